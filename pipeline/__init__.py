@@ -1,0 +1,1 @@
+"""Lidar logs in, trajectory and map out."""

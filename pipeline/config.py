@@ -1,0 +1,121 @@
+"""The configuration: frozen structs; units in the keys, ranges in the types, unknown keys refused."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Count = Annotated[int, Meta(ge=1)]
+
+
+Optimiser = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
+
+
+class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is read from the log. Empty topics are found automatically."""
+
+    topic: str = ""
+    odometry_topic: str = ""
+    ground_truth_topic: str = "/ground_truth"
+    start_s: NonNegative = 0.0
+    end_s: Positive = float("inf")
+    every: Count = 1
+    min_range_m: NonNegative = 0.0
+    max_range_m: Positive = float("inf")
+    prefetch_chunks: Count = 4
+
+
+class PreprocessConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is done to a scan before it is matched."""
+
+    min_range_m: NonNegative = 1.0
+    max_range_m: Positive = 100.0
+    deskew: bool = True
+    map_voxel_m: Positive = 0.5
+    match_voxel_m: Positive = 1.5
+
+
+class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The map that scans are matched against."""
+
+    voxel_size_m: Positive = 1.0
+    max_distance_m: Positive = 100.0
+    max_keyframes: Count = 300
+
+
+class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a scan is aligned."""
+
+    matcher: Literal["plicp", "svd"] = "plicp"
+    optimiser: Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"] = "levenberg-marquardt"
+    max_iterations: Count = 30
+    max_distance_m: Positive = 2.0
+    kernel_scale_m: Positive = 0.3
+    tolerance_m: Positive = 1e-3
+    tolerance_rad: Positive = 1e-4
+    sensor_noise_m: Positive = 0.03
+    min_inlier_share: Share = 0.3
+    min_information: NonNegative = 1e-3
+
+
+class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """How the motion is predicted and when the map grows."""
+
+    prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
+    keyframe_distance_m: Positive = 2.0
+    keyframe_angle_rad: Positive = 0.35
+
+
+class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """How revisits are found and verified."""
+
+    enabled: bool = True
+    radius_m: Positive = 10.0
+    min_travel_m: Positive = 20.0
+    min_overlap: Share = 0.6
+    max_residual_m: Positive = 0.3
+    submap_keyframes: Count = 10
+
+
+class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """How the pose graph is optimised."""
+
+    optimiser: Literal["gauss-newton", "levenberg-marquardt"] = "levenberg-marquardt"
+    max_iterations: Count = 50
+    tolerance: Positive = 1e-6
+    robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = "geman-mcclure"
+    robust_scale: Positive = 3.0
+
+
+class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The maps that are written at the end."""
+
+    voxel_size_m: Positive = 0.2
+    grid_resolution_m: Positive = 0.05
+    slice_min_z_m: float = -0.5
+    slice_max_z_m: float = 0.5
+
+
+class RecordingConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """What goes into the rerun recording."""
+
+    local_map_every: Count = 20
+    max_map_points: Count = 20000
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole tree; a module receives its own branch."""
+
+    log: LogConfig = LogConfig()
+    preprocess: PreprocessConfig = PreprocessConfig()
+    local_map: LocalMapConfig = LocalMapConfig()
+    matching: MatchingConfig = MatchingConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    loops: LoopsConfig = LoopsConfig()
+    graph: GraphConfig = GraphConfig()
+    maps: MapsConfig = MapsConfig()
+    recording: RecordingConfig = RecordingConfig()

@@ -1,0 +1,197 @@
+"""The records that pass between the stages; frozen, and nobody writes into their arrays.
+
+A pose is a homogeneous matrix: (3, 3) for SE(2) in a 2D log, (4, 4) for SE(3) in a 3D log. ``T_a_b`` maps
+coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist has k = 3 or 6 entries, ordered
+(translation, rotation). Time is ``int`` nanoseconds, lengths are metres, angles radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pose = NDArray[np.float64]
+Points = NDArray[np.float64]
+RawPoints = NDArray[np.float32]
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One scan as the log holds it, invalid returns removed.
+
+    Attributes
+    ----------
+    index : place of the scan in the order of log time, from 0
+    stamp_ns : header stamp; the instant at which the scan's pose holds
+    log_time_ns : when it was recorded; scans are processed in this order
+    points : (N, d) float32, metres, lidar frame
+    times_s : (N,) float32, seconds of each point relative to ``stamp_ns``; (0,) where the log has none
+    dropped : returns removed because they were NaN, infinite or out of range
+    T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
+    """
+
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    points: RawPoints
+    times_s: NDArray[np.float32]
+    dropped: int
+    T_odom_base: Pose | None
+
+
+class State(StrEnum):
+    """How far a pose can be trusted."""
+
+    OK = "ok"
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The answer of a registration.
+
+    Attributes
+    ----------
+    T_target_source : (d+1, d+1) pose of the source in the target's frame
+    information : (k, k) inverse covariance of a left twist on ``T_target_source``; m⁻², rad⁻¹m⁻¹, rad⁻²
+    inliers : source points that ended with a partner within reach
+    points : source points that were tried
+    iterations : linearisations used
+    residual_m : root of the weighted mean squared residual over the inliers
+    converged : whether the last step was below the tolerance
+    reason : why the iteration stopped, in words
+    degeneracy_eigenvalue : smallest eigenvalue of the information per inlier, lengths scaled so that
+        translation and rotation compare; 0 is blind, 1 is a direction that every residual sees
+    degeneracy_direction : (k,) unit eigenvector that belongs to it, twist order
+    """
+
+    T_target_source: Pose
+    information: Matrix
+    inliers: int
+    points: int
+    iterations: int
+    residual_m: float
+    converged: bool
+    reason: str
+    degeneracy_eigenvalue: float
+    degeneracy_direction: NDArray[np.float64]
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the source points that found a partner."""
+        return self.inliers / max(self.points, 1)
+
+
+class Verdict(StrEnum):
+    """What became of a proposed loop closure."""
+
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A proposed loop closure: the later keyframe ``source`` seen from the earlier ``target``.
+
+    ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
+    ``overlap`` is the share of source points that lie on the target's surfaces after matching.
+    """
+
+    target: int
+    source: int
+    match: Match
+    overlap: float
+    verdict: Verdict
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class GraphState:
+    """The pose graph after an optimisation.
+
+    Attributes
+    ----------
+    poses : (K, d+1, d+1) T_world_lidar of every keyframe
+    stamps_ns : (K,) int64
+    edges : (E, 2) int64 keyframe pairs (i, j), odometry first
+    is_loop : (E,) bool
+    weight : (E,) robust weight in [0, 1] that the optimiser left to each edge; 1 for odometry
+    chi2 : Σ eᵀΩe
+    """
+
+    poses: Matrix
+    stamps_ns: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    is_loop: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+    chi2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Where the time of one scan went, seconds."""
+
+    read_s: float
+    preprocess_s: float
+    match_s: float
+    map_s: float
+    loops_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Sum of all stages."""
+        return self.read_s + self.preprocess_s + self.match_s + self.map_s + self.loops_s
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What became of one scan.
+
+    Attributes
+    ----------
+    scan : the scan itself
+    points : (M, d) float64 deskewed, downsampled points that were matched, lidar frame
+    T_odom_lidar : pose before optimisation: smooth, drifts
+    T_world_lidar : best pose known now: jumps at closures
+    match : the registration against the local map
+    state, reason : how far the pose can be trusted, and why not
+    keyframe : index of the keyframe made of this scan, -1 if none was
+    local_map : (L, d) float64 points of the local map in the odom frame; filled on keyframes, else (0, d)
+    closures : loop closures tried at this scan
+    graph : the optimised graph if this scan led to an optimisation, else None
+    timing : seconds by stage
+    """
+
+    scan: Scan
+    points: Points
+    T_odom_lidar: Pose
+    T_world_lidar: Pose
+    match: Match
+    state: State
+    reason: str
+    keyframe: int
+    local_map: Points
+    closures: tuple[Closure, ...]
+    graph: GraphState | None
+    timing: Timing
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses over time: ``stamps_ns`` (N,) int64 and ``poses`` (N, d+1, d+1), in the order they were taken."""
+
+    stamps_ns: NDArray[np.int64]
+    poses: Matrix
+
+    @property
+    def dimension(self) -> int:
+        """2 for SE(2) poses, 3 for SE(3)."""
+        return self.poses.shape[-1] - 1
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)

@@ -1,0 +1,16 @@
+"""The errors a user can cause or meet; the command line prints each as one line."""
+
+
+class ScanchainError(Exception):
+    """A run failed for a reason its message names: what, where, what to do. Exit code 1."""
+
+
+class InputError(ScanchainError):
+    """Bad input or arguments: the thing, its value, the limit, the remedy, on one line. Exit code 2."""
+
+
+class MissingExtraError(InputError):
+    """A package of an optional extra is not installed."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; install it with: pip install 'scanchain[{extra}]'")

@@ -1,0 +1,1 @@
+"""ATE, RPE, KITTI metric, relations."""

@@ -1,0 +1,1 @@
+"""Pose graphs: factors, optimisers, linear solvers, g2o."""

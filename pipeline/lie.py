@@ -1,0 +1,227 @@
+"""SE(2) and SE(3) as homogeneous matrices; twists are (translation, rotation), perturbations act from the left.
+
+A left perturbation ξ changes a pose by T ← exp(ξ) T. Every function takes SE(2) as (3, 3) matrices and SE(3) as
+(4, 4) matrices, one or a stack of them: (..., d+1, d+1). Formulas follow Barfoot, State Estimation for Robotics
+(2017), ch. 7, and Sola et al., A micro Lie theory (2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix, Pose
+
+_SMALL = 1e-8  # rad; below this angle the series replaces the closed form
+
+
+def identity(dimension: int) -> Pose:
+    """The pose that moves nothing."""
+    return np.eye(dimension + 1)
+
+
+def inverse(T: Pose) -> Pose:
+    """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1]."""
+    d = T.shape[-1] - 1
+    result = np.zeros_like(T)
+    R_t = np.swapaxes(T[..., :d, :d], -1, -2)
+    result[..., :d, :d] = R_t
+    result[..., :d, d] = -(R_t @ T[..., :d, d, None])[..., 0]
+    result[..., d, d] = 1.0
+    return result
+
+
+def transform(T: Pose, points: NDArray[np.floating]) -> Matrix:
+    """Points (N, d) moved by one pose: R p + t."""
+    d = T.shape[-1] - 1
+    return points @ T[:d, :d].T + T[:d, d]
+
+
+def wrap(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same angle in [−π, π)."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def pose_2d(x_m: float, y_m: float, yaw_rad: float) -> Pose:
+    """SE(2) from coordinates and heading."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s, x_m], [s, c, y_m], [0.0, 0.0, 1.0]])
+
+
+def yaw(T: Pose) -> NDArray[np.float64]:
+    """Heading of a pose (or of a stack), rad: the rotation of its x axis in the xy plane."""
+    return np.arctan2(T[..., 1, 0], T[..., 0, 0])
+
+
+def flatten(T: Pose) -> Pose:
+    """SE(3) to SE(2): position in the plane and heading."""
+    yaw_rad = yaw(T)
+    result = np.zeros((*T.shape[:-2], 3, 3))
+    result[..., 0, 0] = result[..., 1, 1] = np.cos(yaw_rad)
+    result[..., 1, 0] = np.sin(yaw_rad)
+    result[..., 0, 1] = -result[..., 1, 0]
+    result[..., :2, 2] = T[..., :2, 3]
+    result[..., 2, 2] = 1.0
+    return result
+
+
+def lift(T: Pose) -> Pose:
+    """SE(2) to SE(3) in the plane z = 0; an SE(3) pose is returned as it is."""
+    if T.shape[-1] == 4:
+        return T
+    result = np.zeros((*T.shape[:-2], 4, 4))
+    result[..., :2, :2] = T[..., :2, :2]
+    result[..., :2, 3] = T[..., :2, 2]
+    result[..., 2, 2] = result[..., 3, 3] = 1.0
+    return result
+
+
+def rotation_angle(T: Pose) -> NDArray[np.float64]:
+    """Angle of a pose's rotation, rad, in [0, π]; accurate near 0 and near π."""
+    if T.shape[-1] == 3:
+        return np.abs(yaw(T))
+    return np.linalg.norm(_log_so3(T[..., :3, :3]), axis=-1)
+
+
+def hat(v: NDArray[np.float64]) -> Matrix:
+    """The skew matrix with hat(v) w = v × w, (..., 3) → (..., 3, 3)."""
+    result = np.zeros((*v.shape[:-1], 3, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
+    return result
+
+
+def exp(twist: NDArray[np.float64]) -> Pose:
+    """The pose of a twist (..., 3) or (..., 6): R = exp(φ), t = V(φ) ρ (Barfoot 2017, eq. 7.86)."""
+    return _exp_se2(twist) if twist.shape[-1] == 3 else _exp_se3(twist)
+
+
+def log(T: Pose) -> NDArray[np.float64]:
+    """The twist of a pose, exp's inverse: φ = log(R), ρ = V(φ)⁻¹ t; rotation angle in [0, π]."""
+    return _log_se2(T) if T.shape[-1] == 3 else _log_se3(T)
+
+
+def adjoint(T: Pose) -> Matrix:
+    """Ad with T exp(ξ) T⁻¹ = exp(Ad ξ); (..., k, k)."""
+    d = T.shape[-1] - 1
+    R, t = T[..., :d, :d], T[..., :d, d]
+    k = 3 if d == 2 else 6
+    result = np.zeros((*T.shape[:-2], k, k))
+    result[..., :d, :d] = R
+    if d == 2:
+        result[..., 0, 2], result[..., 1, 2] = t[..., 1], -t[..., 0]
+        result[..., 2, 2] = 1.0
+    else:
+        result[..., :3, 3:] = hat(t) @ R
+        result[..., 3:, 3:] = R
+    return result
+
+
+def normalise(T: Pose) -> Pose:
+    """The pose with its rotation made orthonormal again, after many products."""
+    d = T.shape[-1] - 1
+    U, _, Vt = np.linalg.svd(T[:d, :d])
+    result = T.copy()
+    result[:d, :d] = U @ Vt
+    return result
+
+
+def interpolate(T_a: Pose, T_b: Pose, share: float) -> Pose:
+    """The pose a ``share`` of the way from T_a to T_b, along the screw that joins them."""
+    return exp(share * log(T_b @ inverse(T_a))) @ T_a
+
+
+def to_quaternion(R: Matrix) -> NDArray[np.float64]:
+    """Unit quaternions xyzw of rotation matrices (..., 3, 3); w ≥ 0."""
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return flat.reshape(*R.shape[:-2], 4)
+
+
+def from_quaternion(quat_xyzw: NDArray[np.float64]) -> Matrix:
+    """Rotation matrices (..., 3, 3) of quaternions xyzw (..., 4); normalised first."""
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix()
+    return flat.reshape(*quat_xyzw.shape[:-1], 3, 3)
+
+
+def _exp_se2(twist: NDArray[np.float64]) -> Pose:
+    theta = twist[..., 2]
+    a, b = _sinc_and_cosc(theta)
+    result = np.zeros((*twist.shape[:-1], 3, 3))
+    result[..., 0, 0] = result[..., 1, 1] = np.cos(theta)
+    result[..., 1, 0] = np.sin(theta)
+    result[..., 0, 1] = -result[..., 1, 0]
+    result[..., 0, 2] = a * twist[..., 0] - b * twist[..., 1]
+    result[..., 1, 2] = b * twist[..., 0] + a * twist[..., 1]
+    result[..., 2, 2] = 1.0
+    return result
+
+
+def _log_se2(T: Pose) -> NDArray[np.float64]:
+    theta = yaw(T)
+    half = 0.5 * theta
+    small = np.abs(theta) < _SMALL
+    c = np.where(small, 1.0, half / np.tan(np.where(small, 1.0, half)))
+    x, y = T[..., 0, 2], T[..., 1, 2]
+    return np.stack([c * x + half * y, -half * x + c * y, theta], axis=-1)
+
+
+def _sinc_and_cosc(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sin θ / θ and (1 − cos θ) / θ."""
+    small = np.abs(theta) < _SMALL
+    safe = np.where(small, 1.0, theta)
+    sine = np.where(small, 1.0, np.sin(safe) / safe)
+    cosine = np.where(small, 0.5 * theta, 2.0 * np.sin(0.5 * safe) ** 2 / safe)
+    return sine, cosine
+
+
+def _exp_se3(twist: NDArray[np.float64]) -> Pose:
+    rho, phi = twist[..., :3], twist[..., 3:]
+    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
+    a, b, c = _so3_coefficients(theta)
+    K = hat(phi)
+    K2 = K @ K
+    result = np.zeros((*twist.shape[:-1], 4, 4))
+    result[..., :3, :3] = np.eye(3) + a * K + b * K2
+    result[..., :3, 3] = ((np.eye(3) + b * K + c * K2) @ rho[..., None])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def _so3_coefficients(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³, by series below 1e-3 rad."""
+    small = theta < 1e-3
+    safe = np.where(small, 1.0, theta)
+    theta2 = theta * theta
+    a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta2 / 24.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe**2)
+    c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    return a, b, c
+
+
+def _log_so3(R: Matrix) -> NDArray[np.float64]:
+    """Rotation vectors (..., 3) by way of the quaternion, which is well conditioned from 0 to π."""
+    quat = to_quaternion(R)
+    v, w = quat[..., :3], quat[..., 3]
+    norm = np.linalg.norm(v, axis=-1)
+    small = norm < _SMALL
+    scale = np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
+    return scale[..., None] * v
+
+
+def _log_se3(T: Pose) -> NDArray[np.float64]:
+    phi = _log_so3(T[..., :3, :3])
+    theta = np.linalg.norm(phi, axis=-1)[..., None]
+    small = theta < 1e-3
+    safe = np.where(small, 1.0, theta)
+    half = 0.5 * safe
+    e = np.where(small, 1.0 / 12.0 + theta**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2)
+    t = T[..., :3, 3]
+    cross = np.cross(phi, t)
+    rho = t - 0.5 * cross + e * np.cross(phi, cross)
+    return np.concatenate([rho, phi], axis=-1)

@@ -1,0 +1,1 @@
+"""Propose and verify revisits."""

@@ -1,0 +1,1 @@
+"""Point clouds and occupancy grids in formats others read."""

@@ -1,0 +1,1 @@
+"""SVD-ICP and LM-PLICP against a voxel map."""

@@ -1,0 +1,1 @@
+"""Predict, match against the local map, extend it."""

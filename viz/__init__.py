@@ -1,0 +1,1 @@
+"""Shows what the pipeline did: rerun recording, plots."""
