@@ -30,7 +30,7 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PreprocessConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is done to a scan before it is matched."""
+    """What is done to a scan before it is matched: cropped, thinned out, freed of the lidar's own motion."""
 
     min_range_m: NonNegative = 1.0
     max_range_m: Positive = 100.0
@@ -44,17 +44,24 @@ class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     voxel_size_m: Positive = 1.0
     max_distance_m: Positive = 100.0
-    max_keyframes: Count = 300
+    max_insertions: Count = 1000
+    insert_distance_m: NonNegative = 0.0
+    insert_angle_rad: NonNegative = 0.0
+    min_points_alone: Count = 10
 
 
 class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a scan is aligned."""
+    """How a scan is aligned; the first scans, and those after a loss, search wide."""
 
     matcher: Literal["plicp", "svd"] = "plicp"
-    optimiser: Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"] = "levenberg-marquardt"
-    max_iterations: Count = 30
+    optimiser: Optimiser = "levenberg-marquardt"
+    max_iterations: Count = 50
+    reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1
     max_distance_m: Positive = 2.0
     kernel_scale_m: Positive = 0.3
+    wide_reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 2
+    wide_max_distance_m: Positive = 3.0
+    wide_kernel_scale_m: Positive = 2.0
     tolerance_m: Positive = 1e-3
     tolerance_rad: Positive = 1e-4
     sensor_noise_m: Positive = 0.03
@@ -63,9 +70,13 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """How the motion is predicted and when the map grows."""
+    """How the motion is predicted, how far the prediction is trusted, and when a keyframe is made."""
 
     prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
+    wheel_sigma_m: Positive = 0.05
+    wheel_sigma_rad: Positive = 0.05
+    velocity_sigma_m: Positive = 0.5
+    velocity_sigma_rad: Positive = 0.2
     keyframe_distance_m: Positive = 2.0
     keyframe_angle_rad: Positive = 0.35
 

@@ -58,7 +58,10 @@ class Match:
     Attributes
     ----------
     T_target_source : (d+1, d+1) pose of the source in the target's frame
-    information : (k, k) inverse covariance of a left twist on ``T_target_source``; m⁻², rad⁻¹m⁻¹, rad⁻²
+    information : (k, k) inverse covariance of a twist ξ in the source's own frame, T exp(ξ), as a pose-graph
+        edge takes it; m⁻², rad⁻¹m⁻¹, rad⁻²
+    cost : robust cost in m², every point without a partner at the kernel's limit; compares two alignments of
+        the same scan to the same map
     inliers : source points that ended with a partner within reach
     points : source points that were tried
     iterations : linearisations used
@@ -67,11 +70,12 @@ class Match:
     reason : why the iteration stopped, in words
     degeneracy_eigenvalue : smallest eigenvalue of the information per inlier, lengths scaled so that
         translation and rotation compare; 0 is blind, 1 is a direction that every residual sees
-    degeneracy_direction : (k,) unit eigenvector that belongs to it, twist order
+    degeneracy_direction : (k,) unit eigenvector that belongs to it, twist order, source's frame
     """
 
     T_target_source: Pose
     information: Matrix
+    cost: float
     inliers: int
     points: int
     iterations: int

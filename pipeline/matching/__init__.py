@@ -1,1 +1,44 @@
 """SVD-ICP and LM-PLICP against a voxel map."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import MatchingConfig
+from pipeline.data import Match, Points, Pose
+from pipeline.matching.matcher import PointToShapeMatcher
+from pipeline.matching.svd import DegeneratePairsError, rigid_transform
+from pipeline.matching.svd_icp import SvdMatcher
+from pipeline.matching.voxel_map import VoxelMap
+
+__all__ = [
+    "DegeneratePairsError",
+    "Matcher",
+    "PointToShapeMatcher",
+    "SvdMatcher",
+    "VoxelMap",
+    "create_matcher",
+    "rigid_transform",
+]
+
+
+class Matcher(Protocol):
+    """Whatever aligns a scan to a voxel map."""
+
+    def align(
+        self,
+        points: Points,
+        target: VoxelMap,
+        T_predicted: Pose,
+        prior: NDArray[np.float64],
+        *,
+        wide: bool = False,
+    ) -> Match:
+        """Pose of the scan in the map's frame, near the prediction."""
+        ...
+
+
+def create_matcher(config: MatchingConfig) -> Matcher:
+    """The matcher that the configuration names."""
+    return PointToShapeMatcher(config) if config.matcher == "plicp" else SvdMatcher(config)

@@ -1,0 +1,82 @@
+"""The steps of the four optimisers, and the damping that Levenberg–Marquardt keeps between them."""
+
+import math
+
+from numba import njit
+
+GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
+
+
+@njit(cache=True)
+def step(optimiser: int, H, b, damping: float, factor, x) -> bool:
+    """Write the step ξ of one iteration to ``x`` (k,); ``factor`` (k, k) is room for the factorisation.
+
+    Gradient descent    ξ = −(bᵀb / bᵀHb) b, the exact minimiser along the gradient (Cauchy's point)
+    Newton              ξ = −H⁻¹b with the full Hessian; where that is indefinite the diagonal is raised
+    Gauss–Newton        ξ = −(JᵀJ)⁻¹Jᵀr
+    Levenberg–Marquardt ξ = −(JᵀJ + λ diag(JᵀJ))⁻¹Jᵀr (Marquardt 1963)
+    Returns whether the system could be solved.
+    """
+    k = b.shape[0]
+    if optimiser == GRADIENT_DESCENT:
+        along = square = 0.0
+        for i in range(k):
+            square += b[i] * b[i]
+            for j in range(k):
+                along += b[i] * H[i, j] * b[j]
+        for i in range(k):
+            x[i] = -b[i] * square / along if along > 0.0 else 0.0
+        return along > 0.0
+    if optimiser != LEVENBERG_MARQUARDT:
+        damping = 0.0
+    solved = solve(H, b, damping, factor, x)
+    while not solved and optimiser == NEWTON and damping < 1e6:
+        damping = max(4.0 * damping, 1e-3)
+        solved = solve(H, b, damping, factor, x)
+    return solved
+
+
+@njit(cache=True)
+def solve(H, b, damping: float, factor, x) -> bool:
+    """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
+    k = b.shape[0]
+    for i in range(k):
+        for j in range(i + 1):
+            total = H[i, j] + (damping * abs(H[i, i]) if i == j else 0.0)
+            for m in range(j):
+                total -= factor[i, m] * factor[j, m]
+            if i != j:
+                factor[i, j] = total / factor[j, j]
+            elif total <= 1e-12 * abs(H[i, i]) or not math.isfinite(total):
+                return False
+            else:
+                factor[i, i] = math.sqrt(total)
+    for i in range(k):
+        total = -b[i]
+        for m in range(i):
+            total -= factor[i, m] * x[m]
+        x[i] = total / factor[i, i]
+    for i in range(k - 1, -1, -1):
+        total = x[i]
+        for m in range(i + 1, k):
+            total -= factor[m, i] * x[m]
+        x[i] = total / factor[i, i]
+    return True
+
+
+@njit(cache=True)
+def predicted_decrease(H, b, x) -> float:
+    """Decrease of the quadratic model along the step, −bᵀx − ½ xᵀHx."""
+    total = 0.0
+    for i in range(b.shape[0]):
+        row = b[i]
+        for j in range(b.shape[0]):
+            row += 0.5 * H[i, j] * x[j]
+        total -= x[i] * row
+    return total
+
+
+@njit(cache=True)
+def relax(damping: float, gain: float) -> float:
+    """The damping after an accepted step of gain ratio ρ: λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999)."""
+    return damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)

@@ -1,0 +1,77 @@
+"""One point of every voxel of a scan, and the motion taken out of it."""
+
+import numpy as np
+from numba import njit
+
+from pipeline.kernels.hashing import EMPTY, find, pack
+from pipeline.kernels.twist import perturb
+
+
+@njit(cache=True)
+def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, chosen):
+    """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
+
+    points : (N, d) metres from the lidar; chosen : (N,) int32. Returns how many were chosen.
+    Neighbours on a ring mostly share a voxel, so the last key is tried before the table.
+    """
+    n = points.shape[0]
+    slots = 1024
+    while slots < 2 * n:
+        slots *= 2
+    keys = np.full(slots, EMPTY)
+    scale = 1.0 / voxel_m
+    low, high = min_range_m * min_range_m, max_range_m * max_range_m
+    planar = points.shape[1] == 2
+    count = 0
+    last = EMPTY
+    for i in range(n):
+        x, y = points[i, 0], points[i, 1]
+        z = 0.0 if planar else points[i, 2]
+        square = x * x + y * y + z * z
+        if not low <= square <= high:
+            continue
+        key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
+        if key == last:
+            continue
+        last = key
+        slot = find(keys, key)
+        if slot < 0:
+            keys[~slot] = key
+            chosen[count] = i
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def gather(points, chosen, out):
+    """Copy the chosen rows of points (N, d) to ``out`` (M, d)."""
+    for k in range(out.shape[0]):
+        for axis in range(out.shape[1]):
+            out[k, axis] = points[chosen[k], axis]
+
+
+@njit(cache=True)
+def deskew(points, shares, twist):
+    """Move each point, in place, to where the lidar saw it at the scan's stamp.
+
+    points : (N, d) metres, each in the lidar frame of its own instant
+    shares : (N,) time from the stamp to that instant, in units of the time in which the lidar moves by twist
+    twist : (k,) constant velocity; the pose at share τ is T exp(τ ξ), so that p ← exp(τ ξ) p
+    """
+    d = points.shape[1]
+    origin = np.zeros(3)
+    start, moved = np.eye(d + 1), np.eye(d + 1)
+    part = np.empty_like(twist)
+    last = np.nan
+    for i in range(points.shape[0]):
+        if shares[i] != last:
+            last = shares[i]
+            part[:] = twist * last
+            perturb(part, start, origin, moved)
+        x, y = points[i, 0], points[i, 1]
+        z = points[i, 2] if d == 3 else 0.0
+        for axis in range(d):
+            value = moved[axis, 0] * x + moved[axis, 1] * y + moved[axis, d]
+            if d == 3:
+                value += moved[axis, 2] * z
+            points[i, axis] = value

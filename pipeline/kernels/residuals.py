@@ -1,0 +1,180 @@
+"""Normal equations of the distances between points and the local shapes they are paired with."""
+
+from numba import njit
+
+from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
+
+
+@njit(cache=True)
+def normal_equations(
+    voxels, points, T, origin, partner, scale_m: float, point_weight: float, second_order: bool, H, b
+):
+    """Linearise every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
+
+    With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
+    ``origin`` (all lengths counted from there, so that rotation and translation stay apart), T ← exp(ξ) T,
+    changes the residual by
+        r = nᵀ(p − q)        ∂r/∂ξ = [nᵀ, (p × n)ᵀ]     (Chen & Medioni 1992; in 2D Censi 2008)
+    On a line the residuals are the two across it, on a point shape all components of p − q. Geman–McClure
+    weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985).
+    Off planes the mean of a voxel only stands for the surface to within the voxel's size, so there r² counts
+    ``point_weight`` = σ²/(σ² + variance of a point in a voxel).
+
+    points : (N, d) metres, source frame; origin : (3,), map frame; partner : (N,) rows of the map's voxels, −1 for none
+    scale_m : s; residuals far above it are all but ignored
+    second_order : adds the curvature of the rotation, r nᵀ ∂²p/∂φ², which makes it Newton's Hessian (the
+        weights held fixed)
+    H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
+    """
+    H[:, :] = 0.0
+    b[:] = 0.0
+    cost = weights = squares = 0.0
+    s2 = scale_m * scale_m
+    planar = points.shape[1] == 2
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez = px - cell[0], py - cell[1], pz - cell[2]
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+        along = nx * ex + ny * ey + nz * ez
+        shape = cell[SHAPE]
+        if shape == PLANE:
+            r2 = along * along
+            ex, ey, ez = along * nx, along * ny, along * nz
+        elif shape == LINE:
+            ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
+            r2 = ex * ex + ey * ey + ez * ez
+        else:
+            r2 = ex * ex + ey * ey + ez * ez
+        trust = 1.0 if shape == PLANE else point_weight
+        r2 *= trust
+        ratio = s2 / (s2 + r2)
+        w = trust * ratio * ratio
+        cost += 0.5 * r2 * ratio
+        weights += w
+        squares += ratio * ratio * r2
+        if planar:
+            _add_2d(H, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
+        elif shape == PLANE:
+            _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
+        else:
+            _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+        if second_order:
+            _add_curvature(H, w, px, py, pz, ex, ey, ez, planar)
+    _mirror(H)
+    return cost, weights, squares
+
+
+@njit(cache=True, inline="always")
+def _add_2d(H, b, w, px, py, ex, ey, nx, ny, plane: bool):
+    """Point-to-line: J = [n, p × n]; point-to-point: J = [I, (−p_y, p_x)ᵀ]."""
+    if plane:
+        turn = px * ny - py * nx
+        r = nx * ex + ny * ey
+        H[0, 0] += w * nx * nx
+        H[0, 1] += w * nx * ny
+        H[0, 2] += w * nx * turn
+        H[1, 1] += w * ny * ny
+        H[1, 2] += w * ny * turn
+        H[2, 2] += w * turn * turn
+        b[0] += w * nx * r
+        b[1] += w * ny * r
+        b[2] += w * turn * r
+    else:
+        H[0, 0] += w
+        H[1, 1] += w
+        H[0, 2] -= w * py
+        H[1, 2] += w * px
+        H[2, 2] += w * (px * px + py * py)
+        b[0] += w * ex
+        b[1] += w * ey
+        b[2] += w * (px * ey - py * ex)
+
+
+@njit(cache=True, inline="always")
+def _add_plane(H, b, w, px, py, pz, nx, ny, nz, r):
+    """One residual: J = [n, p × n], upper triangle."""
+    cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+    wx, wy, wz = w * nx, w * ny, w * nz
+    H[0, 0] += wx * nx
+    H[0, 1] += wx * ny
+    H[0, 2] += wx * nz
+    H[0, 3] += wx * cx
+    H[0, 4] += wx * cy
+    H[0, 5] += wx * cz
+    H[1, 1] += wy * ny
+    H[1, 2] += wy * nz
+    H[1, 3] += wy * cx
+    H[1, 4] += wy * cy
+    H[1, 5] += wy * cz
+    H[2, 2] += wz * nz
+    H[2, 3] += wz * cx
+    H[2, 4] += wz * cy
+    H[2, 5] += wz * cz
+    H[3, 3] += w * cx * cx
+    H[3, 4] += w * cx * cy
+    H[3, 5] += w * cx * cz
+    H[4, 4] += w * cy * cy
+    H[4, 5] += w * cy * cz
+    H[5, 5] += w * cz * cz
+    r *= w
+    b[0] += r * nx
+    b[1] += r * ny
+    b[2] += r * nz
+    b[3] += r * cx
+    b[4] += r * cy
+    b[5] += r * cz
+
+
+@njit(cache=True)
+def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
+    """Three residuals, J = P [I, −p×], with P = I on a point shape and P = I − vvᵀ across a line."""
+    H[0, 0] += w
+    H[1, 1] += w
+    H[2, 2] += w
+    H[0, 4] += w * pz
+    H[0, 5] -= w * py
+    H[1, 3] -= w * pz
+    H[1, 5] += w * px
+    H[2, 3] += w * py
+    H[2, 4] -= w * px
+    H[3, 3] += w * (py * py + pz * pz)
+    H[4, 4] += w * (px * px + pz * pz)
+    H[5, 5] += w * (px * px + py * py)
+    H[3, 4] -= w * px * py
+    H[3, 5] -= w * px * pz
+    H[4, 5] -= w * py * pz
+    b[0] += w * ex
+    b[1] += w * ey
+    b[2] += w * ez
+    b[3] += w * (py * ez - pz * ey)
+    b[4] += w * (pz * ex - px * ez)
+    b[5] += w * (px * ey - py * ex)
+    if line:
+        _add_plane(H, b, -w, px, py, pz, vx, vy, vz, 0.0)
+
+
+@njit(cache=True)
+def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
+    """∂²/∂φ² of eᵀ exp(φ) p at φ = 0: ½(e pᵀ + p eᵀ) − (eᵀp) I; in 2D −eᵀp."""
+    dot = ex * px + ey * py + ez * pz
+    if planar:
+        H[2, 2] -= w * dot
+        return
+    H[3, 3] += w * (ex * px - dot)
+    H[4, 4] += w * (ey * py - dot)
+    H[5, 5] += w * (ez * pz - dot)
+    H[3, 4] += w * 0.5 * (ex * py + ey * px)
+    H[3, 5] += w * 0.5 * (ex * pz + ez * px)
+    H[4, 5] += w * 0.5 * (ey * pz + ez * py)
+
+
+@njit(cache=True, inline="always")
+def _mirror(H):
+    for row in range(1, H.shape[0]):
+        for column in range(row):
+            H[row, column] = H[column, row]

@@ -1,0 +1,210 @@
+"""A hash map of voxels that keep running moments of their points and the local shape fitted to them.
+
+A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
+that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, one cache line: mean
+(3), direction (3), shape, tick of the last insertion. A 2D map is the plane z = 0 of the same layout.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipeline.kernels.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
+from pipeline.kernels.hashing import find, pack, unpack
+
+POINT, LINE, PLANE = 0.0, 1.0, 2.0
+MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
+
+
+class Voxels(NamedTuple):
+    """The arrays of a voxel map: ``keys`` (S,), ``index`` (S,), ``moments`` (V, 10), ``cells`` (V, 8)."""
+
+    keys: NDArray[np.int64]
+    index: NDArray[np.int32]
+    voxel_keys: NDArray[np.int64]
+    moments: NDArray[np.float64]
+    cells: NDArray[np.float64]
+    count: NDArray[np.int64]
+    size_m: float
+
+
+@njit(cache=True)
+def insert(voxels, points, T, tick: float, alone: float):
+    """Add points (N, d), moved by T into the map's frame, and fit the voxels they fall into anew.
+
+    alone : points from which on a voxel is fitted without its neighbours
+    Room for N more voxels must be there. Returns the number of voxels touched.
+    """
+    touched = np.empty(points.shape[0], np.int32)
+    sums = np.empty(10)
+    touches = 0
+    for i in range(points.shape[0]):
+        x, y, z = move(T, points, i)
+        voxel = _voxel_at(voxels, x, y, z)
+        if voxels.cells[voxel, TICK] != tick:
+            voxels.cells[voxel, TICK] = tick
+            touched[touches] = voxel
+            touches += 1
+        _accumulate(voxels, voxel, x, y, z)
+    for k in range(touches):
+        _fit(voxels, touched[k], points.shape[1], alone, sums)
+    return touches
+
+
+@njit(cache=True, inline="always")
+def move(T, points, i: int):
+    """Point i moved by the pose T; z is 0 in 2D."""
+    x, y = points[i, 0], points[i, 1]
+    if points.shape[1] == 2:
+        return T[0, 0] * x + T[0, 1] * y + T[0, 2], T[1, 0] * x + T[1, 1] * y + T[1, 2], 0.0
+    z = points[i, 2]
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@njit(cache=True)
+def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: float):
+    """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
+    for voxel in range(voxels.count[0]):
+        cell = voxels.cells[voxel]
+        dx, dy, dz = cell[0] - x, cell[1] - y, cell[2] - z
+        if cell[TICK] < oldest_tick or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
+            continue
+        key = voxels.voxel_keys[voxel]
+        slot = ~find(kept.keys, key)
+        new = kept.count[0]
+        kept.count[0] = new + 1
+        kept.keys[slot] = key
+        kept.index[slot] = new
+        kept.voxel_keys[new] = key
+        kept.moments[new] = voxels.moments[voxel]
+        kept.cells[new] = cell
+
+
+@njit(cache=True, inline="always")
+def _voxel_at(voxels, x: float, y: float, z: float) -> int:
+    """Row of the voxel that holds the point; a new one is empty."""
+    scale = 1.0 / voxels.size_m
+    key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
+    slot = find(voxels.keys, key)
+    if slot >= 0:
+        return voxels.index[slot]
+    voxel = voxels.count[0]
+    voxels.count[0] = voxel + 1
+    voxels.keys[~slot] = key
+    voxels.index[~slot] = voxel
+    voxels.voxel_keys[voxel] = key
+    voxels.moments[voxel, :] = 0.0
+    voxels.cells[voxel, :] = 0.0
+    voxels.cells[voxel, TICK] = -1.0
+    return voxel
+
+
+@njit(cache=True, inline="always")
+def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
+    ix, iy, iz = unpack(voxels.voxel_keys[voxel])
+    x -= (ix + 0.5) * voxels.size_m
+    y -= (iy + 0.5) * voxels.size_m
+    z -= (iz + 0.5) * voxels.size_m
+    m = voxels.moments[voxel]
+    m[0] += 1.0
+    m[1] += x
+    m[2] += y
+    m[3] += z
+    m[4] += x * x
+    m[5] += x * y
+    m[6] += x * z
+    m[7] += y * y
+    m[8] += y * z
+    m[9] += z * z
+
+
+@njit(cache=True)
+def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
+    """Mean of the voxel's own points; shape and direction from them, or from the neighbours' too if few."""
+    ix, iy, iz = unpack(voxels.voxel_keys[voxel])
+    m = voxels.moments[voxel]
+    size = voxels.size_m
+    cell = voxels.cells[voxel]
+    cell[0] = (ix + 0.5) * size + m[1] / m[0]
+    cell[1] = (iy + 0.5) * size + m[2] / m[0]
+    cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
+    if m[0] < alone:
+        _sum_neighbourhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+        m = sums
+    if dimension == 2:
+        _fit_2d(m, cell)
+    else:
+        _fit_3d(m, cell)
+
+
+@njit(cache=True)
+def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
+    """Moments of the 3ᵈ voxels around one, relative to its centre, written to ``sums`` (10,)."""
+    sums[:] = 0.0
+    size = voxels.size_m
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-height, height + 1):
+                slot = find(voxels.keys, pack(ix + dx, iy + dy, iz + dz))
+                if slot < 0:
+                    continue
+                m = voxels.moments[voxels.index[slot]]
+                n, x, y, z = m[0], dx * size, dy * size, dz * size
+                sums[0] += n
+                sums[1] += m[1] + n * x
+                sums[2] += m[2] + n * y
+                sums[3] += m[3] + n * z
+                sums[4] += m[4] + 2.0 * x * m[1] + n * x * x
+                sums[5] += m[5] + x * m[2] + y * m[1] + n * x * y
+                sums[6] += m[6] + x * m[3] + z * m[1] + n * x * z
+                sums[7] += m[7] + 2.0 * y * m[2] + n * y * y
+                sums[8] += m[8] + y * m[3] + z * m[2] + n * y * z
+                sums[9] += m[9] + 2.0 * z * m[3] + n * z * z
+
+
+@njit(cache=True)
+def _fit_2d(m, cell):
+    """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
+    cell[SHAPE] = POINT
+    n = m[0]
+    if n < 3.0:
+        return
+    mx, my = m[1] / n, m[2] / n
+    small, large, nx, ny = normal_2d(m[4] / n - mx * mx, m[5] / n - mx * my, m[7] / n - my * my)
+    if large > 1e-12 and small < 0.1 * large:
+        cell[SHAPE] = PLANE
+        cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
+
+
+@njit(cache=True)
+def _fit_3d(m, cell):
+    """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
+
+    A plane is thin against its second extent, a line is thin against its length in both others.
+    """
+    cell[SHAPE] = POINT
+    n = m[0]
+    if n < 5.0:
+        return
+    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
+    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
+    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
+    small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
+    if small < 0.1 * middle:
+        cell[SHAPE] = PLANE
+        chosen = small
+    elif middle < 0.1 * large:
+        cell[SHAPE] = LINE
+        chosen = large
+    else:
+        return
+    vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
+    cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2] = vx, vy, vz
+    if vx == 0.0 and vy == 0.0 and vz == 0.0:
+        cell[SHAPE] = POINT

@@ -1,0 +1,122 @@
+"""LM-PLICP: a scan aligned to the local shapes of a voxel map, and what the answer is worth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.config import MatchingConfig
+from pipeline.data import Match, Matrix, Points, Pose
+from pipeline.kernels import registration
+from pipeline.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
+from pipeline.kernels.registration import Outcome, Terms, align
+from pipeline.matching.voxel_map import VoxelMap
+
+OPTIMISERS = {
+    "gradient-descent": GRADIENT_DESCENT,
+    "newton": NEWTON,
+    "gauss-newton": GAUSS_NEWTON,
+    "levenberg-marquardt": LEVENBERG_MARQUARDT,
+}
+
+_ENDINGS = {
+    registration.CONVERGED: "converged",
+    registration.OUT_OF_ITERATIONS: "out of iterations",
+    registration.NO_PARTNERS: "no point has a partner in the map",
+    registration.SINGULAR: "the partners do not determine the pose",
+    registration.NO_DECREASE: "no step lowers the cost any more",
+}
+
+
+class PointToShapeMatcher:
+    """Point-to-line (2D) and point-to-plane (3D) ICP, by one of four optimisers.
+
+    Residuals n·(R x + t − y) with n from the map (Chen & Medioni 1992; Censi 2008), Geman–McClure weights, and
+    Levenberg–Marquardt by default.
+    """
+
+    def __init__(self, config: MatchingConfig) -> None:
+        self.config = config
+
+    def align(
+        self,
+        points: Points,
+        target: VoxelMap,
+        T_predicted: Pose,
+        prior: NDArray[np.float64],
+        *,
+        wide: bool = False,
+    ) -> Match:
+        """Pose of the scan in the map's frame, near the prediction.
+
+        points : (N, d) metres, lidar frame
+        prior : (k,) information of the prediction, m⁻² and rad⁻², twist order
+        wide : search far, for a prediction that is little more than a guess
+        """
+        T = T_predicted.copy()
+        variance = self.config.sensor_noise_m**2
+        outcome = align(target.voxels, points, T, prior * variance, terms_of(self.config, target, wide))
+        return judge(T, T_predicted, outcome, points, self.config.sensor_noise_m)
+
+
+def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
+    """The numbers a kernel runs under.
+
+    A mean of a voxel of size a is a/√12 away from the surface point it stands for: that variance, against the
+    sensor's, is what a pair off planes counts.
+    """
+    variance = config.sensor_noise_m**2
+    spread = target.config.voxel_size_m**2 / 12.0
+    return Terms(
+        optimiser=OPTIMISERS[config.optimiser],
+        max_iterations=config.max_iterations,
+        reach=config.wide_reach_voxels if wide else config.reach_voxels,
+        max_distance_m=config.wide_max_distance_m if wide else config.max_distance_m,
+        first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
+        scale_m=config.kernel_scale_m,
+        point_weight=variance / (variance + spread),
+        tolerance_m=config.tolerance_m,
+        tolerance_rad=config.tolerance_rad,
+    )
+
+
+def judge(T: Pose, T_first: Pose, outcome: Outcome, points: Points, sensor_noise_m: float) -> Match:
+    """The match that an outcome amounts to: information in the source's frame, degeneracy, words.
+
+    The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
+    """
+    residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
+    centred = T.copy()
+    centred[:-1, -1] -= T_first[:-1, -1]
+    Ad = lie.adjoint(centred)
+    H = Ad.T @ outcome.H @ Ad
+    eigenvalue, direction = degeneracy(H, outcome.weights, points)
+    return Match(
+        T_target_source=T,
+        information=H / max(sensor_noise_m, residual_m) ** 2,
+        cost=outcome.cost,
+        inliers=outcome.pairs,
+        points=len(points),
+        iterations=outcome.iterations,
+        residual_m=residual_m,
+        converged=outcome.ending in (registration.CONVERGED, registration.NO_DECREASE),
+        reason=_ENDINGS[outcome.ending],
+        degeneracy_eigenvalue=eigenvalue,
+        degeneracy_direction=direction,
+    )
+
+
+def degeneracy(H: Matrix, weights: float, points: Points) -> tuple[float, NDArray[np.float64]]:
+    """Smallest eigenvalue of the information per weight, and its direction (k,).
+
+    Rotations are counted as the lengths they move a point at the scan's root mean square range, so that the
+    eigenvalues compare (Zhang, Kaess & Singh 2016 with the units evened out).
+    """
+    d = points.shape[1]
+    scale = np.ones(len(H))
+    scale[d:] = 1.0 / max(math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)), 1e-9)
+    values, vectors = np.linalg.eigh(scale[:, None] * H * scale / max(weights, 1e-300))
+    return max(float(values[0]), 0.0), vectors[:, 0]

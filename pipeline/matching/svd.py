@@ -1,0 +1,45 @@
+"""The closed-form rigid transformation between paired points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Points, Pose
+from pipeline.errors import ScanchainError
+
+_RANK_TOLERANCE = 1e-9  # of the largest singular value
+
+
+class DegeneratePairsError(ScanchainError):
+    """The pairs leave a rotation free: all on one point, or in 3D on one line."""
+
+
+def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64]) -> Pose:
+    """The pose T that minimises Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
+
+    With centred x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
+        R = V diag(1, …, det(V Uᵀ)) Uᵀ        t = μ_y − R μ_x
+    (Arun, Huang & Blostein 1987; the determinant after Umeyama 1991, eq. 43; weights after Sorkine-Hornung &
+    Rabinovich 2017, eq. 22). Without the determinant noisy or planar points give a reflection.
+
+    source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0
+    Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
+    """
+    d = source.shape[1]
+    total = weight.sum()
+    if len(source) < d or total <= 0.0:
+        raise DegeneratePairsError(f"{len(source)} pairs of weight {total:g} do not determine a rotation in {d}D")
+    mean_x, mean_y = weight @ source / total, weight @ target / total
+    W = ((source - mean_x) * weight[:, None]).T @ (target - mean_y)
+    U, singular, Vt = np.linalg.svd(W)
+    if singular[d - 2] <= _RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny):
+        raise DegeneratePairsError(
+            f"all {len(source)} pairs lie on a {'line' if d == 3 else 'point'}: the rotation about it is free"
+        )
+    signs = np.ones(d)
+    signs[-1] = np.linalg.det(Vt.T @ U.T)
+    T = np.eye(d + 1)
+    T[:d, :d] = (Vt.T * np.sign(signs)) @ U.T
+    T[:d, d] = mean_y - T[:d, :d] @ mean_x
+    return T

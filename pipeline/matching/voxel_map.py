@@ -1,0 +1,64 @@
+"""The local map: voxels that remember mean, normal and shape, and forget what is far or old."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.config import LocalMapConfig
+from pipeline.data import Points, Pose
+from pipeline.kernels.voxels import TICK, Voxels, insert, keep
+
+_SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
+_SWEEP_EVERY = 20  # insertions between two rounds of forgetting
+
+
+class VoxelMap:
+    """A map that points are inserted into and scans are matched against; grows and forgets by itself.
+
+    ``voxels`` holds the arrays for the kernels; nobody else writes into them.
+    """
+
+    def __init__(self, dimension: int, config: LocalMapConfig) -> None:
+        self.dimension = dimension
+        self.config = config
+        self.insertions = 0
+        self.voxels = _empty(1 << 12, config.voxel_size_m)
+
+    def __len__(self) -> int:
+        return int(self.voxels.count[0])
+
+    def insert(self, points: Points, T_map_lidar: Pose) -> None:
+        """Add points (N, d) of the lidar frame; every so often forget what is far or old."""
+        self.insertions += 1
+        if self.insertions % _SWEEP_EVERY == 0:
+            self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)
+        if len(self) + len(points) > len(self.voxels.cells):
+            self._rebuild(2 * (len(self) + len(points)), T_map_lidar, np.inf)
+        insert(self.voxels, points, T_map_lidar, float(self.insertions), float(self.config.min_points_alone))
+
+    def points(self) -> Points:
+        """The mean of every voxel, (V, d), map frame."""
+        return self.voxels.cells[: len(self), : self.dimension].copy()
+
+    def _rebuild(self, room: int, T_map_lidar: Pose, radius_m: float) -> None:
+        kept = _empty(max(room, len(self)), self.config.voxel_size_m)
+        position = np.zeros(3)
+        position[: self.dimension] = T_map_lidar[:-1, -1]
+        oldest = self.insertions - self.config.max_insertions
+        keep(self.voxels, kept, *position, radius_m, float(oldest))
+        self.voxels = kept
+
+
+def _empty(room: int, voxel_size_m: float) -> Voxels:
+    capacity = 1 << max(12, int(np.ceil(np.log2(room))))
+    cells = np.zeros((capacity, 8))
+    cells[:, TICK] = -1.0
+    return Voxels(
+        keys=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int64),
+        index=np.zeros(_SLOTS_PER_VOXEL * capacity, np.int32),
+        voxel_keys=np.zeros(capacity, np.int64),
+        moments=np.zeros((capacity, 10)),
+        cells=cells,
+        count=np.zeros(1, np.int64),
+        size_m=voxel_size_m,
+    )

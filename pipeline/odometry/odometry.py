@@ -1,0 +1,156 @@
+"""Scan-to-map odometry: predict, match against the local map, extend it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.config import Config
+from pipeline.data import Match, Matrix, Points, Pose, Scan, State
+from pipeline.errors import InputError
+from pipeline.matching import VoxelMap, create_matcher
+from pipeline.odometry.prediction import Prediction, Predictor
+from pipeline.preprocess import downsample, preprocess
+
+_WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
+_PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
+_DOUBT = 1.3  # cost per point over its running mean, from which on other guesses are tried
+_MEMORY = 0.9  # of that running mean, per scan
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """A scan with its place in the odometry frame.
+
+    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, in the
+    lidar frame; the seconds tell where the time went.
+    """
+
+    scan: Scan
+    points: Points
+    matched: Points
+    T_odom_lidar: Pose
+    match: Match
+    state: State
+    reason: str
+    preprocess_s: float
+    match_s: float
+    map_s: float
+
+
+class Odometry:
+    """Feeds on scans, one by one, and keeps the local map."""
+
+    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
+        self.config = config
+        self.dimension = T_base_lidar.shape[0] - 1
+        self.predictor = Predictor(config.odometry, T_base_lidar)
+        self.matcher = create_matcher(config.matching)
+        self.local_map = VoxelMap(self.dimension, config.local_map)
+        self.T_odom_inserted = self.predictor.T_odom_lidar
+        self.wide_scans = _WIDE_SCANS
+        self.lost_scans = 0
+        self.usual_cost = 0.0
+
+    def track(self, scan: Scan) -> Tracked:
+        """Predict, correct by registration, extend the map."""
+        started = perf_counter()
+        points = preprocess(
+            scan, self.predictor.T_previous_current, self.predictor.interval_s, self.config.preprocess
+        )
+        matched = downsample(points, self.config.preprocess.match_voxel_m)
+        if not len(matched):
+            raise InputError(
+                f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
+                f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
+                f"({self.config.preprocess.max_range_m:g}); widen them"
+            )
+        prepared = perf_counter()
+        prediction = self.predictor.predict(scan)
+        if len(self.local_map):
+            match = self._align(matched, prediction)
+            state, reason = self._judge(match)
+        else:
+            match = self._first_match(matched)
+            state, reason = State.OK, "first scan"
+        T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
+        aligned = perf_counter()
+        self.predictor.correct(scan, T_odom_lidar)
+        self._extend(points, T_odom_lidar, state)
+        return Tracked(
+            scan, points, matched, T_odom_lidar, match, state, reason,
+            prepared - started, aligned - prepared, perf_counter() - aligned,
+        )  # fmt: skip
+
+    def _align(self, points: Points, prediction: Prediction) -> Match:
+        """The best of the alignments from the expected pose and, where that one is doubtful, from others."""
+        wide = self.wide_scans > 0
+        best = self.matcher.align(
+            points, self.local_map, prediction.T_odom_lidar, prediction.information, wide=wide
+        )
+        if best.cost > _DOUBT * self.usual_cost * len(points):
+            for guess in prediction.alternatives:
+                other = self.matcher.align(points, self.local_map, guess, prediction.information, wide=wide)
+                if other.cost < best.cost:
+                    best = other
+        cost = best.cost / len(points)
+        self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
+        return best
+
+    def _judge(self, match: Match) -> tuple[State, str]:
+        config = self.config.matching
+        if match.inlier_share < config.min_inlier_share:
+            return State.LOST, (
+                f"{match.inliers} of {match.points} points found a partner, below the share "
+                f"matching.min_inlier_share ({config.min_inlier_share:g})"
+            )
+        if not np.isfinite(match.T_target_source).all():
+            return State.LOST, match.reason
+        if match.degeneracy_eigenvalue < config.min_information:
+            direction = " ".join(f"{value:.2f}" for value in match.degeneracy_direction)
+            return State.DEGENERATE, (
+                f"motion along [{direction}] is undetermined: information "
+                f"{match.degeneracy_eigenvalue:.1e} < matching.min_information ({config.min_information:g})"
+            )
+        return State.OK, match.reason
+
+    def _extend(self, points: Points, T_odom_lidar: Pose, state: State) -> None:
+        """Insert the scan where it is known well and brings something new."""
+        if state is State.LOST:
+            self.lost_scans += 1
+            self.wide_scans = _WIDE_SCANS
+            if self.lost_scans < _PATIENCE:
+                return
+        else:
+            self.lost_scans = 0
+            self.wide_scans -= self.wide_scans > 0
+        if len(self.local_map) and not self._moved_enough(T_odom_lidar) and state is not State.LOST:
+            return
+        self.local_map.insert(points, T_odom_lidar)
+        self.T_odom_inserted = T_odom_lidar
+
+    def _moved_enough(self, T_odom_lidar: Pose) -> bool:
+        T = lie.inverse(self.T_odom_inserted) @ T_odom_lidar
+        config = self.config.local_map
+        distance_m = float(np.linalg.norm(T[:-1, -1]))
+        return distance_m >= config.insert_distance_m or float(lie.rotation_angle(T)) >= config.insert_angle_rad
+
+    def _first_match(self, points: Points) -> Match:
+        k = 3 if self.dimension == 2 else 6
+        information: Matrix = np.diag(np.full(k, 1.0 / self.config.matching.sensor_noise_m**2)) * len(points)
+        return Match(
+            T_target_source=self.predictor.T_odom_lidar,
+            information=information,
+            cost=0.0,
+            inliers=len(points),
+            points=len(points),
+            iterations=0,
+            residual_m=0.0,
+            converged=True,
+            reason="first scan: the frame starts here",
+            degeneracy_eigenvalue=1.0,
+            degeneracy_direction=np.eye(k)[0],
+        )

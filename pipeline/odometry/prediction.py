@@ -1,0 +1,89 @@
+"""Where the lidar should be now: by the wheels, by constant velocity, or where it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.config import OdometryConfig
+from pipeline.data import Pose, Scan
+from pipeline.errors import InputError
+
+_LARGEST_STRETCH = 20.0  # a longer gap says nothing about the motion in it
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where to look for the next pose.
+
+    Attributes
+    ----------
+    T_odom_lidar : the expected pose
+    alternatives : poses worth trying where the expected one leads nowhere good
+    information : (k,) inverse variances of the expected pose, m⁻² and rad⁻²
+    """
+
+    T_odom_lidar: Pose
+    alternatives: tuple[Pose, ...]
+    information: NDArray[np.float64]
+
+
+class Predictor:
+    """Remembers the last pose, the last motion and the last wheel reading."""
+
+    def __init__(self, config: OdometryConfig, T_base_lidar: Pose) -> None:
+        self.config = config
+        self.T_base_lidar = T_base_lidar
+        self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
+        self.T_previous_current = self.T_odom_lidar
+        self.interval_s = 0.0
+        self.last_scan: Scan | None = None
+
+    def predict(self, scan: Scan) -> Prediction:
+        """The expected pose of a scan that follows the last one corrected."""
+        T = self.T_odom_lidar
+        constant = T @ self.T_previous_current
+        stretched = T @ lie.exp(self._stretch(scan) * lie.log(self.T_previous_current))
+        wheel = self._wheel_motion(scan)
+        if wheel is None:
+            sigma_m, sigma_rad = self.config.velocity_sigma_m, self.config.velocity_sigma_rad
+            return Prediction(constant, (stretched, T), self._information(sigma_m, sigma_rad))
+        sigma_m, sigma_rad = self.config.wheel_sigma_m, self.config.wheel_sigma_rad
+        return Prediction(T @ wheel, (constant, T), self._information(sigma_m, sigma_rad))
+
+    def correct(self, scan: Scan, T_odom_lidar: Pose) -> None:
+        """Take the pose that the scan turned out to have."""
+        if self.last_scan is not None:
+            self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
+            self.interval_s = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9
+        self.T_odom_lidar = T_odom_lidar
+        self.last_scan = scan
+
+    def _wheel_motion(self, scan: Scan) -> Pose | None:
+        """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
+        if self.config.prior == "constant-velocity" or self.last_scan is None:
+            return None
+        last, now = self.last_scan.T_odom_base, scan.T_odom_base
+        if last is None or now is None:
+            if self.config.prior == "wheel":
+                raise InputError(
+                    f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
+                    "set log.odometry_topic, or odometry.prior to 'auto'"
+                )
+            return None
+        return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
+
+    def _stretch(self, scan: Scan) -> float:
+        """This interval over the last one; 1 where the stamps make no sense."""
+        if self.last_scan is None or self.interval_s <= 0.0:
+            return 1.0
+        ratio = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9 / self.interval_s
+        return ratio if 0.0 < ratio < _LARGEST_STRETCH else 1.0
+
+    def _information(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
+        d = self.T_odom_lidar.shape[0] - 1
+        turns = 1 if d == 2 else 3
+        return np.array([sigma_m**-2] * d + [sigma_rad**-2] * turns)
