@@ -62,6 +62,8 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     wide_reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 2
     wide_max_distance_m: Positive = 3.0
     wide_kernel_scale_m: Positive = 2.0
+    seed_half_width_m: Positive = 0.5
+    seed_half_width_rad: Positive = 0.6
     tolerance_m: Positive = 1e-3
     tolerance_rad: Positive = 1e-4
     sensor_noise_m: Positive = 0.03
@@ -79,17 +81,28 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     velocity_sigma_rad: Positive = 0.2
     keyframe_distance_m: Positive = 2.0
     keyframe_angle_rad: Positive = 0.35
+    edge_sigma_m: Positive = 0.02
+    edge_sigma_rad: Positive = 0.002
 
 
 class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """How revisits are found and verified."""
+    """How revisits are found and verified.
+
+    The search radius is what odometry may have drifted since the place was seen, ``drift`` metres a metre, at
+    least ``min_radius_m`` and at most ``max_radius_m``.
+    """
 
     enabled: bool = True
-    radius_m: Positive = 10.0
-    min_travel_m: Positive = 20.0
+    drift: Positive = 0.03
+    min_radius_m: Positive = 5.0
+    max_radius_m: Positive = 30.0
+    min_travel_m: Positive = 30.0
+    submap_keyframes: Count = 5
     min_overlap: Share = 0.6
-    max_residual_m: Positive = 0.3
-    submap_keyframes: Count = 10
+    min_information: NonNegative = 0.01
+    edge_sigma_m: Positive = 0.05
+    edge_sigma_rad: Positive = 0.005
+    optimise_every: Count = 10
 
 
 class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -32,6 +32,7 @@ class Scan:
     times_s : (N,) float32, seconds of each point relative to ``stamp_ns``; (0,) where the log has none
     dropped : returns removed because they were NaN, infinite or out of range
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
+    waited_s : seconds that the reader of the log made its consumer wait for this scan
     """
 
     index: int
@@ -41,6 +42,7 @@ class Scan:
     times_s: NDArray[np.float32]
     dropped: int
     T_odom_base: Pose | None
+    waited_s: float = 0.0
 
 
 class State(StrEnum):
@@ -89,6 +91,27 @@ class Match:
     def inlier_share(self) -> float:
         """Share of the source points that found a partner."""
         return self.inliers / max(self.points, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A scan that stands in the pose graph.
+
+    Attributes
+    ----------
+    index : its number in the graph
+    scan_index, stamp_ns : the scan it was made of
+    points : (M, d) deskewed points, lidar frame
+    T_odom_lidar : pose in the odometry frame
+    travelled_m : length of the way up to it, by odometry
+    """
+
+    index: int
+    scan_index: int
+    stamp_ns: int
+    points: Points
+    T_odom_lidar: Pose
+    travelled_m: float
 
 
 class Verdict(StrEnum):

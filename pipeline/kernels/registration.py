@@ -10,11 +10,15 @@ from pipeline.kernels.association import associate
 from pipeline.kernels.descent import LEVENBERG_MARQUARDT, NEWTON, predicted_decrease, relax, step
 from pipeline.kernels.residuals import normal_equations
 from pipeline.kernels.twist import orthonormalise, perturb
+from pipeline.kernels.voxels import Voxels
 
-CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR, NO_DECREASE = 0, 1, 2, 3, 4
-
+CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # of the kernel's scale from one association to the next
+PATIENCE = 20  # associations at the last scale
+NEARLY = 1.0  # tolerances within which the pairs are kept
+COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 
 
 class Terms(NamedTuple):
@@ -49,90 +53,128 @@ class Outcome(NamedTuple):
     ending: int
 
 
+class Problem(NamedTuple):
+    """What stays through an alignment, but for ``partner`` (N,), the pairs of the moment."""
+
+    voxels: Voxels
+    points: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    partner: NDArray[np.int32]
+    terms: Terms
+
+
+class Estimate(NamedTuple):
+    """A pose, the twist ``away`` from the first one, and the normal equations there; ``sums`` (4,) as above."""
+
+    T: NDArray[np.float64]
+    away: NDArray[np.float64]
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    sums: NDArray[np.float64]
+
+
 @njit(cache=True)
 def align(voxels, points, T, prior, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ diag(prior) ξ, where ξ is the twist away from
-    the first value: prior (k,) is the information of the prediction times the variance of a residual. Twists turn
-    about the first value's position.
-    Points keep their partners while the pose moves less than a hundredth of a voxel; steps that raise the cost
-    of the same pairs are taken back and damped harder (Levenberg 1944, Marquardt 1963; gain ratio after
-    Nielsen 1999).
+    the first value: prior (k,) is the information of the prediction times the variance of a residual. Twists
+    turn about the first value's position.
+    Points find new partners after every step until the steps are nearly small, or PATIENCE were taken with the
+    kernel at its last scale: pairs that flip to and fro would go on for ever. From then on the pairs stay.
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
-    H, b = np.zeros((k, k)), np.zeros(k)
-    H_trial, b_trial = np.zeros((k, k)), np.zeros(k)
-    factor, x, away = np.zeros((k, k)), np.zeros(k), np.zeros(k)
-    T_trial = T.copy()
     origin = np.zeros(3)
     origin[: points.shape[1]] = T[:-1, -1]
-    partner = np.empty(points.shape[0], np.int32)
-    second_order = terms.optimiser == NEWTON
-    damping, growth = 1e-4, 2.0
-    renew, pairs, ending = True, 0, OUT_OF_ITERATIONS
-    cost = weights = squares = 0.0
-    iterations = 0
-    scale_m = terms.first_scale_m
+    problem = Problem(voxels, points, origin, prior, np.empty(points.shape[0], np.int32), terms)
+    now = Estimate(T, np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
+    trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
+    x, factor = np.zeros(k), np.zeros((k, k))
+    now.sums[DAMPING] = _FIRST_DAMPING
+    scale_m, settled = terms.first_scale_m, 0
+    pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
     while iterations < terms.max_iterations:
         iterations += 1
-        if renew:
-            pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, partner)
+        if settled < PATIENCE:
+            pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, problem.partner)
             if pairs == 0:
                 ending = NO_PARTNERS
                 break
-            cost, weights, squares = normal_equations(
-                voxels, points, T, origin, partner, scale_m, terms.point_weight, second_order, H, b
-            )
-            cost += _add_prior(H, b, prior, away, 1.0)
-        if not step(terms.optimiser, H, b, damping, factor, x):
+            _linearise(problem, scale_m, now)
+        if not _descend(problem, scale_m, now, trial, x, factor):
             ending = SINGULAR
             break
-        perturb(x, T, origin, T_trial)
-        trial, trial_weights, trial_squares = normal_equations(
-            voxels, points, T_trial, origin, partner, scale_m, terms.point_weight, second_order, H_trial, b_trial
-        )
-        away += x
-        trial += _add_prior(H_trial, b_trial, prior, away, 1.0)
-        small = _is_small(x, terms)
-        if terms.optimiser == LEVENBERG_MARQUARDT and trial > cost * (1.0 + 1e-12):
-            away -= x
-            renew = False
-            if damping > 1e8 or (small and scale_m <= terms.scale_m):
-                ending = CONVERGED if small else NO_DECREASE
+        if scale_m <= terms.scale_m:
+            if _is_small(x, terms, 1.0):
+                ending = CONVERGED
                 break
-            damping, growth = damping * growth, 2.0 * growth
-            continue
-        gain = (cost - trial) / max(predicted_decrease(H, b, x), 1e-300)
-        damping, growth = max(relax(damping, min(gain, 1.0)), 1e-9), 2.0
-        T[:, :] = T_trial
-        H[:, :], b[:] = H_trial, b_trial
-        cost, weights, squares = trial, trial_weights, trial_squares
-        if small and scale_m <= terms.scale_m:
-            ending = CONVERGED
-            break
+            settled = PATIENCE if _is_small(x, terms, NEARLY) else settled + 1
         scale_m = max(terms.scale_m, SHRINK * scale_m)
-        renew = True
     orthonormalise(T)
-    cost -= _add_prior(H, b, prior, away, -1.0)
-    cost += 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
-    return Outcome(H, cost, weights, squares, pairs, iterations, ending)
+    for i in range(k):
+        now.H[i, i] -= prior[i]
+        now.sums[COST] -= 0.5 * prior[i] * now.away[i] * now.away[i]
+    cost = now.sums[COST] + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
+    return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
+
+
+@njit(cache=True)
+def _linearise(problem, scale_m: float, estimate):
+    """Fill the estimate's normal equations and sums at its pose, the prediction's pull included."""
+    terms = problem.terms
+    cost, weights, squares = normal_equations(
+        problem.voxels,
+        problem.points,
+        estimate.T,
+        problem.origin,
+        problem.partner,
+        scale_m,
+        terms.point_weight,
+        terms.optimiser == NEWTON,
+        estimate.H,
+        estimate.b,
+    )
+    for i in range(estimate.b.shape[0]):
+        pull = problem.prior[i] * estimate.away[i]
+        estimate.H[i, i] += problem.prior[i]
+        estimate.b[i] += pull
+        cost += 0.5 * pull * estimate.away[i]
+    estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
+
+
+@njit(cache=True)
+def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
+    """Take one step x (k,) with the present pairs; False where the equations determine none.
+
+    Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
+    that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more.
+    """
+    terms = problem.terms
+    growth = 2.0
+    while step(terms.optimiser, now.H, now.b, now.sums[DAMPING], factor, x):
+        perturb(x, now.T, problem.origin, trial.T)
+        for i in range(x.shape[0]):
+            trial.away[i] = now.away[i] + x[i]
+        _linearise(problem, scale_m, trial)
+        lowered = now.sums[COST] - trial.sums[COST]
+        if terms.optimiser != LEVENBERG_MARQUARDT or lowered >= 0.0:
+            gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
+            trial.sums[DAMPING] = max(relax(now.sums[DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
+            now.T[:, :], now.away[:] = trial.T, trial.away
+            now.H[:, :], now.b[:], now.sums[:] = trial.H, trial.b, trial.sums
+            return True
+        if _is_small(x, terms, 1.0) or now.sums[DAMPING] > _MOST_DAMPING:
+            x[:] = 0.0
+            return True
+        now.sums[DAMPING] *= growth
+        growth *= 2.0
+    return False
 
 
 @njit(cache=True, inline="always")
-def _add_prior(H, b, prior, away, sign: float) -> float:
-    """Add the prediction's pull to the normal equations (or take it off again); returns its cost."""
-    cost = 0.0
-    for i in range(b.shape[0]):
-        H[i, i] += sign * prior[i]
-        b[i] += sign * prior[i] * away[i]
-        cost += 0.5 * prior[i] * away[i] * away[i]
-    return cost
-
-
-@njit(cache=True, inline="always")
-def _is_small(x, terms) -> bool:
+def _is_small(x, terms, times: float) -> bool:
     d = 2 if x.shape[0] == 3 else 3
     shift = turn = 0.0
     for i in range(x.shape[0]):
@@ -140,4 +182,4 @@ def _is_small(x, terms) -> bool:
             shift += x[i] * x[i]
         else:
             turn += x[i] * x[i]
-    return shift < terms.tolerance_m**2 and turn < terms.tolerance_rad**2
+    return shift < (times * terms.tolerance_m) ** 2 and turn < (times * terms.tolerance_rad) ** 2

@@ -22,8 +22,8 @@ def normal_equations(
 
     points : (N, d) metres, source frame; origin : (3,), map frame; partner : (N,) rows of the map's voxels, −1 for none
     scale_m : s; residuals far above it are all but ignored
-    second_order : adds the curvature of the rotation, r nᵀ ∂²p/∂φ², which makes it Newton's Hessian (the
-        weights held fixed)
+    second_order : adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
+        held fixed)
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
     """
     H[:, :] = 0.0
@@ -160,17 +160,30 @@ def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
 
 @njit(cache=True)
 def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
-    """∂²/∂φ² of eᵀ exp(φ) p at φ = 0: ½(e pᵀ + p eᵀ) − (eᵀp) I; in 2D −eᵀp."""
+    """Second derivative of eᵀ exp(ξ) p at ξ = 0, of which the first-order rows know nothing.
+
+    exp(ξ) p = p + φ × p + ρ + ½ φ × (φ × p) + ½ φ × ρ + …, so that the blocks are
+        ½(e pᵀ + p eᵀ) − (eᵀp) I for (φ, φ), in 2D −eᵀp, and ½ φᵀ(ρ × e) for (ρ, φ).
+    """
     dot = ex * px + ey * py + ez * pz
+    half = 0.5 * w
     if planar:
         H[2, 2] -= w * dot
+        H[0, 2] += half * ey
+        H[1, 2] -= half * ex
         return
+    H[0, 4] -= half * ez
+    H[0, 5] += half * ey
+    H[1, 3] += half * ez
+    H[1, 5] -= half * ex
+    H[2, 3] -= half * ey
+    H[2, 4] += half * ex
     H[3, 3] += w * (ex * px - dot)
     H[4, 4] += w * (ey * py - dot)
     H[5, 5] += w * (ez * pz - dot)
-    H[3, 4] += w * 0.5 * (ex * py + ey * px)
-    H[3, 5] += w * 0.5 * (ex * pz + ez * px)
-    H[4, 5] += w * 0.5 * (ey * pz + ez * py)
+    H[3, 4] += half * (ex * py + ey * px)
+    H[3, 5] += half * (ex * pz + ez * px)
+    H[4, 5] += half * (ey * pz + ez * py)
 
 
 @njit(cache=True, inline="always")

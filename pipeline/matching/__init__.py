@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import MatchingConfig
 from pipeline.data import Match, Points, Pose
+from pipeline.matching.correlative import correlative_seed
 from pipeline.matching.matcher import PointToShapeMatcher
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.svd_icp import SvdMatcher
@@ -18,6 +19,7 @@ __all__ = [
     "PointToShapeMatcher",
     "SvdMatcher",
     "VoxelMap",
+    "correlative_seed",
     "create_matcher",
     "rigid_transform",
 ]

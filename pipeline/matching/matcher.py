@@ -27,7 +27,6 @@ _ENDINGS = {
     registration.OUT_OF_ITERATIONS: "out of iterations",
     registration.NO_PARTNERS: "no point has a partner in the map",
     registration.SINGULAR: "the partners do not determine the pose",
-    registration.NO_DECREASE: "no step lowers the cost any more",
 }
 
 
@@ -102,7 +101,7 @@ def judge(T: Pose, T_first: Pose, outcome: Outcome, points: Points, sensor_noise
         points=len(points),
         iterations=outcome.iterations,
         residual_m=residual_m,
-        converged=outcome.ending in (registration.CONVERGED, registration.NO_DECREASE),
+        converged=outcome.ending == registration.CONVERGED,
         reason=_ENDINGS[outcome.ending],
         degeneracy_eigenvalue=eigenvalue,
         degeneracy_direction=direction,

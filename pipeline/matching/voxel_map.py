@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline import lie
 from pipeline.config import LocalMapConfig
 from pipeline.data import Points, Pose
 from pipeline.kernels.voxels import TICK, Voxels, insert, keep
@@ -42,10 +43,9 @@ class VoxelMap:
 
     def _rebuild(self, room: int, T_map_lidar: Pose, radius_m: float) -> None:
         kept = _empty(max(room, len(self)), self.config.voxel_size_m)
-        position = np.zeros(3)
-        position[: self.dimension] = T_map_lidar[:-1, -1]
+        x, y, z = lie.lift(T_map_lidar)[:3, 3]
         oldest = self.insertions - self.config.max_insertions
-        keep(self.voxels, kept, *position, radius_m, float(oldest))
+        keep(self.voxels, kept, x, y, z, radius_m, float(oldest))
         self.voxels = kept
 
 

@@ -11,13 +11,13 @@ from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Match, Matrix, Points, Pose, Scan, State
 from pipeline.errors import InputError
-from pipeline.matching import VoxelMap, create_matcher
+from pipeline.matching import VoxelMap, correlative_seed, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
 from pipeline.preprocess import downsample, preprocess
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
-_DOUBT = 1.3  # cost per point over its running mean, from which on other guesses are tried
+_DOUBT = 2.0  # cost per point over its running mean, from which on other guesses are tried
 _MEMORY = 0.9  # of that running mean, per scan
 
 
@@ -51,6 +51,7 @@ class Odometry:
         self.matcher = create_matcher(config.matching)
         self.local_map = VoxelMap(self.dimension, config.local_map)
         self.T_odom_inserted = self.predictor.T_odom_lidar
+        self.no_prior = np.zeros(3 if self.dimension == 2 else 6)
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
         self.usual_cost = 0.0
@@ -86,19 +87,34 @@ class Odometry:
         )  # fmt: skip
 
     def _align(self, points: Points, prediction: Prediction) -> Match:
-        """The best of the alignments from the expected pose and, where that one is doubtful, from others."""
+        """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
         wide = self.wide_scans > 0
         best = self.matcher.align(
             points, self.local_map, prediction.T_odom_lidar, prediction.information, wide=wide
         )
-        if best.cost > _DOUBT * self.usual_cost * len(points):
-            for guess in prediction.alternatives:
-                other = self.matcher.align(points, self.local_map, guess, prediction.information, wide=wide)
+        doubtful_cost = _DOUBT * self.usual_cost * len(points)
+        if best.cost > doubtful_cost > 0.0:
+            for guess in self._guesses(points, prediction):
+                other = self.matcher.align(points, self.local_map, guess, self.no_prior, wide=True)
                 if other.cost < best.cost:
                     best = other
         cost = best.cost / len(points)
         self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
+
+    def _guesses(self, points: Points, prediction: Prediction) -> tuple[Pose, ...]:
+        """Other poses to start from; in the plane also the best of a grid around the expected one."""
+        if self.dimension == 3:
+            return prediction.alternatives
+        config = self.config.matching
+        seed = correlative_seed(
+            points,
+            self.local_map,
+            prediction.T_odom_lidar,
+            half_width_m=config.seed_half_width_m,
+            half_width_rad=config.seed_half_width_rad,
+        )
+        return (*prediction.alternatives, seed)
 
     def _judge(self, match: Match) -> tuple[State, str]:
         config = self.config.matching

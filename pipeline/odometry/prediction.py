@@ -77,7 +77,7 @@ class Predictor:
         return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
 
     def _stretch(self, scan: Scan) -> float:
-        """This interval over the last one; 1 where the stamps make no sense."""
+        """The interval up to this scan over the last one; 1 where the stamps make no sense."""
         if self.last_scan is None or self.interval_s <= 0.0:
             return 1.0
         ratio = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9 / self.interval_s

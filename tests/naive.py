@@ -1,0 +1,99 @@
+"""Slow, clear twins of the matching kernels; every kernel test says fast == naive."""
+
+import numpy as np
+
+from pipeline import lie
+
+
+def voxel_of(point, size):
+    return tuple(np.floor(np.append(point, [0.0] * (3 - len(point))) / size).astype(int))
+
+
+def group(points, size):
+    """Points by voxel."""
+    groups = {}
+    for point in points:
+        groups.setdefault(voxel_of(point, size), []).append(point)
+    return {key: np.array(members) for key, members in groups.items()}
+
+
+def shape(points, neighbours, alone):
+    """Shape name and direction of one voxel's points; neighbours' points join in while they are few."""
+    members = points if len(points) >= alone else np.concatenate([points, *neighbours])
+    d = members.shape[1]
+    if len(members) < (3 if d == 2 else 5):
+        return "point", None
+    centred = members - members.mean(0)
+    values, vectors = np.linalg.eigh(centred.T @ centred / len(members))
+    if d == 2:
+        return ("plane", vectors[:, 0]) if values[0] < 0.1 * values[1] else ("point", None)
+    if values[0] < 0.1 * values[1]:
+        return "plane", vectors[:, 0]
+    if values[1] < 0.1 * values[2]:
+        return "line", vectors[:, 2]
+    return "point", None
+
+
+def nearest_mean(point, means, size, reach, max_distance):
+    """Key of the nearest voxel mean among the (2·reach)ᵈ voxels around a point, None if none is near."""
+    d = len(point)
+    base = np.floor(point / size - 0.5).astype(int) - reach + 1
+    best, chosen = max_distance, None
+    for key, mean in means.items():
+        offset = np.array(key[:d]) - base
+        if (offset >= 0).all() and (offset < 2 * reach).all() and np.linalg.norm(mean - point) < best:
+            best, chosen = np.linalg.norm(mean - point), key
+    return chosen
+
+
+def residual(p, mean, kind, direction, point_weight):
+    """Residual vector whose squared length the cost counts."""
+    e = p - mean
+    if kind == "plane":
+        return np.array([direction @ e])
+    if kind == "line":
+        e = e - direction * (direction @ e)
+    return np.sqrt(point_weight) * e
+
+
+def cost(points, pairs, T, scale, point_weight):
+    """Σ ½ s²r²/(s²+r²) over pairs (index, mean, kind, direction)."""
+    total = 0.0
+    moved = lie.transform(T, points)
+    for i, mean, kind, direction in pairs:
+        r2 = float((residual(moved[i], mean, kind, direction, point_weight) ** 2).sum())
+        total += 0.5 * scale**2 * r2 / (scale**2 + r2)
+    return total
+
+
+def gauss_newton_hessian(points, pairs, T, origin, scale, point_weight):
+    """Σ w JᵀJ with J by central differences of the residual under a left twist about the origin."""
+    k = 3 if points.shape[1] == 2 else 6
+    shift = lie.identity(points.shape[1])
+    shift[:-1, -1] = origin
+    H = np.zeros((k, k))
+    h = 1e-6
+    steps = [shift @ lie.exp(h * unit) @ lie.inverse(shift) @ T for unit in np.vstack([np.eye(k), -np.eye(k)])]
+    moved = [lie.transform(step, points) for step in steps]
+    here = lie.transform(T, points)
+    for i, mean, kind, direction in pairs:
+        args = (mean, kind, direction, point_weight)
+        J = np.stack(
+            [(residual(moved[a][i], *args) - residual(moved[a + k][i], *args)) / (2 * h) for a in range(k)], axis=1
+        )
+        r2 = float((residual(here[i], *args) ** 2).sum())
+        H += (scale**2 / (scale**2 + r2)) ** 2 * J.T @ J
+    return H
+
+
+def first_per_voxel(points, size, low, high):
+    seen, chosen = set(), []
+    for i, point in enumerate(points):
+        if low <= np.linalg.norm(point) <= high and voxel_of(point, size) not in seen:
+            seen.add(voxel_of(point, size))
+            chosen.append(i)
+    return chosen
+
+
+def deskew(points, shares, twist):
+    return np.array([lie.transform(lie.exp(s * twist), p[None])[0] for p, s in zip(points, shares, strict=True)])

@@ -1,0 +1,219 @@
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipeline import lie
+from pipeline.config import LocalMapConfig, MatchingConfig
+from pipeline.matching import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
+from pipeline.matching.matcher import OPTIMISERS
+
+
+def room(dimension, seed=0, unit=1.0):
+    """Points on the walls (and floor) of a room with a pillar, some centimetres of noise."""
+    rng = np.random.default_rng(seed)
+    n = 3000
+    z = rng.uniform(0.0, 2.5, n)
+    x, y = rng.uniform(-4.0, 4.0, n), rng.uniform(-3.0, 3.0, n)
+    walls = [
+        np.column_stack([x, np.full(n, 3.0), z]),
+        np.column_stack([x, np.full(n, -3.0), z]),
+        np.column_stack([np.full(n, 4.0), y, z]),
+        np.column_stack([np.full(n, -4.0), y, z]),
+    ]
+    if dimension == 3:
+        walls.append(np.column_stack([x, y, np.zeros(n)]))
+    points = np.concatenate(walls) + 0.01 * rng.normal(size=(n * len(walls), 3))
+    return unit * np.ascontiguousarray(points[:, :dimension])
+
+
+def set_up(dimension, unit=1.0, **changes):
+    """A matcher for the room, every length of its configuration in the given unit."""
+    settings = {
+        "max_distance_m": 0.8, "kernel_scale_m": 0.2, "wide_max_distance_m": 1.0, "wide_kernel_scale_m": 0.5,
+        "tolerance_m": 1e-5, "sensor_noise_m": 0.02,
+    }  # fmt: skip
+    scaled = {name: unit * value for name, value in settings.items()}
+    config = msgspec.convert({"tolerance_rad": 1e-6, "max_iterations": 200, **scaled, **changes}, MatchingConfig)
+    target = VoxelMap(dimension, LocalMapConfig(voxel_size_m=0.4 * unit))
+    target.insert(room(dimension, unit=unit), lie.identity(dimension))
+    return create_matcher(config), target
+
+
+def truth(dimension, unit=1.0):
+    T = lie.exp(np.array([0.12, -0.07, 0.04] if dimension == 2 else [0.12, -0.07, 0.05, 0.02, -0.03, 0.04]))
+    T[:-1, -1] *= unit
+    return T
+
+
+def no_prior(dimension):
+    return np.zeros(3 if dimension == 2 else 6)
+
+
+def scan_at(T, unit=1.0):
+    """The room seen from T, a tenth of its points."""
+    return lie.transform(lie.inverse(T), room(T.shape[0] - 1, seed=1, unit=unit)[::10])
+
+
+def off(T_a, T_b):
+    return np.abs(lie.log(lie.inverse(T_a) @ T_b)).max()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("optimiser", list(OPTIMISERS))
+def test_all_four_optimisers_reach_the_same_minimum_near_the_truth(dimension, optimiser):
+    T = truth(dimension)
+    iterations = 20_000 if optimiser == "gradient-descent" else 200
+    matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=iterations)
+    reference, _ = set_up(dimension)
+    match = matcher.align(scan_at(T), target, lie.identity(dimension), no_prior(dimension))
+    expected = reference.align(scan_at(T), target, lie.identity(dimension), no_prior(dimension))
+    assert expected.converged
+    assert off(expected.T_target_source, T) < 3e-3
+    assert off(match.T_target_source, expected.T_target_source) < 1e-3
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_second_order_methods_need_far_fewer_steps_than_gradient_descent(dimension):
+    steps = {}
+    for optimiser in OPTIMISERS:
+        matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=20_000)
+        T = truth(dimension)
+        steps[optimiser] = matcher.align(scan_at(T), target, lie.identity(dimension), no_prior(dimension)).iterations
+    assert max(steps["newton"], steps["gauss-newton"], steps["levenberg-marquardt"]) < 20
+    assert steps["gradient-descent"] > 2 * steps["levenberg-marquardt"]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
+def test_metres_or_centimetres_same_motion(dimension, matcher_name):
+    answers = []
+    for unit in (1.0, 100.0):
+        matcher, target = set_up(dimension, unit, matcher=matcher_name)
+        match = matcher.align(scan_at(truth(dimension, unit), unit), target, lie.identity(dimension), no_prior(dimension))
+        T = match.T_target_source.copy()
+        T[:-1, -1] /= unit
+        answers.append((T, match.iterations, match.inliers, match.degeneracy_eigenvalue))
+    np.testing.assert_allclose(answers[0][0], answers[1][0], atol=1e-7)
+    assert answers[0][1:3] == answers[1][1:3]
+    assert answers[0][3] == pytest.approx(answers[1][3], rel=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
+def test_both_matchers_find_the_motion_from_a_guess_half_a_metre_off(dimension, matcher_name):
+    T = truth(dimension)
+    T[0, -1] += 0.4
+    matcher, target = set_up(dimension, matcher=matcher_name)
+    match = matcher.align(scan_at(T), target, lie.identity(dimension), no_prior(dimension), wide=True)
+    assert match.converged
+    assert off(match.T_target_source, T) < (3e-3 if matcher_name == "plicp" else 0.05)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_information_predicts_the_spread_of_repeated_matches(dimension):
+    """Independent noise on the scan only: the mean squared Mahalanobis distance is about k."""
+    T = truth(dimension)
+    matcher, target = set_up(dimension, kernel_scale_m=1.0, sensor_noise_m=0.05)
+    clean = scan_at(T)
+    rng = np.random.default_rng(3)
+    matches = [
+        matcher.align(clean + 0.05 * rng.normal(size=clean.shape), target, T, no_prior(dimension)) for _ in range(60)
+    ]
+    mean = np.mean([lie.log(lie.inverse(T) @ match.T_target_source) for match in matches], axis=0)
+    errors = [lie.log(lie.inverse(T) @ match.T_target_source) - mean for match in matches]
+    squares = [e @ match.information @ e for e, match in zip(errors, matches, strict=True)]
+    k = len(mean)
+    assert 0.5 < np.mean(squares) / k < 2.0
+
+
+def test_a_corridor_is_reported_as_degenerate_along_its_axis():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-10, 10, 4000)
+    walls = np.column_stack([x, np.where(rng.random(4000) < 0.5, 1.0, -1.0) + 0.005 * rng.normal(size=4000)])
+    turned = lie.exp(np.array([0.0, 0.0, 0.5]))
+    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
+    target.insert(lie.transform(turned, walls), lie.identity(2))
+    match = create_matcher(MatchingConfig(max_distance_m=0.8)).align(walls[::10], target, turned, np.zeros(3))
+    open_room, room_map = set_up(2)
+    free = open_room.align(scan_at(truth(2)), room_map, lie.identity(2), np.zeros(3))
+    assert match.degeneracy_eigenvalue < 1e-3 < 0.1 < free.degeneracy_eigenvalue
+    assert abs(match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
+
+
+def test_a_prediction_holds_the_pose_where_the_map_does_not():
+    x = np.linspace(-10, 10, 2000)
+    wall = np.column_stack([x, np.full(2000, 1.0)])
+    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
+    target.insert(wall, lie.identity(2))
+    start = lie.pose_2d(0.31, 0.1, 0.0)
+    match = create_matcher(MatchingConfig()).align(wall[500:1500], target, start, np.array([1e2, 1e2, 1e2]))
+    assert match.T_target_source[0, 2] == pytest.approx(0.31, abs=1e-2)
+    assert match.T_target_source[1, 2] == pytest.approx(0.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
+def test_a_scan_far_from_the_map_says_that_nothing_matched(matcher_name):
+    matcher, target = set_up(2, matcher=matcher_name)
+    away = lie.pose_2d(500.0, 0.0, 0.0)
+    match = matcher.align(scan_at(truth(2)), target, away, np.zeros(3))
+    assert (match.inliers, match.converged) == (0, False)
+    assert match.reason == "no point has a partner in the map"
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_closed_form_equals_scipys(dimension):
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(40, 3)) * ([1, 1, 0] if dimension == 2 else 1)
+    T = lie.exp(np.array([1, 2, 0, 0, 0, 2.0] if dimension == 2 else [1, 2, 3, 0.3, -1.2, 2.0]))
+    y = lie.transform(T, x) + 0.1 * rng.normal(size=x.shape) * ([1, 1, 0] if dimension == 2 else 1)
+    weight = rng.uniform(0.1, 1.0, 40)
+    centre = [weight @ v / weight.sum() for v in (x, y)]
+    R = Rotation.align_vectors(y - centre[1], x - centre[0], weights=weight)[0].as_matrix()
+    answer = rigid_transform(x[:, :dimension], y[:, :dimension], weight)
+    np.testing.assert_allclose(answer[:-1, :-1], R[:dimension, :dimension], atol=1e-9)
+    np.testing.assert_allclose(answer[:-1, -1], (centre[1] - R @ centre[0])[:dimension], atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_noisy_points_never_come_out_as_a_reflection(dimension):
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        x, y = rng.normal(size=(2, dimension + 1, dimension))
+        T = rigid_transform(x, y, np.ones(len(x)))
+        assert np.linalg.det(T[:-1, :-1]) == pytest.approx(1.0)
+
+
+def test_planar_points_in_space_give_a_rotation_not_a_reflection():
+    rng = np.random.default_rng(6)
+    x = rng.normal(size=(30, 3)) * [1, 1, 0]
+    T = lie.exp(np.array([1, 2, 3, 0.3, -1.2, 2.0]))
+    np.testing.assert_allclose(rigid_transform(x, lie.transform(T, x), np.ones(30)), T, atol=1e-9)
+
+
+def test_points_on_a_line_in_space_are_refused_not_answered():
+    x = np.outer(np.linspace(-1, 1, 20), [1.0, 2.0, -1.0])
+    with pytest.raises(DegeneratePairsError, match="on a line"):
+        rigid_transform(x, x + 1.0, np.ones(20))
+
+
+def test_points_on_one_spot_are_refused_in_the_plane():
+    with pytest.raises(DegeneratePairsError, match="on a point"):
+        rigid_transform(np.ones((5, 2)), np.zeros((5, 2)), np.ones(5))
+
+
+def test_a_map_forgets_what_is_far_and_what_is_old():
+    config = LocalMapConfig(voxel_size_m=1.0, max_distance_m=30.0, max_insertions=50)
+    target = VoxelMap(3, config)
+    rng = np.random.default_rng(0)
+    sizes = []
+    for step in range(400):
+        target.insert(rng.uniform(-10, 10, (500, 3)), lie.exp(np.array([step * 1.0, 0, 0, 0, 0, 0])))
+        sizes.append(len(target))
+    assert np.abs(target.points()[:, 0] - 399.0).max() < 30.0 + 20 * 1.0 + 10.0
+    assert max(sizes[200:]) < 1.1 * max(sizes[100:200])
+    standing = VoxelMap(2, config)
+    standing.insert(np.array([[5.0, 5.0]]), lie.identity(2))
+    for _ in range(80):
+        standing.insert(np.array([[1.0, 1.0]]), lie.identity(2))
+    assert len(standing) == 1
