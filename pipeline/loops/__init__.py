@@ -1,1 +1,5 @@
 """Propose and verify revisits."""
+
+from pipeline.loops.closer import LoopCloser
+
+__all__ = ["LoopCloser"]

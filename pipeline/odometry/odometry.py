@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipeline.data import Match, Matrix, Points, Pose, Scan, State
 from pipeline.errors import InputError
 from pipeline.matching import VoxelMap, correlative_seed, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
-from pipeline.preprocess import downsample, preprocess
+from pipeline.preprocess import downsample, middle_s, preprocess
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
@@ -25,8 +25,8 @@ _MEMORY = 0.9  # of that running mean, per scan
 class Tracked:
     """A scan with its place in the odometry frame.
 
-    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, in the
-    lidar frame; the seconds tell where the time went.
+    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
+    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
     """
 
     scan: Scan
@@ -76,15 +76,36 @@ class Odometry:
             state, reason = self._judge(match)
         else:
             match = self._first_match(matched)
-            state, reason = State.OK, "first scan"
-        T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
+            state, reason = State.OK, match.reason
+        T_odom_middle = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         aligned = perf_counter()
-        self.predictor.correct(scan, T_odom_lidar)
-        self._extend(points, T_odom_lidar, state)
+        T_stamp_middle = self._from_middle_to_stamp(scan, T_odom_middle)
+        self.predictor.correct(scan, T_odom_middle)
+        self._extend(points, T_odom_middle, state)
         return Tracked(
-            scan, points, matched, T_odom_lidar, match, state, reason,
-            prepared - started, aligned - prepared, perf_counter() - aligned,
-        )  # fmt: skip
+            scan=scan,
+            points=lie.transform(T_stamp_middle, points),
+            matched=lie.transform(T_stamp_middle, matched),
+            T_odom_lidar=T_odom_middle @ lie.inverse(T_stamp_middle),
+            match=seen_from(match, T_stamp_middle),
+            state=state,
+            reason=reason,
+            preprocess_s=prepared - started,
+            match_s=aligned - prepared,
+            map_s=perf_counter() - aligned,
+        )
+
+    def _from_middle_to_stamp(self, scan: Scan, T_odom_middle: Pose) -> Pose:
+        """T_stamp_middle by the velocity between the middles of the last scan and this one.
+
+        Scans are matched as seen from their middle; the stamp lies between two middles, or just beyond.
+        """
+        interval_s = self.predictor.interval_to(scan)
+        middle = middle_s(scan, self.config.preprocess)
+        if middle == 0.0 or interval_s <= 0.0:
+            return lie.identity(self.dimension)
+        motion = lie.inverse(self.predictor.T_odom_lidar) @ T_odom_middle
+        return lie.exp(middle / interval_s * lie.log(motion))
 
     def _align(self, points: Points, prediction: Prediction) -> Match:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
@@ -170,3 +191,16 @@ class Odometry:
             degeneracy_eigenvalue=1.0,
             degeneracy_direction=np.eye(k)[0],
         )
+
+
+def seen_from(match: Match, T_new_old: Pose) -> Match:
+    """The match of a scan whose points are given in another frame that moves with it."""
+    T_old_new = lie.inverse(T_new_old)
+    direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
+    Ad_inverse = lie.adjoint(T_old_new)
+    return replace(
+        match,
+        T_target_source=match.T_target_source @ T_old_new,
+        information=Ad_inverse.T @ match.information @ Ad_inverse,
+        degeneracy_direction=direction / np.linalg.norm(direction),
+    )

@@ -58,9 +58,13 @@ class Predictor:
         """Take the pose that the scan turned out to have."""
         if self.last_scan is not None:
             self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
-            self.interval_s = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9
+            self.interval_s = self.interval_to(scan)
         self.T_odom_lidar = T_odom_lidar
         self.last_scan = scan
+
+    def interval_to(self, scan: Scan) -> float:
+        """Seconds from the last scan's stamp to this one's; 0 for the first scan."""
+        return (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9 if self.last_scan is not None else 0.0
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
@@ -80,7 +84,7 @@ class Predictor:
         """The interval up to this scan over the last one; 1 where the stamps make no sense."""
         if self.last_scan is None or self.interval_s <= 0.0:
             return 1.0
-        ratio = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9 / self.interval_s
+        ratio = self.interval_to(scan) / self.interval_s
         return ratio if 0.0 < ratio < _LARGEST_STRETCH else 1.0
 
     def _information(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:

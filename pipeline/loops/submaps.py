@@ -1,0 +1,48 @@
+"""Small maps around a keyframe, built when a loop closure first asks for them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+from pipeline import lie
+from pipeline.config import LocalMapConfig
+from pipeline.data import Keyframe
+from pipeline.matching import VoxelMap
+
+_HELD = 64  # submaps in memory; the one unused for longest goes first
+
+
+class Submaps:
+    """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame.
+
+    Neighbouring keyframes are placed by odometry, which over so short a way is as good as any pose known later.
+    """
+
+    def __init__(self, dimension: int, half_width: int, config: LocalMapConfig) -> None:
+        self.dimension = dimension
+        self.half_width = half_width
+        self.config = config
+        self.held: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
+
+    def anchor_of(self, keyframe: int) -> int:
+        """The keyframe whose submap this one is nearest the middle of."""
+        return keyframe // self.half_width * self.half_width
+
+    def around(self, anchor: int, keyframes: Sequence[Keyframe], newest: int) -> VoxelMap:
+        """The submap of an anchor out of the keyframes up to ``newest``."""
+        last = min(anchor + self.half_width, newest)
+        submap = self.held.pop((anchor, last), None)
+        if submap is None:
+            submap = self._build(keyframes[anchor], keyframes[max(anchor - self.half_width, 0) : last + 1])
+        self.held[anchor, last] = submap
+        if len(self.held) > _HELD:
+            self.held.popitem(last=False)
+        return submap
+
+    def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
+        submap = VoxelMap(self.dimension, self.config)
+        T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
+        for keyframe in members:
+            submap.insert(keyframe.points, T_anchor_odom @ keyframe.T_odom_lidar)
+        return submap

@@ -1,0 +1,200 @@
+"""The whole chain: odometry, keyframes, loop closures, pose graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.config import Config
+from pipeline.data import (
+    Closure,
+    GraphState,
+    Keyframe,
+    Match,
+    Matrix,
+    Points,
+    Pose,
+    Scan,
+    State,
+    Step,
+    Timing,
+    Trajectory,
+    Verdict,
+)
+from pipeline.graph.pose_graph import PoseGraph
+from pipeline.loops import LoopCloser
+from pipeline.odometry import Odometry, Tracked
+
+
+@dataclass(frozen=True, slots=True)
+class SlamResult:
+    """What a log amounts to.
+
+    ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimisation; ``keyframes``
+    the scans that stand in the ``graph``; ``closures`` every loop closure tried.
+    """
+
+    trajectory: Trajectory
+    odometry: Trajectory
+    keyframes: tuple[Keyframe, ...]
+    closures: tuple[Closure, ...]
+    graph: PoseGraph
+    state: GraphState
+
+
+class Slam:
+    """Feeds on scans; every scan gives a step, the end gives the result."""
+
+    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
+        self.config = config
+        self.dimension = T_base_lidar.shape[0] - 1
+        self.odometry = Odometry(config, T_base_lidar)
+        self.closer = LoopCloser(config, self.dimension)
+        self.graph = PoseGraph(self.dimension)
+        self.keyframes: list[Keyframe] = []
+        self.closures: list[Closure] = []
+        self.stamps_ns: list[int] = []
+        self.odometry_poses: list[Pose] = []
+        self.T_world_odom = lie.identity(self.dimension)
+        self.travelled_m = 0.0
+        self.waiting_closures = 0
+        self.optimised_at = 0
+
+    def process(self, scan: Scan) -> Step:
+        """Place one scan, and whatever it closes."""
+        tracked = self.odometry.track(scan)
+        started = perf_counter()
+        keyframe = self._keyframe(tracked)
+        closures: tuple[Closure, ...] = ()
+        state = None
+        if keyframe >= 0 and self.config.loops.enabled:
+            closures = self._close_loops()
+            state = self._optimise_when_due()
+        timing = Timing(
+            scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, perf_counter() - started
+        )
+        return Step(
+            scan=scan,
+            points=tracked.matched,
+            T_odom_lidar=tracked.T_odom_lidar,
+            T_world_lidar=self.T_world_odom @ tracked.T_odom_lidar,
+            match=tracked.match,
+            state=tracked.state,
+            reason=tracked.reason,
+            keyframe=keyframe,
+            local_map=self._local_map(keyframe),
+            closures=closures,
+            graph=state,
+            timing=timing,
+        )
+
+    def finish(self) -> SlamResult:
+        """Optimise once more and spread the corrections over all scans."""
+        state = self._optimise()
+        stamps_ns = np.array(self.stamps_ns, np.int64)
+        odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
+        corrected = self._spread(state.poses, odometry)
+        return SlamResult(
+            trajectory=Trajectory(stamps_ns, corrected),
+            odometry=Trajectory(stamps_ns, odometry),
+            keyframes=tuple(self.keyframes),
+            closures=tuple(self.closures),
+            graph=self.graph,
+            state=state,
+        )
+
+    def _keyframe(self, tracked: Tracked) -> int:
+        """Make a keyframe of a scan that moved far enough; its index, or −1."""
+        if self.odometry_poses:
+            step = lie.inverse(self.odometry_poses[-1]) @ tracked.T_odom_lidar
+            self.travelled_m += float(np.linalg.norm(step[:-1, -1]))
+        self.stamps_ns.append(tracked.scan.stamp_ns)
+        self.odometry_poses.append(tracked.T_odom_lidar)
+        if self.keyframes and (tracked.state is State.LOST or not self._moved_enough(tracked.T_odom_lidar)):
+            return -1
+        keyframe = Keyframe(
+            index=len(self.keyframes),
+            scan_index=len(self.odometry_poses) - 1,
+            stamp_ns=tracked.scan.stamp_ns,
+            points=tracked.points,
+            T_odom_lidar=tracked.T_odom_lidar,
+            travelled_m=self.travelled_m,
+        )
+        self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
+        if self.keyframes:
+            last = self.keyframes[-1]
+            config = self.config.odometry
+            self.graph.add_edge(
+                last.index,
+                keyframe.index,
+                lie.inverse(last.T_odom_lidar) @ keyframe.T_odom_lidar,
+                edge_information(tracked.match, config.edge_sigma_m, config.edge_sigma_rad),
+            )
+        self.keyframes.append(keyframe)
+        return keyframe.index
+
+    def _moved_enough(self, T_odom_lidar: Pose) -> bool:
+        T = lie.inverse(self.keyframes[-1].T_odom_lidar) @ T_odom_lidar
+        config = self.config.odometry
+        distance_m = float(np.linalg.norm(T[:-1, -1]))
+        return distance_m > config.keyframe_distance_m or float(lie.rotation_angle(T)) > config.keyframe_angle_rad
+
+    def _close_loops(self) -> tuple[Closure, ...]:
+        closures = self.closer.close(self.keyframes, self.graph.poses)
+        config = self.config.loops
+        for closure in closures:
+            self.closures.append(closure)
+            if closure.verdict is Verdict.ACCEPTED:
+                self.waiting_closures += 1
+                self.graph.add_edge(
+                    closure.target,
+                    closure.source,
+                    closure.match.T_target_source,
+                    edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad),
+                    is_loop=True,
+                )
+        return closures
+
+    def _optimise_when_due(self) -> GraphState | None:
+        """Optimise once closures wait and the graph has grown since the last time."""
+        grown = len(self.keyframes) - self.optimised_at
+        if not self.waiting_closures or grown < self.config.loops.optimise_every:
+            return None
+        return self._optimise()
+
+    def _optimise(self) -> GraphState:
+        state = self.graph.optimise(self.config.graph).state
+        self.waiting_closures, self.optimised_at = 0, len(self.keyframes)
+        self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
+        return state
+
+    def _spread(self, keyframe_poses: Matrix, odometry: Matrix) -> Matrix:
+        """World poses of all scans: each keyframe's correction, blended between it and the next."""
+        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
+        relative = lie.inverse(odometry[numbers]) @ odometry[np.append(numbers[1:], numbers[-1])]
+        target = lie.inverse(keyframe_poses) @ keyframe_poses[np.append(np.arange(1, len(numbers)), -1)]
+        correction = lie.log(target @ lie.inverse(relative))
+        before = np.searchsorted(numbers, np.arange(len(odometry)), side="right") - 1
+        span = np.append(np.diff(numbers), 1)[before]
+        share = np.clip((np.arange(len(odometry)) - numbers[before]) / span, 0.0, 1.0)
+        within = lie.inverse(odometry[numbers[before]]) @ odometry
+        return keyframe_poses[before] @ lie.exp(share[:, None] * correction[before]) @ within
+
+    def _local_map(self, keyframe: int) -> Points:
+        return self.odometry.local_map.points() if keyframe >= 0 else np.empty((0, self.dimension))
+
+
+def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:
+    """Information (k, k) of a pose-graph edge: the matcher's, with a floor under its variances.
+
+    Residuals share the map's errors and are far from independent, so that H alone promises too much.
+    """
+    d = match.T_target_source.shape[0] - 1
+    k = len(match.information)
+    floor = np.array([sigma_m**2] * d + [sigma_rad**2] * (k - d))
+    covariance = np.linalg.inv(match.information + np.diag(1e-6 / floor)) + np.diag(floor)
+    information = np.linalg.inv(covariance)
+    return 0.5 * (information + information.T)
