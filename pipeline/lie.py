@@ -23,7 +23,13 @@ def identity(dimension: int) -> Pose:
 def inverse(T: Pose) -> Pose:
     """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1]."""
     d = T.shape[-1] - 1
-    result = np.zeros_like(T)
+    result = np.zeros(T.shape)
+    if T.ndim == 2:
+        R_t = T[:d, :d].T
+        result[:d, :d] = R_t
+        result[:d, d] = -(R_t @ T[:d, d])
+        result[d, d] = 1.0
+        return result
     R_t = np.swapaxes(T[..., :d, :d], -1, -2)
     result[..., :d, :d] = R_t
     result[..., :d, d] = -(R_t @ T[..., :d, d, None])[..., 0]

@@ -72,7 +72,7 @@ class Odometry:
         prepared = perf_counter()
         prediction = self.predictor.predict(scan)
         if len(self.local_map):
-            match = self._align(matched, prediction)
+            match = self._align(scan, matched, prediction)
             state, reason = self._judge(match)
         else:
             match = self._first_match(matched)
@@ -82,32 +82,33 @@ class Odometry:
         T_stamp_middle = self._from_middle_to_stamp(scan, T_odom_middle)
         self.predictor.correct(scan, T_odom_middle)
         self._extend(points, T_odom_middle, state)
-        return Tracked(
+        tracked = Tracked(
             scan=scan,
-            points=lie.transform(T_stamp_middle, points),
-            matched=lie.transform(T_stamp_middle, matched),
-            T_odom_lidar=T_odom_middle @ lie.inverse(T_stamp_middle),
-            match=seen_from(match, T_stamp_middle),
+            points=points,
+            matched=matched,
+            T_odom_lidar=T_odom_middle,
+            match=match,
             state=state,
             reason=reason,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
             map_s=perf_counter() - aligned,
         )
+        return tracked if T_stamp_middle is None else seen_from(tracked, T_stamp_middle)
 
-    def _from_middle_to_stamp(self, scan: Scan, T_odom_middle: Pose) -> Pose:
-        """T_stamp_middle by the velocity between the middles of the last scan and this one.
+    def _from_middle_to_stamp(self, scan: Scan, T_odom_middle: Pose) -> Pose | None:
+        """T_stamp_middle, None where they are one, by the velocity between the middles of the last scan and this one.
 
         Scans are matched as seen from their middle; the stamp lies between two middles, or just beyond.
         """
         interval_s = self.predictor.interval_to(scan)
         middle = middle_s(scan, self.config.preprocess)
         if middle == 0.0 or interval_s <= 0.0:
-            return lie.identity(self.dimension)
+            return None
         motion = lie.inverse(self.predictor.T_odom_lidar) @ T_odom_middle
         return lie.exp(middle / interval_s * lie.log(motion))
 
-    def _align(self, points: Points, prediction: Prediction) -> Match:
+    def _align(self, scan: Scan, points: Points, prediction: Prediction) -> Match:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
         wide = self.wide_scans > 0
         best = self.matcher.align(
@@ -115,7 +116,7 @@ class Odometry:
         )
         doubtful_cost = _DOUBT * self.usual_cost * len(points)
         if best.cost > doubtful_cost > 0.0:
-            for guess in self._guesses(points, prediction):
+            for guess in self._guesses(scan, points, prediction):
                 other = self.matcher.align(points, self.local_map, guess, self.no_prior, wide=True)
                 if other.cost < best.cost:
                     best = other
@@ -123,10 +124,11 @@ class Odometry:
         self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
 
-    def _guesses(self, points: Points, prediction: Prediction) -> tuple[Pose, ...]:
+    def _guesses(self, scan: Scan, points: Points, prediction: Prediction) -> tuple[Pose, ...]:
         """Other poses to start from; in the plane also the best of a grid around the expected one."""
+        alternatives = self.predictor.alternatives(scan)
         if self.dimension == 3:
-            return prediction.alternatives
+            return alternatives
         config = self.config.matching
         seed = correlative_seed(
             points,
@@ -135,7 +137,7 @@ class Odometry:
             half_width_m=config.seed_half_width_m,
             half_width_rad=config.seed_half_width_rad,
         )
-        return (*prediction.alternatives, seed)
+        return (*alternatives, seed)
 
     def _judge(self, match: Match) -> tuple[State, str]:
         config = self.config.matching
@@ -193,14 +195,21 @@ class Odometry:
         )
 
 
-def seen_from(match: Match, T_new_old: Pose) -> Match:
-    """The match of a scan whose points are given in another frame that moves with it."""
+def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
+    """The same scan as seen from another frame that moves with it: points, pose, information."""
     T_old_new = lie.inverse(T_new_old)
+    match = tracked.match
     direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
     Ad_inverse = lie.adjoint(T_old_new)
     return replace(
-        match,
-        T_target_source=match.T_target_source @ T_old_new,
-        information=Ad_inverse.T @ match.information @ Ad_inverse,
-        degeneracy_direction=direction / np.linalg.norm(direction),
+        tracked,
+        points=lie.transform(T_new_old, tracked.points),
+        matched=lie.transform(T_new_old, tracked.matched),
+        T_odom_lidar=tracked.T_odom_lidar @ T_old_new,
+        match=replace(
+            match,
+            T_target_source=match.T_target_source @ T_old_new,
+            information=Ad_inverse.T @ match.information @ Ad_inverse,
+            degeneracy_direction=direction / np.linalg.norm(direction),
+        ),
     )

@@ -22,12 +22,10 @@ class Prediction:
     Attributes
     ----------
     T_odom_lidar : the expected pose
-    alternatives : poses worth trying where the expected one leads nowhere good
     information : (k,) inverse variances of the expected pose, m⁻² and rad⁻²
     """
 
     T_odom_lidar: Pose
-    alternatives: tuple[Pose, ...]
     information: NDArray[np.float64]
 
 
@@ -44,15 +42,22 @@ class Predictor:
 
     def predict(self, scan: Scan) -> Prediction:
         """The expected pose of a scan that follows the last one corrected."""
-        T = self.T_odom_lidar
-        constant = T @ self.T_previous_current
-        stretched = T @ lie.exp(self._stretch(scan) * lie.log(self.T_previous_current))
         wheel = self._wheel_motion(scan)
+        config = self.config
         if wheel is None:
-            sigma_m, sigma_rad = self.config.velocity_sigma_m, self.config.velocity_sigma_rad
-            return Prediction(constant, (stretched, T), self._information(sigma_m, sigma_rad))
-        sigma_m, sigma_rad = self.config.wheel_sigma_m, self.config.wheel_sigma_rad
-        return Prediction(T @ wheel, (constant, T), self._information(sigma_m, sigma_rad))
+            expected = self.T_odom_lidar @ self.T_previous_current
+            return Prediction(expected, self._information(config.velocity_sigma_m, config.velocity_sigma_rad))
+        expected = self.T_odom_lidar @ wheel
+        return Prediction(expected, self._information(config.wheel_sigma_m, config.wheel_sigma_rad))
+
+    def alternatives(self, scan: Scan) -> tuple[Pose, ...]:
+        """Poses worth trying where the expected one leads nowhere good.
+
+        Constant velocity, the same over the time that passed by the stamps, and standing still.
+        """
+        T = self.T_odom_lidar
+        stretched = lie.exp(self._stretch(scan) * lie.log(self.T_previous_current))
+        return T @ self.T_previous_current, T @ stretched, T
 
     def correct(self, scan: Scan, T_odom_lidar: Pose) -> None:
         """Take the pose that the scan turned out to have."""

@@ -1,0 +1,129 @@
+"""Sparse Cholesky factorisation of a symmetric matrix of blocks; ordering and structure are found once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spilu
+
+from pipeline.data import Matrix
+from pipeline.kernels import graph_cholesky, graph_fronts, graph_symbolic
+
+_LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
+
+
+class SingularMatrixError(ArithmeticError):
+    """A pivot vanished: ``variable`` is the block whose value the equations leave open."""
+
+    def __init__(self, variable: int) -> None:
+        super().__init__(f"variable {variable} is not determined by the equations")
+        self.variable = variable
+
+
+class BlockPattern:
+    """Which blocks of a symmetric matrix may be nonzero: every diagonal one and the given pairs.
+
+    The values of such a matrix are one flat array: the n diagonal blocks, then one block for each pair
+    (row, column), each row-major. Blocks may differ in size.
+    """
+
+    def __init__(self, sizes: NDArray[np.int64], pairs: NDArray[np.int64]) -> None:
+        """Sizes (n,) in scalars of the variables; pairs (P, 2) distinct variables, each pair once."""
+        variables = np.arange(len(sizes))
+        self.sizes = sizes
+        self.pairs = pairs
+        self.rows = np.concatenate([variables, pairs[:, 0]])
+        self.columns = np.concatenate([variables, pairs[:, 1]])
+        self.starts = np.cumsum(sizes) - sizes
+        self.scalars = int(sizes.sum())
+        self.value_count = int((sizes[self.rows] * sizes[self.columns]).sum())
+        self.diagonal = self._diagonal()
+
+    def _diagonal(self) -> NDArray[np.int64]:
+        """Place among the values of every scalar's diagonal entry, (scalars,)."""
+        squares = np.cumsum(self.sizes**2) - self.sizes**2
+        within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
+        return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
+
+
+class SparseCholesky:
+    """The factor A = Uᵀ U of a block-sparse matrix; the fill-reducing ordering and the symbolic analysis are kept.
+
+    ``factorise`` may be called any number of times with new values of the same pattern.
+    """
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        """Order the variables and lay out the fronts."""
+        self.pattern = pattern
+        start, neighbours = _adjacency(pattern)
+        order = _fill_reducing_order(start, neighbours)
+        order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))]
+        parent = graph_symbolic.elimination_tree(start, neighbours, order)
+        begin, rows = graph_symbolic.column_structures(start, neighbours, order, parent)
+        sizes = pattern.sizes[order]
+        groups = graph_symbolic.group_columns(parent, begin, rows, sizes)
+        self._fronts = graph_fronts.lay_out_fronts(groups, begin, rows, sizes)
+        places = np.empty(len(order), np.int64)
+        places[order] = np.cumsum(sizes) - sizes
+        self._blocks = graph_fronts.lay_out_blocks(
+            self._fronts, places, pattern.sizes, pattern.rows, pattern.columns
+        )
+        self._places = np.repeat(places - pattern.starts, pattern.sizes) + np.arange(pattern.scalars)
+        self._factor = np.zeros(int(self._fronts.factor_start[-1]))
+        self._stack = np.empty(self._fronts.stack_size)
+        self._work = np.empty(self._fronts.widest**2)
+        self._floor = np.empty(pattern.scalars)
+
+    @property
+    def entries(self) -> int:
+        """Stored entries of the factor, explicit zeros included."""
+        pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
+        return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
+
+    def factorise(self, values: NDArray[np.float64]) -> None:
+        """Factor the matrix with these block values; raises SingularMatrixError where it is not positive definite."""
+        self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
+        failed = graph_cholesky.factorise(
+            self._fronts, self._blocks, values, self._floor, self._factor, self._stack, self._work
+        )
+        if failed >= 0:
+            scalar = int(np.flatnonzero(self._places == failed)[0])
+            raise SingularMatrixError(int(np.searchsorted(self.pattern.starts, scalar, side="right") - 1))
+
+    def solve(self, right_side: Matrix) -> Matrix:
+        """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
+        columns = right_side.reshape(len(right_side), -1)
+        result, local = np.empty_like(columns), np.empty(self._fronts.widest)
+        x = np.empty(self.pattern.scalars)
+        for column in range(columns.shape[1]):
+            x[self._places] = columns[:, column]
+            graph_cholesky.solve(self._fronts, self._factor, x, local)
+            result[:, column] = x[self._places]
+        return result.reshape(right_side.shape)
+
+
+def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Neighbour lists of the variables, without themselves: (start (n + 1,), neighbours)."""
+    both = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    start = np.searchsorted(both[:, 0], np.arange(len(pattern.sizes) + 1))
+    return start.astype(np.int64), np.ascontiguousarray(both[:, 1])
+
+
+def _fill_reducing_order(start: NDArray[np.int64], neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as SuperLU has it.
+
+    An incomplete factorisation that drops every entry hands the ordering out without the work of a full one.
+    """
+    n = len(start) - 1
+    if n < 2:
+        return np.arange(n)
+    rows = np.concatenate([np.repeat(np.arange(n), np.diff(start)), np.arange(n)])
+    columns = np.concatenate([neighbours, np.arange(n)])
+    weights = np.concatenate([np.full(len(neighbours), -1.0), np.diff(start) + 1.0])
+    matrix = coo_matrix((weights, (rows, columns)), shape=(n, n)).tocsc()
+    factor = spilu(
+        matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
+    return np.argsort(factor.perm_c).astype(np.int64)

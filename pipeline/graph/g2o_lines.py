@@ -1,0 +1,98 @@
+"""The lines of a g2o file, sorted by what they say and turned into numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.errors import InputError
+
+VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
+EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
+TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
+
+
+@dataclass(slots=True)
+class Rows:
+    """The lines of one kind: where they stand, the vertex ids they begin with, the numbers that follow."""
+
+    lines: list[int] = field(default_factory=list)
+    ids: list[list[int]] = field(default_factory=list)
+    numbers: list[list[float]] = field(default_factory=list)
+
+    def ids_array(self, width: int) -> NDArray[np.int64]:
+        """Vertex ids (n, width)."""
+        return np.array(self.ids, np.int64).reshape(-1, width)
+
+    def numbers_array(self, width: int) -> Matrix:
+        """Numbers (n, width)."""
+        return np.array(self.numbers, np.float64).reshape(-1, width)
+
+
+@dataclass(slots=True)
+class G2oLines:
+    """A file's lines by kind; ``dimension`` is 2 or 3, and 0 where it holds neither poses nor edges."""
+
+    dimension: int = 0
+    vertices: Rows = field(default_factory=Rows)
+    edges: Rows = field(default_factory=Rows)
+    fixed: Rows = field(default_factory=Rows)
+    others: list[str] = field(default_factory=list)
+
+
+def sort_lines(path: Path) -> G2oLines:
+    """Read the file; a line that cannot be understood is an error that names it."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise InputError(f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges") from error
+    result = G2oLines()
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if words:
+            _sort_line(path, number, words, line, result)
+    if not result.edges.ids:
+        raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
+    return result
+
+
+def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2oLines) -> None:
+    """Put one line where it belongs."""
+    tag = words[0]
+    if tag == "FIX":
+        for word in words[1:]:
+            _append(path, number, [tag, word], 1, 0, result.fixed)
+        return
+    for dimension in (2, 3):
+        if tag not in (VERTICES[dimension], EDGES[dimension]):
+            continue
+        if result.dimension not in (0, dimension):
+            raise InputError(f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file")
+        result.dimension = dimension
+        if tag == VERTICES[dimension]:
+            _append(path, number, words, 1, POSE_NUMBERS[dimension], result.vertices)
+        else:
+            _append(path, number, words, 2, POSE_NUMBERS[dimension] + TRIANGLE[dimension], result.edges)
+        return
+    result.others.append(line)
+
+
+def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, rows: Rows) -> None:
+    """Add a line's ids and numbers, each checked."""
+    if len(words) != 1 + ids + numbers:
+        raise InputError(f"{path}:{number}: {words[0]} has {len(words) - 1} values, needs {ids + numbers}")
+    try:
+        rows.ids.append([int(word) for word in words[1 : 1 + ids]])
+        values = [float(word) for word in words[1 + ids :]]
+    except ValueError as error:
+        raise InputError(f"{path}:{number}: {words[0]}: {error}") from error
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}:{number}: {words[0]} has a value that is not finite; remove or mend the line")
+    rows.numbers.append(values)
+    rows.lines.append(number)

@@ -1,0 +1,45 @@
+"""An array that grows at its end, with room kept in reserve so that appending costs little on average."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class GrowingArray:
+    """Rows of one shape and type; the room doubles when it is full."""
+
+    def __init__(self, row_shape: tuple[int, ...], dtype: type) -> None:
+        self._room = np.empty((16, *row_shape), dtype)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, row: Any) -> int:
+        """Index of the row, now the last."""
+        self.extend(np.asarray(row, self._room.dtype)[None])
+        return self._count - 1
+
+    def extend(self, rows: NDArray[Any]) -> None:
+        """Append rows (n, ...)."""
+        end = self._count + len(rows)
+        if end > len(self._room):
+            room = np.empty((max(2 * len(self._room), end), *self._room.shape[1:]), self._room.dtype)
+            room[: self._count] = self._room[: self._count]
+            self._room = room
+        self._room[self._count : end] = rows
+        self._count = end
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        """View of the rows, (n, ...), not to be written to."""
+        view = self._room[: self._count]
+        view.flags.writeable = False
+        return view
+
+    def replace(self, rows: NDArray[Any]) -> None:
+        """Put other values into all rows; views handed out before keep the old ones."""
+        self._room = np.array(rows, self._room.dtype)

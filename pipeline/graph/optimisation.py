@@ -1,0 +1,41 @@
+"""What an optimisation of the pose graph did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import GraphState
+
+Initialisation = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
+
+
+@dataclass(frozen=True, slots=True)
+class Optimisation:
+    """The answer of ``PoseGraph.optimise``.
+
+    Attributes
+    ----------
+    state : the graph as it is now
+    chi2_before, chi2_after : Σ eᵀΩe over all edges, unweighted, at the poses before and of the answer
+    cost_after : what was minimised: as chi2_after, with the robust loss of the loop edges
+    rejected : (E,) bool, in the order of ``state.edges``: loop edges that contradict the rest
+    iterations : linear solves
+    converged, reason : whether and why the iteration stopped
+    initialisation : where the first guess came from
+    time_s : wall time
+    """
+
+    state: GraphState
+    chi2_before: float
+    chi2_after: float
+    cost_after: float
+    rejected: NDArray[np.bool_]
+    iterations: int
+    converged: bool
+    reason: str
+    initialisation: Initialisation
+    time_s: float

@@ -1,0 +1,250 @@
+"""The pose graph: keyframe poses and the relative poses measured between them, grown one by one."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.config import GraphConfig
+from pipeline.data import GraphState, Matrix, Pose
+from pipeline.errors import InputError
+from pipeline.graph import initialise as guesses
+from pipeline.graph.between import BetweenProblem
+from pipeline.graph.cholesky import SingularMatrixError
+from pipeline.graph.growing_array import GrowingArray
+from pipeline.graph.optimisation import Initialisation, Optimisation
+from pipeline.graph.optimiser import Minimiser, Minimum
+from pipeline.graph.robust import rejection_limit, robust_loss
+from pipeline.graph.soundness import check_connected, check_edges, undetermined
+
+_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the poses at hand need no better guess
+
+
+class PoseGraph:
+    """Poses T_world_lidar and between factors T_ij (frame j seen from frame i) with e = log(T_ij⁻¹ T_i⁻¹ T_j).
+
+    The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
+    """
+
+    def __init__(self, dimension: int) -> None:
+        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses."""
+        self.dimension = dimension
+        self.freedom = 3 if dimension == 2 else 6
+        pose, k = (dimension + 1, dimension + 1), self.freedom
+        self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
+        self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
+        self._information, self._is_loop = GrowingArray((k, k), np.float64), GrowingArray((), np.bool_)
+        self._weight = GrowingArray((), np.float64)
+        self._fixed: set[int] = set()
+        self._problem: BetweenProblem | None = None
+        self._factor_is_now = False
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def poses(self) -> Matrix:
+        """T_world_lidar of every pose, (K, d+1, d+1)."""
+        return self._poses.rows
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Stamp of every pose, (K,)."""
+        return self._stamps_ns.rows
+
+    @property
+    def edges(self) -> NDArray[np.int64]:
+        """Pose pairs (i, j), (E, 2), in the order they were added."""
+        return self._edges.rows
+
+    @property
+    def measurements(self) -> Matrix:
+        """T_ij of every edge, (E, d+1, d+1)."""
+        return self._measurements.rows
+
+    @property
+    def information(self) -> Matrix:
+        """Ω of every edge, (E, k, k)."""
+        return self._information.rows
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """Whether the robust loss applies to the edge, (E,)."""
+        return self._is_loop.rows
+
+    @property
+    def weight(self) -> NDArray[np.float64]:
+        """Weight that the last optimisation left to every edge, (E,); 1 before."""
+        return self._weight.rows
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Which poses are held, (K,); pose 0 where none was named."""
+        held = np.zeros(len(self), np.bool_)
+        held[sorted(self._fixed) or slice(0, 1)] = True
+        return held
+
+    @property
+    def held(self) -> list[int]:
+        """Poses held by name through ``fix``, ascending."""
+        return sorted(self._fixed)
+
+    def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
+        """Index of the new pose, with this first guess."""
+        self._changed()
+        self._stamps_ns.append(stamp_ns)
+        return self._poses.append(T_world)
+
+    def add_edge(self, i: int, j: int, T_ij: Pose, information: Matrix, is_loop: bool = False) -> None:
+        """Add a measurement of frame j in frame i.
+
+        information (k, k) is the inverse covariance of e = log(T_ij⁻¹ T_i⁻¹ T_j), a right twist on T_ij; what a
+        matcher says about left twists becomes that by ``right_information``. Loops get the robust loss.
+        """
+        self.add_edges(np.array([[i, j]]), T_ij[None], information[None], np.array([is_loop]))
+
+    def add_edges(
+        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
+    ) -> None:
+        """Add many edges: (E, 2), (E, d+1, d+1), (E, k, k), (E,)."""
+        check_edges(edges, information, len(self))
+        self._changed()
+        self._edges.extend(edges)
+        self._measurements.extend(measurements)
+        self._information.extend(information)
+        self._is_loop.extend(is_loop)
+        self._weight.extend(np.ones(len(edges)))
+
+    def fix(self, index: int) -> None:
+        """Hold this pose where it is, instead of pose 0."""
+        if not 0 <= index < len(self):
+            raise InputError(f"pose {index} cannot be fixed: the graph has {len(self)} poses; add it first")
+        self._changed()
+        self._fixed.add(index)
+
+    def optimise(self, config: GraphConfig, *, initialise: Initialisation = "auto") -> Optimisation:
+        """Move the poses to the minimum of χ², starting from the chosen guess."""
+        begin = time.perf_counter()
+        problem = self._prepared()
+        chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
+        guess, source = self._guess(initialise, chi2_before, robust=config.robust != "none")
+        shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
+        guess[:, :-1, -1] -= shift
+        loss = robust_loss(config.robust, config.robust_scale, self.freedom)
+        minimiser = Minimiser(problem, self.is_loop, config.optimiser)
+        try:
+            minimum = minimiser.minimise(guess, loss, config.max_iterations, config.tolerance)
+        except SingularMatrixError as error:
+            raise undetermined(int(problem.free[error.variable])) from error
+        self._take(minimum, shift)
+        chi2 = minimum.estimate.chi2
+        limit = np.inf if config.robust == "none" else rejection_limit(config.robust_scale, self.freedom)
+        return Optimisation(
+            state=self.state(),
+            chi2_before=chi2_before,
+            chi2_after=float(chi2.sum()),
+            cost_after=minimum.estimate.cost,
+            rejected=(self.is_loop & (chi2 > limit))[self._order()],
+            iterations=minimum.iterations,
+            converged=minimum.converged,
+            reason=minimum.reason,
+            initialisation=source,
+            time_s=time.perf_counter() - begin,
+        )
+
+    def state(self) -> GraphState:
+        """The graph as it is, for those who show or write it; odometry edges first."""
+        order, problem = self._order(), self._prepared()
+        return GraphState(
+            poses=self.poses,
+            stamps_ns=self.stamps_ns,
+            edges=self.edges[order],
+            is_loop=self.is_loop[order],
+            weight=self.weight[order],
+            chi2=float(problem.chi2(problem.errors(self.poses)).sum()),
+        )
+
+    def relative_covariance(self, i: int, j: int) -> Matrix:
+        """Covariance (k, k) of a left twist on T_i⁻¹ T_j, given all edges at the poses and weights of now.
+
+        With left twists ξ_i, ξ_j of the world poses it is Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ. The factor of H
+        is kept until the graph changes, so that each further pair costs k solves.
+        """
+        problem = self._factored()
+        selection = np.zeros((len(problem.free), self.freedom, self.freedom))
+        for pose, sign in ((i, -1.0), (j, 1.0)):
+            if problem.variable[pose] >= 0:
+                selection[problem.variable[pose]] += sign * np.eye(self.freedom)
+        flat = selection.reshape(-1, self.freedom)
+        adjoint = lie.adjoint(lie.inverse(self.poses[i]))
+        return adjoint @ (flat.T @ problem.cholesky.solve(flat)) @ adjoint.T
+
+    def _factored(self) -> BetweenProblem:
+        """The problem, with the factor of the undamped H in its solver."""
+        problem = self._prepared()
+        if not self._factor_is_now:
+            equations = problem.linearise(self.poses, problem.errors(self.poses), self.weight)
+            try:
+                problem.cholesky.factorise(equations.values)
+            except SingularMatrixError as error:
+                raise undetermined(int(problem.free[error.variable])) from error
+            self._factor_is_now = True
+        return problem
+
+    def _prepared(self) -> BetweenProblem:
+        """The least-squares problem; built anew after the graph has grown."""
+        if self._problem is None:
+            fixed = self.fixed
+            check_connected(self.edges, fixed)
+            self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed)
+        return self._problem
+
+    def _guess(self, initialise: Initialisation, chi2_given: float, *, robust: bool) -> tuple[Matrix, Initialisation]:
+        """Poses to start from. "auto" keeps those at hand where they fit, else takes the better of two.
+
+        Where suspect loops are marked it keeps them in any case: no other guess is safe from a false loop.
+        """
+        arguments = (self.poses, self.fixed, self.edges, self.measurements)
+        if initialise == "odometry":
+            return guesses.follow_odometry(*arguments), initialise
+        if initialise == "spanning-tree":
+            return guesses.follow_spanning_tree(*arguments), initialise
+        if initialise == "chordal":
+            return guesses.relax_chordally(*arguments, self.information), initialise
+        freedom = self.freedom * max(len(self.edges) - len(self) + 1, 1)
+        suspect = robust and bool(self.is_loop.any())
+        if initialise == "given" or suspect or chi2_given <= _GOOD_GUESS * freedom:
+            return self.poses.copy(), "given"
+        problem = self._prepared()
+        poses = guesses.relax_chordally(*arguments, self.information)
+        if float(problem.chi2(problem.errors(poses)).sum()) < chi2_given:
+            return poses, "chordal"
+        return self.poses.copy(), "given"
+
+    def _take(self, minimum: Minimum, shift: NDArray[np.float64]) -> None:
+        """Keep the answer; fixed poses stay to the bit."""
+        poses = orthonormal(minimum.estimate.poses)
+        poses[:, :-1, -1] += shift
+        fixed = self.fixed
+        poses[fixed] = self.poses[fixed]
+        self._poses.replace(poses)
+        self._weight.replace(minimum.weights)
+        self._factor_is_now = False
+
+    def _order(self) -> NDArray[np.int64]:
+        """Edges with odometry first, otherwise as they were added."""
+        return np.argsort(self.is_loop, kind="stable")
+
+    def _changed(self) -> None:
+        self._problem, self._factor_is_now = None, False
+
+
+def orthonormal(poses: Matrix) -> Matrix:
+    """Poses whose nearly orthonormal rotations are made so again, R (3 I − RᵀR) / 2, one Newton step."""
+    result, d = poses.copy(), poses.shape[-1] - 1
+    R = poses[:, :d, :d]
+    result[:, :d, :d] = R @ (1.5 * np.eye(d) - 0.5 * np.swapaxes(R, 1, 2) @ R)
+    return result

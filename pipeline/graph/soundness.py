@@ -1,0 +1,59 @@
+"""Whether a pose graph can be optimised at all; what is wrong with it, where it cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.data import Matrix
+from pipeline.errors import InputError
+
+_ROUNDING = 1e-6  # share of the largest eigenvalue that a negative one may have, from printed digits
+
+
+def check_edges(edges: NDArray[np.int64], information: Matrix, pose_count: int) -> None:
+    """Refuse edges to unknown poses, from a pose to itself, or with an impossible information matrix."""
+    for i, j in edges[((edges < 0) | (edges >= pose_count)).any(axis=1)][:1]:
+        raise InputError(f"edge {i}-{j} joins a pose that is not there: the graph has {pose_count}; add it first")
+    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
+        raise InputError(f"edge {i}-{j} joins a pose to itself; remove it")
+    for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
+        i, j = edges[index]
+        raise InputError(
+            f"edge {i}-{j}: information matrix is not symmetric positive semidefinite; give an inverse covariance"
+        )
+
+
+def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
+    """Which of the matrices (E, k, k) are finite, symmetric and without negative eigenvalues, (E,)."""
+    finite = np.isfinite(information).all(axis=(1, 2))
+    matrices = np.where(finite[:, None, None], information, 0.0)
+    scale = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+    symmetric = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0) <= _ROUNDING * scale
+    return finite & symmetric & (np.linalg.eigvalsh(matrices)[:, 0] >= -_ROUNDING * scale)
+
+
+def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:
+    """Refuse a graph with poses that no chain of edges joins to a fixed one."""
+    if not len(fixed):
+        raise InputError("the pose graph has no poses; add some before optimising")
+    n = len(fixed)
+    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    _, part = connected_components(links, directed=False)
+    loose = np.flatnonzero(~np.isin(part, part[fixed]))
+    if len(loose):
+        names = ", ".join(str(v) for v in loose[:8]) + (", ..." if len(loose) > 8 else "")
+        raise InputError(
+            f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {names};"
+            " add edges to them or fix one of them"
+        )
+
+
+def undetermined(pose: int) -> InputError:
+    """The error for a pose that its edges leave free in some direction."""
+    return InputError(
+        f"pose graph: the edges leave pose {pose} free in some direction (singular information);"
+        " give its edges full information matrices, or use levenberg-marquardt"
+    )
