@@ -1,1 +1,53 @@
-"""ATE, RPE, KITTI metric, relations."""
+"""How good a trajectory is: ATE, RPE, the KITTI metric, relations; each result says what it measures."""
+
+from pipeline.evaluate.absolute import AbsoluteError, absolute_error
+from pipeline.evaluate.alignment import Alignment, align
+from pipeline.evaluate.kitti import (
+    KITTI_LENGTHS_M,
+    SHORT_LENGTHS_M,
+    KittiError,
+    LengthError,
+    kitti_error,
+    lengths_for,
+)
+from pipeline.evaluate.pairing import PAIRING_LIMIT_S, Pairs, pair
+from pipeline.evaluate.relations import (
+    RELATION_LIMIT_S,
+    RelationError,
+    Relations,
+    read_relations,
+    relation_error,
+)
+from pipeline.evaluate.relative import (
+    RelativeError,
+    relative_error_over_distance,
+    relative_error_over_frames,
+    relative_error_over_time,
+)
+from pipeline.evaluate.statistics import Statistics
+
+__all__ = [
+    "KITTI_LENGTHS_M",
+    "PAIRING_LIMIT_S",
+    "RELATION_LIMIT_S",
+    "SHORT_LENGTHS_M",
+    "AbsoluteError",
+    "Alignment",
+    "KittiError",
+    "LengthError",
+    "Pairs",
+    "RelationError",
+    "Relations",
+    "RelativeError",
+    "Statistics",
+    "absolute_error",
+    "align",
+    "kitti_error",
+    "lengths_for",
+    "pair",
+    "read_relations",
+    "relation_error",
+    "relative_error_over_distance",
+    "relative_error_over_frames",
+    "relative_error_over_time",
+]

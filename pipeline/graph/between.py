@@ -26,7 +26,8 @@ class BetweenProblem:
 
     e is the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e), so Ω is the inverse
     covariance of a right twist on Z. Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the
-    fixed poses out of the system.
+    fixed poses out of the system: ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,)
+    the pose of each block, ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
     """
 
     def __init__(
@@ -42,9 +43,9 @@ class BetweenProblem:
         ends = variable[edges].reshape(-1, 2)
         joined = (ends >= 0).all(axis=1)
         pairs, which = np.unique(np.sort(ends[joined], axis=1)[:, ::-1], axis=0, return_inverse=True)
-        self._slots = np.full((len(edges), 3), -1, np.int64)
-        self._slots[:, :2] = ends
-        self._slots[joined, 2] = len(self.free) + which.reshape(-1)
+        self.slots = np.full((len(edges), 3), -1, np.int64)
+        self.slots[:, :2] = ends
+        self.slots[joined, 2] = len(self.free) + which.reshape(-1)
         sizes = np.full(len(self.free), self.freedom, np.int64)
         self.pattern = BlockPattern(sizes, np.ascontiguousarray(pairs).reshape(-1, 2))
         self.cholesky = SparseCholesky(self.pattern)
@@ -76,9 +77,7 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        graph_scatter.scatter_between(
-            jacobian, errors, self.information, weights, self._slots, blocks, gradient
-        )
+        graph_scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(blocks.reshape(-1), gradient.reshape(-1))
 
     def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:

@@ -53,17 +53,19 @@ class SparseCholesky:
     ``factorise`` may be called any number of times with new values of the same pattern.
     """
 
-    def __init__(self, pattern: BlockPattern) -> None:
-        """Order the variables and lay out the fronts."""
+    def __init__(self, pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> None:
+        """Order the variables, unless an order (n,) of the same structure is at hand, and lay out the fronts."""
         self.pattern = pattern
         start, neighbours = _adjacency(pattern)
-        order = _fill_reducing_order(start, neighbours)
+        if order is None:
+            order = _fill_reducing_order(start, neighbours)
         order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))]
         parent = graph_symbolic.elimination_tree(start, neighbours, order)
         begin, rows = graph_symbolic.column_structures(start, neighbours, order, parent)
         sizes = pattern.sizes[order]
         groups = graph_symbolic.group_columns(parent, begin, rows, sizes)
         self._fronts = graph_fronts.lay_out_fronts(groups, begin, rows, sizes)
+        self.order = order
         places = np.empty(len(order), np.int64)
         places[order] = np.cumsum(sizes) - sizes
         self._blocks = graph_fronts.lay_out_blocks(
@@ -82,7 +84,7 @@ class SparseCholesky:
         return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
 
     def factorise(self, values: NDArray[np.float64]) -> None:
-        """Factor the matrix with these block values; raises SingularMatrixError where it is not positive definite."""
+        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
         self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
         failed = graph_cholesky.factorise(
             self._fronts, self._blocks, values, self._floor, self._factor, self._stack, self._work

@@ -51,7 +51,9 @@ def sort_lines(path: Path) -> G2oLines:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not text"
-        raise InputError(f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges") from error
+        raise InputError(
+            f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
+        ) from error
     result = G2oLines()
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -73,7 +75,9 @@ def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2o
         if tag not in (VERTICES[dimension], EDGES[dimension]):
             continue
         if result.dimension not in (0, dimension):
-            raise InputError(f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file")
+            raise InputError(
+                f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file"
+            )
         result.dimension = dimension
         if tag == VERTICES[dimension]:
             _append(path, number, words, 1, POSE_NUMBERS[dimension], result.vertices)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import GraphState
-
-Initialisation = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
+from pipeline.graph.initialise import Initialisation
 
 
 @dataclass(frozen=True, slots=True)

@@ -140,7 +140,7 @@ class Minimiser:
     def _accept(self, gained: float, step: NDArray[np.float64], equations: NormalEquations) -> bool:
         """Update λ by the gain ratio, true over predicted decrease (Nielsen 1999)."""
         diagonal = equations.values[self._problem.pattern.diagonal]
-        predicted = float(step @ (self._damping * diagonal * step - equations.gradient))
+        predicted = float((step * (self._damping * diagonal * step - equations.gradient)).sum())
         if not gained >= 0.0:
             return False
         gain = min(gained / max(predicted, 1e-300), 1.0)

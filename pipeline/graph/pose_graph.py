@@ -11,16 +11,14 @@ from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.data import GraphState, Matrix, Pose
 from pipeline.errors import InputError
-from pipeline.graph import initialise as guesses
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.optimisation import Initialisation, Optimisation
+from pipeline.graph.initialise import Initialisation, first_guess
+from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.optimiser import Minimiser, Minimum
 from pipeline.graph.robust import rejection_limit, robust_loss
 from pipeline.graph.soundness import check_connected, check_edges, undetermined
-
-_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the poses at hand need no better guess
 
 
 class PoseGraph:
@@ -94,6 +92,8 @@ class PoseGraph:
 
     def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
         """Index of the new pose, with this first guess."""
+        if not np.isfinite(T_world).all():
+            raise InputError(f"pose {len(self)} is not finite; give it a first guess or leave it out")
         self._changed()
         self._stamps_ns.append(stamp_ns)
         return self._poses.append(T_world)
@@ -110,7 +110,7 @@ class PoseGraph:
         self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> None:
         """Add many edges: (E, 2), (E, d+1, d+1), (E, k, k), (E,)."""
-        check_edges(edges, information, len(self))
+        check_edges(edges, measurements, information, len(self))
         self._changed()
         self._edges.extend(edges)
         self._measurements.extend(measurements)
@@ -130,7 +130,8 @@ class PoseGraph:
         begin = time.perf_counter()
         problem = self._prepared()
         chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
-        guess, source = self._guess(initialise, chi2_before, robust=config.robust != "none")
+        trusted = config.robust == "none" or not self.is_loop.any()
+        guess, source = first_guess(problem, self.poses, initialise, trusted=trusted)
         shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
         guess[:, :-1, -1] -= shift
         loss = robust_loss(config.robust, config.robust_scale, self.freedom)
@@ -201,28 +202,6 @@ class PoseGraph:
             check_connected(self.edges, fixed)
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed)
         return self._problem
-
-    def _guess(self, initialise: Initialisation, chi2_given: float, *, robust: bool) -> tuple[Matrix, Initialisation]:
-        """Poses to start from. "auto" keeps those at hand where they fit, else takes the better of two.
-
-        Where suspect loops are marked it keeps them in any case: no other guess is safe from a false loop.
-        """
-        arguments = (self.poses, self.fixed, self.edges, self.measurements)
-        if initialise == "odometry":
-            return guesses.follow_odometry(*arguments), initialise
-        if initialise == "spanning-tree":
-            return guesses.follow_spanning_tree(*arguments), initialise
-        if initialise == "chordal":
-            return guesses.relax_chordally(*arguments, self.information), initialise
-        freedom = self.freedom * max(len(self.edges) - len(self) + 1, 1)
-        suspect = robust and bool(self.is_loop.any())
-        if initialise == "given" or suspect or chi2_given <= _GOOD_GUESS * freedom:
-            return self.poses.copy(), "given"
-        problem = self._prepared()
-        poses = guesses.relax_chordally(*arguments, self.information)
-        if float(problem.chi2(problem.errors(poses)).sum()) < chi2_given:
-            return poses, "chordal"
-        return self.poses.copy(), "given"
 
     def _take(self, minimum: Minimum, shift: NDArray[np.float64]) -> None:
         """Keep the answer; fixed poses stay to the bit."""

@@ -13,12 +13,18 @@ from pipeline.errors import InputError
 _ROUNDING = 1e-6  # share of the largest eigenvalue that a negative one may have, from printed digits
 
 
-def check_edges(edges: NDArray[np.int64], information: Matrix, pose_count: int) -> None:
-    """Refuse edges to unknown poses, from a pose to itself, or with an impossible information matrix."""
-    for i, j in edges[((edges < 0) | (edges >= pose_count)).any(axis=1)][:1]:
+def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
+    """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers."""
+    lowest, highest = edges.min(axis=1, initial=0), edges.max(axis=1, initial=-1)
+    for index in np.flatnonzero((lowest < 0) | (highest >= pose_count))[:1]:
+        i, j = edges[index]
         raise InputError(f"edge {i}-{j} joins a pose that is not there: the graph has {pose_count}; add it first")
-    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
+    for index in np.flatnonzero(edges[:, 0] == edges[:, 1])[:1]:
+        i, j = edges[index]
         raise InputError(f"edge {i}-{j} joins a pose to itself; remove it")
+    for index in np.flatnonzero(~np.isfinite(np.sum(measurements, axis=(1, 2))))[:1]:
+        i, j = edges[index]
+        raise InputError(f"edge {i}-{j}: measurement is not finite; leave the edge out")
     for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
         i, j = edges[index]
         raise InputError(
@@ -28,7 +34,7 @@ def check_edges(edges: NDArray[np.int64], information: Matrix, pose_count: int) 
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     """Which of the matrices (E, k, k) are finite, symmetric and without negative eigenvalues, (E,)."""
-    finite = np.isfinite(information).all(axis=(1, 2))
+    finite = np.isfinite(np.sum(information, axis=(1, 2)))
     matrices = np.where(finite[:, None, None], information, 0.0)
     scale = np.abs(matrices).max(axis=(1, 2), initial=0.0)
     symmetric = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0) <= _ROUNDING * scale

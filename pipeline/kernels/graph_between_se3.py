@@ -128,10 +128,11 @@ def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
 
 @njit(cache=True)
 def _coupling(error: _Array, Q: _Array) -> None:
-    """Fill Q(−ρ, −φ) (Barfoot 2017, eq. 7.86b), with A = [−ρ]×, B = [−φ]×:
+    """Fill Q(−ρ, −φ) (Barfoot 2017, eq. 7.86b).
 
-    Q = ½A + a (BA + AB + BAB) + b (BBA + ABB − 3 BAB) + c (BABB + BBAB); and, without matrix products,
-    AB + BA = ρφᵀ + φρᵀ − 2(ρ·φ)I,  BAB = −(ρ·φ)B,  BBA + ABB = −θ²A − (ρ·φ)B,  BB = φφᵀ − θ²I.
+    With A = [−ρ]× and B = [−φ]×, Q = ½A + a (BA + AB + BAB) + b (BBA + ABB − 3 BAB) + c (BABB + BBAB); and,
+    without matrix products, AB + BA = ρφᵀ + φρᵀ − 2(ρ·φ)I,  BAB = −(ρ·φ)B,
+    BBA + ABB = −θ²A − (ρ·φ)B,  BB = φφᵀ − θ²I.
     """
     x, y, z = -error[0], -error[1], -error[2]
     p, q, r = -error[3], -error[4], -error[5]

@@ -45,7 +45,7 @@ def factorise(
             _extend_add(front, fronts.place[first:end], stack[depth : depth + (end - first) ** 2], runs)
         failed = _eliminate(front, pivots, floor[fronts.rows[row0] :])
         if failed >= 0:
-            return fronts.rows[row0 + failed]
+            return int(fronts.rows[row0 + failed])
         rest = height - pivots
         start = fronts.factor_start[f]
         for a in range(pivots):
@@ -150,7 +150,7 @@ def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
 
 @njit(cache=True)
 def _update_rest(front: _Array, k0: int, k1: int, c0: int, c1: int) -> None:
-    """Subtract Uᵀ U of panel rows k0 to k1 from columns c0 to c1 of the rows below, two rows, four pivots a time."""
+    """Subtract Uᵀ U of rows k0 to k1 from columns c0 to c1 of the rows below: two rows, four pivots a time."""
     i = k1
     while i < c1:
         pair = i + 1 < c1

@@ -47,19 +47,21 @@ def scatter_between(
         _weigh(jacobian[f], errors[f], information[f], weights[f], whitened, M, g)
         i, j, pair = slots[f, 0], slots[f, 1], slots[f, 2]
         if i >= 0:
-            for a in range(k):
-                gradient[i, a] -= g[a]
-                for b in range(k):
-                    blocks[i, a, b] += M[a, b]
+            _add(blocks[i], M, 1.0)
+            gradient[i] -= g
         if j >= 0:
-            for a in range(k):
-                gradient[j, a] += g[a]
-                for b in range(k):
-                    blocks[j, a, b] += M[a, b]
+            _add(blocks[j], M, 1.0)
+            gradient[j] += g
         if pair >= 0:
-            for a in range(k):
-                for b in range(k):
-                    blocks[pair, a, b] -= M[a, b]
+            _add(blocks[pair], M, -1.0)
+
+
+@njit(cache=True)
+def _add(block: _Array, M: _Array, sign: float) -> None:
+    """Add ±M to a block."""
+    for a in range(M.shape[0]):
+        for b in range(M.shape[1]):
+            block[a, b] += sign * M[a, b]
 
 
 @njit(cache=True)

@@ -83,27 +83,28 @@ def column_structures(start: _Index, neighbours: _Index, order: _Index, parent: 
     rows = np.empty(max(4 * neighbours.size, 16), np.int64)
     mark = np.full(n, -1, np.int64)
     for j in range(n):
-        end = begin[j]
-        if end + n > rows.size:
+        if begin[j] + n > rows.size:
             rows = np.concatenate((rows, np.empty(rows.size + n, np.int64)))
-        for q in range(start[order[j]], start[order[j] + 1]):
-            i = place[neighbours[q]]
-            if i > j and mark[i] != j:
-                mark[i] = j
-                rows[end] = i
-                end += 1
+        adjacent = place[neighbours[start[order[j]] : start[order[j] + 1]]]
+        end = _join(adjacent, j, mark, rows, begin[j])
         child = first_child[j]
         while child != -1:
-            for q in range(begin[child], begin[child + 1]):
-                i = rows[q]
-                if i > j and mark[i] != j:
-                    mark[i] = j
-                    rows[end] = i
-                    end += 1
+            end = _join(rows[begin[child] : begin[child + 1]], j, mark, rows, end)
             child = sibling[child]
         rows[begin[j] : end].sort()
         begin[j + 1] = end
     return begin, rows[: begin[n]]
+
+
+@njit(cache=True)
+def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
+    """Append the members beyond j that are not in column j yet; return the column's new end."""
+    for i in members:
+        if i > j and mark[i] != j:
+            mark[i] = j
+            rows[end] = i
+            end += 1
+    return end
 
 
 @njit(cache=True)

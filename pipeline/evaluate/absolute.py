@@ -1,0 +1,81 @@
+"""Absolute trajectory error: how far each pose is from where it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Matrix, Pose
+from pipeline.evaluate.alignment import Alignment, align
+from pipeline.evaluate.pairing import Pairs
+from pipeline.evaluate.statistics import Statistics
+
+
+@dataclass(frozen=True, slots=True)
+class AbsoluteError:
+    """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
+
+    Attributes
+    ----------
+    definition : what was computed, in words
+    alignment : how the frames were brought together
+    translation_m : of ‖t_ref − t_est‖
+    rotation_rad : of the angle of R_refᵀ R_est
+    path_length_m : of the reference, over the paired poses
+    T_reference_estimate : the alignment that was found
+    errors_m, errors_rad : (N,) pose by pose, in the order of the pairs
+    """
+
+    definition: str
+    alignment: Alignment
+    translation_m: Statistics
+    rotation_rad: Statistics
+    path_length_m: float
+    T_reference_estimate: Pose
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+
+    @property
+    def share_of_path(self) -> float:
+        """Root mean squared translational error over the length of the path; inf where nothing moved."""
+        return self.translation_m.rmse / self.path_length_m if self.path_length_m else float("inf")
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        rotation = self.rotation_rad.scaled(np.degrees(1.0))
+        return (
+            f"ATE rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
+            f"max {self.translation_m.maximum:.4f}; {100.0 * self.share_of_path:.3f} % of "
+            f"{self.path_length_m:.1f} m), rotation rmse {rotation.rmse:.3f} deg"
+        )
+
+
+def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> AbsoluteError:
+    """Align the estimate to the reference and compare pose by pose."""
+    T = align(pairs.estimate, pairs.reference, alignment)
+    error = lie.inverse(pairs.reference) @ T @ pairs.estimate
+    errors_m = np.linalg.norm(error[:, :3, 3], axis=1)
+    errors_rad = lie.rotation_angle(error)
+    return AbsoluteError(
+        definition=(
+            f"ATE: ‖t_ref − t_est‖ and the angle of R_refᵀ R_est after alignment '{alignment}' "
+            f"({alignment.description}) over {pairs.description}"
+        ),
+        alignment=alignment,
+        translation_m=Statistics.of(errors_m),
+        rotation_rad=Statistics.of(errors_rad),
+        path_length_m=float(path_length(pairs.reference)[-1]),
+        T_reference_estimate=T,
+        errors_m=errors_m,
+        errors_rad=errors_rad,
+    )
+
+
+def path_length(poses: Matrix) -> NDArray[np.float64]:
+    """(N,) metres travelled up to each pose."""
+    steps_m = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
+    return np.append(0.0, np.cumsum(steps_m))

@@ -1,0 +1,95 @@
+"""A point cloud of the world with one point a voxel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Points, Pose
+from pipeline.errors import InputError
+from pipeline.kernels import point_map as kernels
+from pipeline.kernels.hashing import EMPTY
+
+MAX_VOXELS = 16_000_000  # a gigabyte
+_FIRST_VOXELS = 1 << 14
+
+
+class PointMap:
+    """Scans added up in the world frame; each voxel keeps the mean of its points.
+
+    Attributes
+    ----------
+    voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice
+    dimension : 2 or 3, of the points
+    """
+
+    def __init__(
+        self,
+        dimension: int,
+        voxel_size_m: float,
+        *,
+        max_range_m: float = float("inf"),
+        max_voxels: int = MAX_VOXELS,
+    ) -> None:
+        self.dimension = dimension
+        self.voxel_size_m = voxel_size_m
+        self.max_range_m = max_range_m
+        self.max_voxels = max_voxels
+        self.used = 0
+        self._allocate(min(_FIRST_VOXELS, max_voxels))
+
+    def __len__(self) -> int:
+        return self.used
+
+    def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
+        """Add one scan: points (N, d), metres, lidar frame; those beyond ``max_range_m`` are left out."""
+        if not np.isfinite(T_world_lidar).all():
+            raise InputError("a scan added to the map has a pose that is not finite")
+        done = 0
+        while done < len(points):
+            self.used, count = kernels.add_points(
+                T_world_lidar, points[done:], self.max_range_m, self.voxel_size_m,
+                self.slots, self.cells, self.sums, self.counts, self.used,
+            )  # fmt: skip
+            done += count
+            if done < len(points):
+                self._make_room()
+
+    def points(self) -> Points:
+        """(M, d) mean of every voxel, in the order in which they were first seen."""
+        return self.sums[: self.used] / self.counts[: self.used, None]
+
+    def _make_room(self) -> None:
+        """Twice the rows, or, where that is too many, voxels of twice the size."""
+        sums, counts = self.sums[: self.used], self.counts[: self.used]
+        if len(self.counts) < self.max_voxels:
+            self._allocate(min(2 * len(self.counts), self.max_voxels))
+        else:
+            self.voxel_size_m *= 2.0
+            self._allocate(self.max_voxels)
+        self.used = kernels.merge_voxels(
+            sums, counts, self.voxel_size_m, self.slots, self.cells, self.sums, self.counts
+        )
+
+    def _allocate(self, rows: int) -> None:
+        slots = 1 << int(2 * rows - 1).bit_length()
+        self.slots = np.full(slots, EMPTY)
+        self.cells = np.zeros(slots, np.int32)
+        self.sums = np.zeros((rows, self.dimension))
+        self.counts = np.zeros(rows, np.int64)
+
+
+def build_point_map(
+    scans: Iterable[tuple[Pose, NDArray[np.floating]]],
+    *,
+    dimension: int,
+    voxel_size_m: float,
+    max_range_m: float = float("inf"),
+) -> PointMap:
+    """The map of (T_world_lidar, points) pairs; only one scan is held at a time."""
+    result = PointMap(dimension, voxel_size_m, max_range_m=max_range_m)
+    for T_world_lidar, points in scans:
+        result.insert(T_world_lidar, points)
+    return result

@@ -1,0 +1,137 @@
+"""Trajectories as text: TUM and KITTI files, in and out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.data import Matrix, Trajectory
+from pipeline.errors import InputError
+
+_NS_PER_S = 1_000_000_000
+_TUM_FIELDS = "stamp x y z qx qy qz qw"
+_KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
+_ORTHONORMAL = 1e-3  # how far RᵀR of a KITTI file, which is written with few digits, may be from identity
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """SE(3) poses of a TUM file, ``stamp x y z qx qy qz qw`` a line, in the order of the file.
+
+    Stamps are taken from their decimal text, so that nanoseconds stay exact; they need not increase.
+    """
+    stamps_ns: list[int] = []
+    rows: list[list[float]] = []
+    for place, words in text_lines(path):
+        if len(words) != 8:
+            raise InputError(f"{place} has {len(words)} fields, a TUM line has 8: {_TUM_FIELDS}")
+        stamps_ns.append(parse_stamp_ns(words[0], place))
+        row = numbers(words[1:], place)
+        if sum(value * value for value in row[3:]) < 1e-6:
+            raise InputError(f"{place} has the quaternion 0 0 0 0, which is no rotation; write 0 0 0 1 for none")
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path} has no pose; a TUM file has one a line: {_TUM_FIELDS}")
+    values = np.array(rows)
+    poses = np.zeros((len(rows), 4, 4))
+    poses[:, :3, :3] = lie.from_quaternion(values[:, 3:])
+    poses[:, :3, 3] = values[:, :3]
+    poses[:, 3, 3] = 1.0
+    return Trajectory(np.array(stamps_ns, np.int64), poses)
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0."""
+    poses = lie.lift(trajectory.poses)
+    quaternions = lie.to_quaternion(poses[:, :3, :3])
+    with Path(path).open("w", encoding="utf-8", newline="\n") as file:
+        for stamp_ns, pose, quat_xyzw in zip(trajectory.stamps_ns.tolist(), poses, quaternions, strict=True):
+            values = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw))
+            file.write(f"{format_stamp(stamp_ns)} {values}\n")
+
+
+def read_kitti(path: Path | str) -> Trajectory:
+    """SE(3) poses of a KITTI file, the upper 3 × 4 of a matrix a line, row by row.
+
+    The format has no time: the stamp of a pose is its line's number, from 0, so that two files pair line by line.
+    """
+    rows: list[list[float]] = []
+    for place, words in text_lines(path):
+        if len(words) != 12:
+            raise InputError(f"{place} has {len(words)} fields, a KITTI line has 12: {_KITTI_FIELDS}")
+        row = numbers(words, place)
+        R = np.array(row).reshape(3, 4)[:, :3]
+        if np.abs(R.T @ R - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0.0:
+            raise InputError(f"{place} is no rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path} has no pose; a KITTI file has one a line: {_KITTI_FIELDS}")
+    poses = np.zeros((len(rows), 4, 4))
+    poses[:, :3] = np.array(rows).reshape(-1, 3, 4)
+    poses[:, 3, 3] = 1.0
+    return Trajectory(np.arange(len(rows), dtype=np.int64), _orthonormal(poses))
+
+
+def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a KITTI file: the poses without their stamps."""
+    rows = lie.lift(trajectory.poses)[:, :3].reshape(-1, 12)
+    np.savetxt(path, rows, fmt="%.9e", encoding="utf-8")
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Seconds with nine digits after the point, exact."""
+    sign = "-" if stamp_ns < 0 else ""
+    return f"{sign}{abs(stamp_ns) // _NS_PER_S}.{abs(stamp_ns) % _NS_PER_S:09d}"
+
+
+def parse_stamp_ns(text: str, place: str) -> int:
+    """Nanoseconds of a decimal number of seconds, rounded to the nearest; ``place`` is named in the error."""
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise InputError(f"{place} has the stamp {text!r}; it must be a number of seconds") from None
+    if not seconds.is_finite() or abs(seconds) > 9_000_000_000:
+        raise InputError(f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds")
+    return int(seconds.scaleb(9).to_integral_value())
+
+
+def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
+    """Place (file:line) and words of every line that is neither empty nor a comment."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a directory; name a file in it") from None
+    except PermissionError:
+        raise InputError(f"{path} cannot be read; check its permissions") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield f"{path}:{number}", words
+
+
+def numbers(words: list[str], place: str) -> list[float]:
+    """The words as finite numbers; ``place`` is named in the error."""
+    values: list[float] = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            raise InputError(f"{place} has {word!r} where a number is expected; separate by spaces") from None
+        if not np.isfinite(values[-1]):
+            raise InputError(f"{place} has {word}; a pose must be finite")
+    return values
+
+
+def _orthonormal(poses: Matrix) -> Matrix:
+    """The poses with the nearest proper rotations."""
+    U, _, Vt = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = U @ Vt
+    return poses

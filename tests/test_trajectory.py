@@ -1,0 +1,114 @@
+"""Trajectory files: what is written is read back, exactly in time."""
+
+import numpy as np
+import pytest
+from scenes import shared_data
+
+from pipeline import lie
+from pipeline.data import Trajectory
+from pipeline.errors import InputError
+from pipeline.trajectory import format_stamp, parse_stamp_ns, read_kitti, read_tum, write_kitti, write_tum
+
+STAMPS_NS = [1317042145963999987, 1317042145963999986, 976052857337529984, 0, 1, -1, -2500000001]
+
+
+def wandering(count=7, seed=3):
+    """Random SE(3) poses stamped with awkward nanoseconds that step back in time."""
+    random = np.random.default_rng(seed)
+    twists = random.normal(scale=[5, 5, 5, 1, 1, 1], size=(count, 6))
+    return Trajectory(np.array(STAMPS_NS[:count], np.int64), lie.exp(twists))
+
+
+def test_stamps_survive_a_tum_file_to_the_nanosecond_and_in_order(tmp_path):
+    write_tum(tmp_path / "a.tum", wandering())
+    assert read_tum(tmp_path / "a.tum").stamps_ns.tolist() == STAMPS_NS
+
+
+def test_poses_survive_a_tum_file_to_nine_digits(tmp_path):
+    trajectory = wandering()
+    write_tum(tmp_path / "a.tum", trajectory)
+    np.testing.assert_allclose(read_tum(tmp_path / "a.tum").poses, trajectory.poses, atol=1e-8)
+
+
+def test_planar_poses_are_written_into_the_plane(tmp_path):
+    pose = lie.pose_2d(1.5, -2.0, 0.7)
+    write_tum(tmp_path / "a.tum", Trajectory(np.array([5], np.int64), pose[None]))
+    np.testing.assert_allclose(read_tum(tmp_path / "a.tum").poses[0], lie.lift(pose), atol=1e-8)
+
+
+def test_poses_survive_a_kitti_file(tmp_path):
+    trajectory = wandering()
+    write_kitti(tmp_path / "a.txt", trajectory)
+    back = read_kitti(tmp_path / "a.txt")
+    np.testing.assert_allclose(back.poses, trajectory.poses, atol=1e-8)
+    assert back.stamps_ns.tolist() == list(range(7))
+
+
+def test_evo_reads_what_we_write(tmp_path):
+    files = pytest.importorskip("evo.tools.file_interface")
+    trajectory = wandering()
+    write_tum(tmp_path / "a.tum", trajectory)
+    write_kitti(tmp_path / "a.txt", trajectory)
+    from_tum = np.array(files.read_tum_trajectory_file(str(tmp_path / "a.tum")).poses_se3)
+    from_kitti = np.array(files.read_kitti_poses_file(str(tmp_path / "a.txt")).poses_se3)
+    np.testing.assert_allclose(from_tum, trajectory.poses, atol=1e-7)
+    np.testing.assert_allclose(from_kitti, trajectory.poses, atol=1e-7)
+
+
+def test_a_published_ground_truth_is_read_with_its_exact_stamps():
+    trajectory = read_tum(shared_data("3d/kitti_0001_first54.tum"))
+    assert len(trajectory) == 54
+    assert trajectory.stamps_ns[0] == 1317042145963999987
+    np.testing.assert_allclose(trajectory.poses[1, :3, 3], [1.440872, 0.008673, 0.018271])
+
+
+def test_comments_and_empty_lines_are_passed_over(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("# stamp x y z qx qy qz qw\n\n1.5 1 2 3 0 0 0 1\n   \n2.5 1 2 3 0 0 0 2\n")
+    trajectory = read_tum(path)
+    assert trajectory.stamps_ns.tolist() == [1500000000, 2500000000]
+    np.testing.assert_allclose(trajectory.poses[1, :3, :3], np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("1.0 1 2 3 0 0 0", "7 fields"),
+        ("1.0,1,2,3,0,0,0,1", "1 fields"),
+        ("noon 1 2 3 0 0 0 1", "'noon'"),
+        ("nan 1 2 3 0 0 0 1", "nan"),
+        ("1e30 1 2 3 0 0 0 1", "64 bits"),
+        ("1.0 1 2 x 0 0 0 1", "'x'"),
+        ("1.0 1 2 inf 0 0 0 1", "finite"),
+        ("1.0 1 2 3 0 0 0 0", "quaternion"),
+    ],
+)
+def test_a_bad_tum_line_is_named_with_its_number(tmp_path, line, says):
+    path = tmp_path / "bad.tum"
+    path.write_text(f"0.5 1 2 3 0 0 0 1\n{line}\n")
+    with pytest.raises(InputError) as caught:
+        read_tum(path)
+    assert f"{path}:2" in str(caught.value)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["1 0 0 0 0 1 0 0 0 0 1", "2 0 0 0 0 2 0 0 0 0 2 0", "1 0 0 0 0 1 0 0 0 0 -1 0"])
+def test_a_kitti_line_that_is_no_pose_is_named(tmp_path, line):
+    path = tmp_path / "bad.txt"
+    path.write_text(f"{line}\n")
+    with pytest.raises(InputError, match=r"bad\.txt:1"):
+        read_kitti(path)
+
+
+def test_files_that_are_none_are_one_line_errors(tmp_path):
+    (tmp_path / "empty.tum").write_text("# nothing\n")
+    (tmp_path / "binary.tum").write_bytes(bytes(range(256)))
+    for name in ("absent.tum", "empty.tum", "binary.tum", "."):
+        with pytest.raises(InputError, match=r"^[^\n]+$"):
+            read_tum(tmp_path / name)
+
+
+@pytest.mark.parametrize("stamp_ns", STAMPS_NS)
+def test_a_stamp_and_its_text_are_one(stamp_ns):
+    assert parse_stamp_ns(format_stamp(stamp_ns), "here") == stamp_ns
