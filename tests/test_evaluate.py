@@ -1,0 +1,290 @@
+"""Trajectory metrics: equal to their slow twins and to evo on the same pairs."""
+
+import bz2
+import re
+
+import naive_evaluate as naive
+import numpy as np
+import pytest
+from scenes import shared_data
+
+from pipeline import lie
+from pipeline.data import Trajectory
+from pipeline.errors import InputError
+from pipeline.evaluate import (
+    Alignment,
+    absolute_error,
+    kitti_error,
+    lengths_for,
+    pair,
+    read_relations,
+    relation_error,
+    relative_error_over_distance,
+    relative_error_over_frames,
+    relative_error_over_time,
+)
+from pipeline.evaluate.pairing import nearest
+from pipeline.trajectory import parse_stamp_ns, read_tum
+
+
+def drive(count=300, seed=1, step_m=1.0):
+    """A winding course, SE(3), ten poses a second."""
+    random = np.random.default_rng(seed)
+    steps = lie.exp(random.normal([step_m, 0, 0, 0, 0, 0], [0.1, 0.05, 0.05, 0.01, 0.01, 0.05], (count, 6)))
+    poses = np.empty((count, 4, 4))
+    poses[0] = lie.exp(random.normal(size=6))
+    for k in range(1, count):
+        poses[k] = poses[k - 1] @ steps[k]
+    return Trajectory(np.arange(count, dtype=np.int64) * 100_000_000 + 10**18, poses)
+
+
+def disturbed(trajectory, seed=2, sigma_m=0.1):
+    """The same course in another frame, with noise on every pose."""
+    random = np.random.default_rng(seed)
+    noise = lie.exp(random.normal(scale=[sigma_m] * 3 + [0.02] * 3, size=(len(trajectory), 6)))
+    frame = lie.exp(np.array([3.0, -2.0, 1.0, 0.3, -0.2, 2.0]))
+    return Trajectory(trajectory.stamps_ns, frame @ trajectory.poses @ noise)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return pair(disturbed(drive()), drive())
+
+
+def evo_trajectories(pairs):
+    trajectory = pytest.importorskip("evo.core.trajectory")
+    stamps = pairs.stamps_ns / 1e9
+    return (
+        trajectory.PoseTrajectory3D(poses_se3=list(pairs.reference), timestamps=stamps),
+        trajectory.PoseTrajectory3D(poses_se3=list(pairs.estimate), timestamps=stamps),
+    )
+
+
+@pytest.mark.parametrize("alignment", list(Alignment))
+def test_ate_equals_evo(pairs, alignment):
+    reference, estimate = evo_trajectories(pairs)
+    from evo.core import metrics
+
+    if alignment is Alignment.RIGID:
+        estimate.align(reference)
+    if alignment is Alignment.FIRST:
+        estimate.align_origin(reference)
+    ours = absolute_error(pairs, alignment)
+    for relation, errors, statistics in (
+        (metrics.PoseRelation.translation_part, ours.errors_m, ours.translation_m),
+        (metrics.PoseRelation.rotation_angle_rad, ours.errors_rad, ours.rotation_rad),
+    ):
+        theirs = metrics.APE(relation)
+        theirs.process_data((reference, estimate))
+        np.testing.assert_allclose(errors, theirs.error, atol=1e-9)
+        figures = theirs.get_all_statistics()
+        for name, value in (
+            ("rmse", statistics.rmse), ("mean", statistics.mean), ("median", statistics.median),
+            ("std", statistics.std), ("min", statistics.minimum), ("max", statistics.maximum),
+        ):  # fmt: skip
+            assert value == pytest.approx(figures[name], abs=1e-9)
+
+
+@pytest.mark.parametrize("frames", [1, 7])
+def test_rpe_over_frames_equals_evo(pairs, frames):
+    reference, estimate = evo_trajectories(pairs)
+    from evo.core import metrics
+
+    ours = relative_error_over_frames(pairs, frames)
+    for relation, errors in (
+        (metrics.PoseRelation.translation_part, ours.errors_m),
+        (metrics.PoseRelation.rotation_angle_rad, ours.errors_rad),
+    ):
+        theirs = metrics.RPE(relation, delta=frames, delta_unit=metrics.Unit.frames, all_pairs=True)
+        theirs.process_data((reference, estimate))
+        np.testing.assert_allclose(errors, theirs.error, atol=1e-9)
+
+
+def test_rpe_over_distance_equals_evo_on_the_same_stretches(pairs):
+    metrics = pytest.importorskip("evo.core.metrics")
+    ours = relative_error_over_distance(pairs, 20.0)
+    path = naive.travelled(pairs.reference)
+    for (i, j), error_m in zip(ours.stretches, ours.errors_m, strict=True):
+        assert path[j] - path[i] >= 20.0 - 1e-9 > path[j - 1] - path[i] - 2e-9
+        theirs = metrics.RPE.rpe_base(pairs.reference[i], pairs.reference[j], pairs.estimate[i], pairs.estimate[j])
+        assert error_m == pytest.approx(np.linalg.norm(theirs[:3, 3]), abs=1e-9)
+
+
+def test_rpe_over_time_takes_the_first_pose_late_enough(pairs):
+    stretches = relative_error_over_time(pairs, 0.95).stretches
+    np.testing.assert_array_equal(stretches[:, 1] - stretches[:, 0], 10)
+    assert len(stretches) == len(pairs) - 10
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_kitti_metric_equals_naive(pairs, every):
+    lengths_m = (10.0, 50.0, 100.0)
+    ours = kitti_error(pairs, lengths_m, every=every)
+    shares, turns = naive.kitti(pairs.reference, pairs.estimate, lengths_m, every)
+    assert ours.stretches == len(shares) == sum(part.stretches for part in ours.by_length)
+    assert ours.translation_share == pytest.approx(np.mean(shares), abs=1e-12)
+    assert ours.rotation_rad_per_m == pytest.approx(np.mean(turns), abs=1e-9)
+
+
+def test_short_paths_are_judged_over_short_lengths(pairs):
+    assert lengths_for(63.8) == (10.0, 20.0, 40.0)
+    assert lengths_for(250.0) == (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    error = kitti_error(pairs, lengths_for(250.0))
+    assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6
+
+
+def test_metres_or_centimetres_same_judgement(pairs):
+    def in_cm(trajectory):
+        poses = trajectory.poses.copy()
+        poses[:, :3, 3] *= 100.0
+        return Trajectory(trajectory.stamps_ns, poses)
+
+    scaled = pair(in_cm(disturbed(drive())), in_cm(drive()))
+    metres, centimetres = absolute_error(pairs), absolute_error(scaled)
+    assert centimetres.translation_m.rmse == pytest.approx(100.0 * metres.translation_m.rmse)
+    assert centimetres.rotation_rad.rmse == pytest.approx(metres.rotation_rad.rmse)
+    assert centimetres.share_of_path == pytest.approx(metres.share_of_path)
+
+
+def test_a_perfect_estimate_in_another_frame_has_no_error():
+    truth = drive()
+    moved = Trajectory(truth.stamps_ns, lie.exp(np.array([5.0, 2.0, -1.0, 0.5, 1.0, -2.0])) @ truth.poses)
+    pairs = pair(moved, truth)
+    for alignment in (Alignment.FIRST, Alignment.RIGID):
+        assert absolute_error(pairs, alignment).translation_m.maximum < 1e-9
+    assert absolute_error(pairs, Alignment.NONE).translation_m.minimum > 1.0
+    assert relative_error_over_frames(pairs, 5).translation_m.maximum < 1e-9
+    assert kitti_error(pairs, (50.0,)).translation_share < 1e-12
+
+
+def test_alignment_does_not_scale():
+    truth = drive()
+    poses = truth.poses.copy()
+    poses[:, :3, 3] *= 1.1
+    error = absolute_error(pair(Trajectory(truth.stamps_ns, poses), truth))
+    assert error.translation_m.rmse > 1.0
+
+
+def planar(xy, yaw=None):
+    yaw = np.zeros(len(xy)) if yaw is None else yaw
+    poses = np.array([lie.pose_2d(x, y, a) for (x, y), a in zip(xy, yaw, strict=True)])
+    return Trajectory(np.arange(len(xy), dtype=np.int64) * 10**8, poses)
+
+
+def test_a_mirrored_planar_course_is_not_met_by_turning_the_plane_over():
+    xy = np.array([[0.0, 0], [1, 0.2], [2, 0], [3, -0.5], [4, 0.1]])
+    error = absolute_error(pair(planar(xy * [1, -1]), planar(xy)))
+    assert error.translation_m.rmse > 0.1
+    assert error.T_reference_estimate[2, 2] == 1.0
+
+
+def test_a_straight_course_aligns_in_the_plane_and_is_refused_in_space():
+    xy = np.linspace([0.0, 0.0], [10.0, 5.0], 20)
+    assert absolute_error(pair(planar(xy + np.array([1.0, 2.0])), planar(xy))).translation_m.rmse < 1e-12
+    rolled = planar(xy)
+    rolled = Trajectory(rolled.stamps_ns, lie.lift(rolled.poses) @ lie.exp(np.array([0, 0, 0, 0.1, 0, 0])))
+    with pytest.raises(InputError, match="align by the first pose"):
+        absolute_error(pair(rolled, rolled))
+
+
+def test_nearest_equals_naive_with_repeated_and_unsorted_stamps():
+    random = np.random.default_rng(5)
+    stamps = random.integers(0, 60, 40)
+    wanted = random.integers(-10, 70, 200)
+    index, difference = nearest(wanted, stamps)
+    assert index.tolist() == naive.nearest(wanted.tolist(), stamps.tolist())
+    np.testing.assert_array_equal(difference, np.abs(stamps[index] - wanted))
+
+
+def test_pairing_reports_the_share_and_uses_a_pose_once():
+    truth = drive(100)
+    late = truth.stamps_ns[::10] + np.where(np.arange(10) < 7, 3_000_000, 40_000_000)
+    pairs = pair(Trajectory(late, truth.poses[::10]), truth, limit_s=0.01)
+    assert len(pairs) == 7
+    assert pairs.share == pytest.approx(0.7)
+    assert "70.0 %" in absolute_error(pairs).definition
+    doubled = Trajectory(np.repeat(truth.stamps_ns[:5], 2), np.repeat(truth.poses[:5], 2, axis=0))
+    assert pair(doubled, truth).indices.tolist() == [[0, 0], [2, 1], [4, 2], [6, 3], [8, 4]]
+
+
+def test_pairing_keeps_the_order_of_the_estimate():
+    truth = drive(50)
+    order = np.random.default_rng(0).permutation(50)[:20]
+    pairs = pair(Trajectory(truth.stamps_ns[order], truth.poses[order]), truth)
+    np.testing.assert_array_equal(pairs.indices[:, 1], order)
+    np.testing.assert_array_equal(pairs.estimate, pairs.reference)
+
+
+def test_trajectories_of_other_times_are_refused_with_both_spans():
+    truth = drive(10)
+    with pytest.raises(InputError, match=r"same clock"):
+        pair(Trajectory(truth.stamps_ns + 10**12, truth.poses), truth)
+
+
+def test_stretches_that_do_not_fit_are_refused(pairs):
+    for measure in (
+        lambda: relative_error_over_frames(pairs, 300),
+        lambda: relative_error_over_distance(pairs, 1e4),
+        lambda: relative_error_over_time(pairs, 1e4),
+        lambda: kitti_error(pairs, (1e4,)),
+    ):
+        with pytest.raises(InputError, match="fits into"):
+            measure()
+
+
+def wheel_odometry():
+    """The FLASER lines of the Intel log: header stamps, and poses (x, y, yaw) of the raw wheel odometry."""
+    with bz2.open(shared_data("2d/intel.clf.bz2"), "rt") as file:
+        rows = [line.split() for line in file if line.startswith("FLASER")]
+    return [parse_stamp_ns(row[-3], "intel.clf") for row in rows], [[float(v) for v in row[-6:-3]] for row in rows]
+
+
+def test_relations_over_raw_wheel_odometry_equal_naive_and_are_big():
+    stamps_ns, poses = wheel_odometry()
+    relations = read_relations(shared_data("2d/intel.relations"))
+    trajectory = Trajectory(np.array(stamps_ns), np.array([lie.pose_2d(*pose) for pose in poses]))
+    error = relation_error(trajectory, relations)
+    assert error.missing == 0
+    assert len(error.errors_m) == 2984
+    index = {stamp: k for k, stamp in reversed(list(enumerate(stamps_ns)))}
+    for k in range(0, 2984, 50):
+        T, (first, second) = relations.T_first_second[k], relations.stamps_ns[k].tolist()
+        expected = naive.relation_2d(
+            poses[index[first]], poses[index[second]], (T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
+        )
+        assert (error.errors_m[k], error.errors_rad[k]) == pytest.approx(expected, abs=1e-9)
+    assert error.translation_m.mean > 1.0
+    assert error.translation_squared_m2.mean == pytest.approx(error.translation_m.rmse**2)
+    assert re.search(r"translation \d+\.\d{4} ± \d+\.\d{4} m", error.summary)
+
+
+def test_relations_made_of_a_trajectory_find_no_error_in_it(tmp_path):
+    trajectory = planar(np.random.default_rng(1).normal(size=(20, 2)), np.linspace(-3.0, 3.0, 20))
+    lines = []
+    for i, j in ((0, 5), (7, 3), (19, 0)):
+        T = lie.inverse(trajectory.poses[i]) @ trajectory.poses[j]
+        lines.append(f"{i / 10:.6f} {j / 10:.6f} {T[0, 2]:.17g} {T[1, 2]:.17g} 0 0 0 {float(lie.yaw(T)):.17g}")
+    lines.append("0.100000 55.000000 0 0 0 0 0 0")
+    (tmp_path / "a.relations").write_text("\n".join(lines))
+    error = relation_error(trajectory, read_relations(tmp_path / "a.relations"))
+    assert error.used.tolist() == [0, 1, 2]
+    assert error.missing == 1
+    assert error.translation_m.maximum < 1e-12
+    assert error.rotation_rad.maximum < 1e-7
+    with pytest.raises(InputError, match="belong to this log"):
+        relation_error(
+            Trajectory(trajectory.stamps_ns + 10**15, trajectory.poses), read_relations(tmp_path / "a.relations")
+        )
+
+
+def test_a_bad_relation_is_named_with_its_line(tmp_path):
+    (tmp_path / "a.relations").write_text("1.0 2.0 0 0 0 0 0 0\n1.0 2.0 0 0 0 0 0\n")
+    with pytest.raises(InputError, match=r"a\.relations:2 has 7 fields"):
+        read_relations(tmp_path / "a.relations")
+
+
+def test_real_ground_truth_evaluates_to_zero_against_itself():
+    truth = read_tum(shared_data("3d/kitti_0001_first54.tum"))
+    error = absolute_error(pair(truth, truth))
+    assert error.translation_m.rmse < 1e-9
+    assert 60.0 < error.path_length_m < 70.0

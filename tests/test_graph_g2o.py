@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+from scenes import shared_data
+
+from pipeline import lie
+from pipeline.config import GraphConfig
+from pipeline.errors import InputError
+from pipeline.graph.g2o import read_g2o, write_g2o
+
+SQUARE = """\
+# a comment
+VERTEX_SE2 10 0 0 0
+VERTEX_SE2 20 1.1 0.1 1.5
+VERTEX_XY 7 3 4
+FIX 20
+VERTEX_SE2 30 1 1.2 3.1
+EDGE_SE2 10 20 1 0 1.5707963267948966 4 0.5 0.25 5 0 6
+EDGE_SE2 20 30 1 0 1.5707963267948966 4 0 0 5 0 6
+EDGE_SE2 30 10 1.4142135623730951 0 0 4 0 0 5 0 6
+EDGE_SE2_XY 10 7 1 2 1 0 1
+"""
+
+
+@pytest.mark.parametrize("name", ["manhattan", "intel", "MIT", "sphere2500", "smallGrid3D"])
+def test_what_is_written_reads_back_the_same(name, tmp_path):
+    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
+    path = tmp_path / "again.g2o"
+    write_g2o(path, first.graph, ids=first.ids, other_lines=first.other_lines)
+    second = read_g2o(path)
+    assert np.array_equal(first.graph.edges, second.graph.edges)
+    assert np.array_equal(first.graph.information, second.graph.information)
+    assert np.allclose(first.graph.measurements, second.graph.measurements, rtol=0, atol=1e-12)
+    assert np.allclose(first.graph.poses, second.graph.poses, rtol=0, atol=1e-12)
+    assert second.has_guess
+
+
+def test_the_numbers_of_a_line_go_where_they_belong(tmp_path):
+    path = tmp_path / "square.g2o"
+    path.write_text(SQUARE)
+    file = read_g2o(path)
+    graph = file.graph
+    assert file.ids.tolist() == [10, 20, 30]
+    assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert np.allclose(graph.poses[1], lie.pose_2d(1.1, 0.1, 1.5))
+    assert np.allclose(graph.measurements[0], lie.pose_2d(1.0, 0.0, np.pi / 2))
+    assert graph.information[0].tolist() == [[4, 0.5, 0.25], [0.5, 5, 0], [0.25, 0, 6]]
+    assert graph.held == [1] and graph.fixed.tolist() == [False, True, False]
+    assert not graph.is_loop.any()
+
+
+def test_lines_not_understood_are_counted_and_kept(tmp_path):
+    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
+    path.write_text(SQUARE)
+    file = read_g2o(path)
+    assert dict(file.other_tags) == {"#": 1, "VERTEX_XY": 1, "EDGE_SE2_XY": 1}
+    write_g2o(copy, file.graph, ids=file.ids, other_lines=file.other_lines)
+    again = read_g2o(copy)
+    assert again.other_lines == file.other_lines
+    assert again.ids.tolist() == [10, 20, 30] and again.graph.held == [1]
+
+
+def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
+    path = tmp_path / "pair.g2o"
+    upper = " ".join(str(float(v)) for v in _triangle(np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01))
+    half = np.sqrt(0.5)
+    path.write_text(
+        f"EDGE_SE3:QUAT 0 1 1 2 3 {2 * half} 0 0 {2 * half} {upper}\n"
+    )  # a quarter about x, not of length 1
+    graph = read_g2o(path).graph
+    assert np.allclose(graph.measurements[0], [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
+    assert np.allclose(graph.information[0], np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01)
+
+
+def _triangle(matrix):
+    return matrix[np.triu_indices(len(matrix))]
+
+
+def test_a_file_without_vertices_starts_from_its_odometry():
+    file = read_g2o(shared_data("graphs/manhattan.g2o"))
+    graph = file.graph
+    assert not file.has_guess and len(graph) == 3500
+    steps = graph.edges[:, 1] == graph.edges[:, 0] + 1
+    i, j = graph.edges[steps].T
+    relative = lie.inverse(graph.poses[i]) @ graph.poses[j]
+    assert np.allclose(relative, graph.measurements[steps], atol=1e-9)
+
+
+def test_suspect_loops_are_the_edges_that_skip_poses():
+    graph = read_g2o(shared_data("graphs/intel.g2o"), loops="suspect").graph
+    apart = np.abs(graph.edges[:, 0] - graph.edges[:, 1])
+    assert np.array_equal(graph.is_loop, apart != 1)
+
+
+def test_an_optimised_graph_can_be_written_and_is_still_optimal(tmp_path):
+    graph = read_g2o(shared_data("graphs/intel.g2o")).graph
+    answer = graph.optimise(GraphConfig())
+    write_g2o(tmp_path / "intel.g2o", graph)
+    again = read_g2o(tmp_path / "intel.g2o").graph.optimise(GraphConfig())
+    assert again.chi2_before == pytest.approx(answer.chi2_after, rel=1e-9)
+
+
+EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "holds no EDGE_SE2"),
+        ("VERTEX_SE2 0 0 0 0\n", "holds no EDGE_SE2"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", r":1: EDGE_SE2 has 10 values, needs 11"),
+        (f"{EDGE}\nEDGE_SE2 1 two 1 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2: invalid literal"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 zero 1 0 0 1 0 1\n", r":2: EDGE_SE2: could not convert"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 nan 1 0 0 1 0 1\n", r":2: EDGE_SE2 has a value that is not finite"),
+        (f"VERTEX_SE2 0 0 0 0\n{EDGE}\n", r":2: vertex 1 is not in the file"),
+        (f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nVERTEX_SE2 0 1 0 0\n{EDGE}\n", r":3: vertex 0 stands .* twice"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1\n", r":1: information matrix of edge 0-1 is not positive semidefinite"),
+        ("EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1\n", r":1: edge 1-1 joins a vertex to itself"),
+        (f"{EDGE}\nFIX 5\n", r":2: vertex 5 is not in the file"),
+        (f"{EDGE}\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", r":2: VERTEX_SE3:QUAT in an SE\(2\) graph"),
+        ("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 " + "0 " * 21 + "\n", r":1: quaternion of length 0"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line_that_names_the_place(text, words, tmp_path):
+    path = tmp_path / "bad.g2o"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_g2o(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
+    (tmp_path / "bytes.g2o").write_bytes(b"\xff\xfe\x00\x81")
+    for path in (tmp_path / "none.g2o", tmp_path, tmp_path / "bytes.g2o"):
+        with pytest.raises(InputError, match="cannot be read as g2o"):
+            read_g2o(path)

@@ -1,0 +1,280 @@
+import numpy as np
+import pytest
+from scenes import shared_data
+
+from pipeline import lie
+from pipeline.config import GraphConfig
+from pipeline.errors import InputError
+from pipeline.graph.g2o import read_g2o
+from pipeline.graph.pose_graph import PoseGraph
+
+PLAIN = GraphConfig(robust="none")
+BEST_HALF_CHI2 = {
+    "manhattan": 1774.5205,
+    "intel": 22.5021,
+    "MIT": 20.6035,
+    "sphere2500": 675.701,
+    "torus3D": 12117.6,
+}
+
+
+def read(name, **options):
+    return read_g2o(shared_data(f"graphs/{name}.g2o"), **options).graph
+
+
+def ring(dimension, count=12, *, noise=0.0, seed=0):
+    """A closed ring of poses whose guess follows the noisy odometry; the last edge is the loop."""
+    rng = np.random.default_rng(seed)
+    k = 3 if dimension == 2 else 6
+    twist = np.zeros(k)
+    twist[0], twist[-1] = 1.0, 2.0 * np.pi / count
+    true = [lie.identity(dimension)]
+    for _ in range(count - 1):
+        true.append(true[-1] @ lie.exp(twist))
+    graph, T = PoseGraph(dimension), lie.identity(dimension)
+    graph.add_pose(T, 0)
+    for index in range(1, count):
+        Z = lie.inverse(true[index - 1]) @ true[index] @ lie.exp(noise * rng.normal(size=k))
+        T = T @ Z
+        graph.add_pose(T, index)
+        graph.add_edge(index - 1, index, Z, 100.0 * np.eye(k))
+    graph.add_edge(count - 1, 0, lie.inverse(true[-1]), 100.0 * np.eye(k), is_loop=True)
+    return graph, np.array(true)
+
+
+@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "gauss-newton"])
+@pytest.mark.parametrize("name", list(BEST_HALF_CHI2))
+def test_the_published_graphs_reach_the_best_known_chi2_from_their_files(name, optimiser):
+    answer = read(name).optimise(GraphConfig(optimiser=optimiser))
+    assert answer.converged, answer.reason
+    assert 0.5 * answer.chi2_after <= BEST_HALF_CHI2[name] * (1.0 + 2e-5)
+    assert 0.5 * answer.chi2_after >= BEST_HALF_CHI2[name] * (1.0 - 2e-5)
+
+
+def test_small_grid_reaches_one_minimum_by_both_optimisers():
+    answers = [
+        read("smallGrid3D").optimise(GraphConfig(optimiser=o)) for o in ("levenberg-marquardt", "gauss-newton")
+    ]
+    assert all(answer.converged for answer in answers)
+    assert answers[0].chi2_after == pytest.approx(answers[1].chi2_after, rel=1e-5)
+
+
+def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
+    assert read("MIT").optimise(PLAIN).initialisation == "chordal"
+    assert read("intel").optimise(PLAIN).initialisation == "given"
+
+
+@pytest.mark.parametrize("initialise", ["odometry", "spanning-tree", "chordal", "given"])
+def test_every_way_to_start_ends_in_the_same_minimum(initialise):
+    answer = read("intel").optimise(PLAIN, initialise=initialise)
+    assert answer.initialisation == initialise
+    assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2["intel"], rel=2e-5)
+
+
+def test_levenberg_marquardt_lowers_chi2_where_gauss_newton_fails():
+    """From the file's own guess of MIT, plain Gauss-Newton is lost; the damped one at least goes down."""
+    graph = read("MIT")
+    answer = graph.optimise(PLAIN, initialise="given")
+    assert answer.chi2_after < answer.chi2_before
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimension):
+    """Pose 1 lies 1 m ahead of pose 0 and looks left; pose 2 lies 1 m ahead of pose 1: at (1, 1), looking left."""
+    quarter = lie.exp(np.array([0.0, 0.0, np.pi / 2]))
+    ahead = lie.exp(np.array([1.0, 0.0, 0.0]))
+    to_2 = lie.pose_2d(1.0, 1.0, np.pi / 2)
+    measured = [(0, 1, ahead @ quarter), (1, 2, ahead), (0, 2, to_2)]
+    graph = PoseGraph(dimension)
+    raise_dimension = lie.lift if dimension == 3 else np.asarray
+    k = graph.freedom
+    for index in range(3):
+        graph.add_pose(lie.identity(dimension), index)
+    for i, j, T in measured:
+        graph.add_edge(i, j, raise_dimension(T), np.eye(k))
+    answer = graph.optimise(PLAIN)
+    assert answer.chi2_after < 1e-15
+    assert np.allclose(graph.poses[1], raise_dimension(ahead @ quarter), atol=1e-7)
+    assert np.allclose(graph.poses[2][:dimension, dimension], [1.0, 1.0, 0.0][:dimension], atol=1e-7)
+    assert np.allclose(lie.yaw(graph.poses[2]), np.pi / 2, atol=1e-7)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_perfect_ring_returns_the_true_poses(dimension):
+    graph, true = ring(dimension)
+    answer = graph.optimise(PLAIN)
+    assert answer.converged and answer.chi2_after < 1e-12
+    assert np.allclose(graph.poses, true, atol=1e-7)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_answer_moves_with_the_world_frame(dimension):
+    """Far from the origin as near it: the same graph, its first pose elsewhere, ends in the same shape."""
+    near, _ = ring(dimension, noise=0.02)
+    far = PoseGraph(dimension)
+    k = near.freedom
+    away = np.array([4.1e5, -5.3e6, 0.7] if dimension == 2 else [4.1e5, -5.3e6, 120.0, 0.2, -0.3, 0.7])
+    T = lie.exp(away)
+    for pose, stamp in zip(near.poses, near.stamps_ns, strict=True):
+        far.add_pose(T @ pose, int(stamp))
+    far.add_edges(near.edges, near.measurements, near.information, near.is_loop)
+    assert near.optimise(PLAIN).converged and far.optimise(PLAIN).converged
+    assert k == far.freedom
+    # 1e-9 relative of the distance is all that double precision keeps
+    assert np.allclose(lie.inverse(T) @ far.poses, near.poses, atol=1e-7)
+
+
+def test_metres_or_centimetres_same_shape():
+    metres, _ = ring(2, noise=0.05)
+    scale, back = np.diag([100.0, 100.0, 1.0]), np.diag([0.01, 0.01, 1.0])
+    centimetres = PoseGraph(2)
+    for pose in metres.poses:
+        centimetres.add_pose(scale @ pose @ back, 0)
+    centimetres.add_edges(
+        metres.edges, scale @ metres.measurements @ back, back @ metres.information @ back, metres.is_loop
+    )
+    for robust in ("none", "huber", "cauchy", "geman-mcclure", "truncated"):
+        a, b = (graph.optimise(GraphConfig(robust=robust)) for graph in (metres, centimetres))
+        assert a.chi2_after == pytest.approx(b.chi2_after, rel=1e-4)
+        assert np.allclose(back @ centimetres.poses @ scale, metres.poses, atol=1e-4)
+
+
+def test_a_fixed_pose_stays_to_the_bit():
+    graph, _ = ring(3, noise=0.05)
+    graph.fix(4)
+    before = graph.poses.copy()
+    graph.optimise(PLAIN)
+    assert np.array_equal(graph.poses[4], before[4])
+    assert not np.array_equal(graph.poses[0], before[0])
+
+
+def test_the_same_optimisation_twice_is_equal_to_the_bit():
+    answers = [read("intel").optimise(GraphConfig()) for _ in range(2)]
+    assert np.array_equal(answers[0].state.poses, answers[1].state.poses)
+    assert answers[0].chi2_after == answers[1].chi2_after
+
+
+def test_every_reason_to_stop_is_reported():
+    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iterations reached"
+    assert "χ² change" in read("intel").optimise(PLAIN).reason
+    graph, _ = ring(2, noise=0.05)
+    graph.optimise(GraphConfig(robust="none", tolerance=1e-10))
+    assert "gradient" in graph.optimise(PLAIN).reason
+    graph, _ = ring(2)
+    assert graph.optimise(PLAIN).reason.split()[0] in {"gradient", "step", "χ²"}
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_graph_grown_between_optimisations_equals_one_built_at_once(dimension):
+    whole, _ = ring(dimension, count=60, noise=0.03)
+    grown = PoseGraph(dimension)
+    for index, pose in enumerate(whole.poses):
+        assert grown.add_pose(pose, 10 * index) == index
+        for edge in np.flatnonzero(whole.edges.max(axis=1) == index):
+            i, j = whole.edges[edge]
+            grown.add_edge(i, j, whole.measurements[edge], whole.information[edge], bool(whole.is_loop[edge]))
+        if index % 20 == 19:
+            grown.optimise(PLAIN)
+    whole.optimise(PLAIN)
+    assert np.allclose(grown.poses, whole.poses, atol=1e-6)
+    assert grown.stamps_ns.tolist() == [10 * index for index in range(60)]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_relative_covariance_equals_the_dense_inverse(dimension):
+    graph, _ = ring(dimension, count=8, noise=0.02)
+    graph.optimise(PLAIN)
+    k, i, j = graph.freedom, 2, 6
+    from naive_graph import normal_equations
+
+    H, _ = normal_equations(
+        graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
+    )
+    P = np.linalg.inv(H)
+
+    def picked(a, b):
+        return P[(a - 1) * k : a * k, (b - 1) * k : b * k]
+
+    joint = picked(i, i) + picked(j, j) - picked(i, j) - picked(j, i)
+    adjoint = lie.adjoint(lie.inverse(graph.poses[i]))
+    assert np.allclose(graph.relative_covariance(i, j), adjoint @ joint @ adjoint.T, rtol=1e-5, atol=1e-9)
+    assert np.allclose(
+        graph.relative_covariance(0, 1), lie_covariance_from_first(graph, P, k), rtol=1e-5, atol=1e-9
+    )
+
+
+def lie_covariance_from_first(graph, P, k):
+    """Pose 0 is held at the identity, so the world is its frame."""
+    return P[:k, :k]
+
+
+def test_odometry_alone_adds_up_the_covariances_of_its_steps():
+    graph = PoseGraph(2)
+    for index in range(4):
+        graph.add_pose(lie.pose_2d(index, 0.0, 0.0), index)
+    for index in range(3):
+        graph.add_edge(index, index + 1, lie.pose_2d(1.0, 0.0, 0.0), np.diag([100.0, 100.0, 1e9]))
+    assert np.allclose(np.diag(graph.relative_covariance(0, 3))[:2], 0.03, rtol=1e-4)
+    assert np.allclose(graph.relative_covariance(1, 1), 0.0)
+
+
+def test_a_pose_that_nothing_joins_is_named():
+    graph, _ = ring(2)
+    graph.add_pose(lie.identity(2), 99)
+    with pytest.raises(InputError, match=r"1 of 13 poses are not joined to a fixed one: 12;"):
+        graph.optimise(PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("i", "j", "information", "words"),
+    [
+        (0, 7, np.eye(3), "edge 0-7 joins a pose that is not there"),
+        (-1, 1, np.eye(3), "edge -1-1 joins a pose that is not there"),
+        (1, 1, np.eye(3), "joins a pose to itself"),
+        (0, 1, np.diag([1.0, 1.0, -1.0]), "not symmetric positive semidefinite"),
+        (
+            0,
+            1,
+            np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+            "not symmetric positive semidefinite",
+        ),
+        (0, 1, np.full((3, 3), np.nan), "not symmetric positive semidefinite"),
+    ],
+)
+def test_an_impossible_edge_is_refused_and_changes_nothing(i, j, information, words):
+    graph, _ = ring(2, count=3)
+    with pytest.raises(InputError, match=words):
+        graph.add_edge(i, j, lie.identity(2), information)
+    assert len(graph.edges) == 3
+
+
+def test_a_measurement_or_a_pose_that_is_not_finite_is_refused():
+    graph, _ = ring(2, count=3)
+    with pytest.raises(InputError, match="measurement is not finite"):
+        graph.add_edge(0, 2, np.full((3, 3), np.nan), np.eye(3))
+    with pytest.raises(InputError, match="pose 3 is not finite"):
+        graph.add_pose(np.full((3, 3), np.inf), 0)
+
+
+def test_gauss_newton_names_the_pose_that_its_edges_leave_free():
+    graph = PoseGraph(2)
+    for index in range(3):
+        graph.add_pose(lie.identity(2), index)
+    graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), np.eye(3))
+    graph.add_edge(1, 2, lie.pose_2d(1.0, 0.0, 0.0), np.diag([1.0, 1.0, 0.0]))
+    with pytest.raises(InputError, match="leave pose 2 free"):
+        graph.optimise(GraphConfig(optimiser="gauss-newton", robust="none"), initialise="given")
+
+
+def test_an_empty_graph_says_so():
+    with pytest.raises(InputError, match="has no poses"):
+        PoseGraph(2).optimise(PLAIN)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_poses_without_edges_but_the_first_are_already_optimal(dimension):
+    graph = PoseGraph(dimension)
+    graph.add_pose(lie.identity(dimension), 5)
+    answer = graph.optimise(GraphConfig())
+    assert answer.converged and answer.chi2_after == 0.0
+    assert np.array_equal(graph.poses[0], lie.identity(dimension))

@@ -1,0 +1,226 @@
+"""The recording of a run: what every step says, to a file, to a viewer, or to both.
+
+Nothing that goes wrong here after the start ends a run; it is collected in ``Recording.warnings``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from pipeline.config import RecordingConfig
+from pipeline.data import Closure, GraphState, Matrix, Step
+from pipeline.errors import InputError
+from viz import entities, shapes, viewer
+from viz.batching import Batcher
+from viz.blueprint import blueprint
+from viz.keyframe_graph import KeyframeGraph
+from viz.messages import Message, Times
+from viz.sinks import FileSink, LiveSink, Sink, open_stream
+
+SinkName = Literal["save", "spawn", "connect", "web"]
+
+
+class Recording:
+    """Takes in steps and results; a context that is entered before the first and left after the last.
+
+    path : the .rrd file; needed for the sink "save", ignored otherwise
+    name : what the viewer calls the recording
+    sinks : "save" to the file, "spawn" a viewer, "connect" to an open one, serve a "web" viewer on this machine;
+        none at all is a recording that goes nowhere
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        dimension: int,
+        name: str,
+        sinks: frozenset[SinkName],
+        config: RecordingConfig,
+        port: int = viewer.PORT,
+        web_port: int = viewer.WEB_PORT,
+    ) -> None:
+        if "save" in sinks and path is None:
+            raise InputError("no path for the recording: give --out, or leave save out of --rerun")
+        self.path = path
+        self.dimension = dimension
+        self.name = name
+        self.wanted = sinks
+        self.config = config
+        self.port = port
+        self.web_port = web_port
+        self.web_address = ""
+        self.sinks: list[Sink] = []
+        self.server: subprocess.Popen[bytes] | None = None
+        self.batcher = Batcher(dimension)
+        self.graph = KeyframeGraph()
+        self.odometry: list[Matrix] = []
+        self.framed = np.empty((0, 3), np.float32)
+        self.recorded_points = 0
+        self.problems: list[str] = []
+
+    def __enter__(self) -> Recording:
+        recording_id = uuid4()
+        if "save" in self.wanted and self.path is not None:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.sinks.append(FileSink(self.path, stream, blueprint(self.dimension)))
+        address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
+        if address:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.sinks.append(LiveSink(address, stream, blueprint(self.dimension)))
+        self._send(lambda: entities.constants(self.dimension))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What went wrong so far, a line each."""
+        return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
+
+    def log(self, step: Step) -> None:
+        """Record one step; most of it is gathered and written in batches."""
+        if self.sinks:
+            self._send(lambda: self._step(step))
+
+    def log_trajectory(self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]) -> None:
+        """Record the way after optimisation: poses (N, d+1, d+1) of the scans ``indices``, as a line and over time."""
+        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimised))
+
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
+        """Record the final graph and what became of every closure."""
+        self._send(lambda: self.graph.settle(closures, graph))
+
+    def log_map(self, points: NDArray[np.floating]) -> None:
+        """Record the finished map (N, d); thinned to a quarter of the points that the scans took."""
+        self._send(lambda: self._map(points))
+
+    def log_grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
+    ) -> None:
+        """Record the finished occupancy grid of a 2D log.
+
+        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
+        origin_m : x, y of the outer corner of cells[0, 0]
+        """
+        self._send(lambda: self._grid(cells, resolution_m, origin_m))
+
+    def close(self) -> None:
+        """Write what is gathered, frame the view, and let go of file and viewer; once is enough."""
+        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(), *self._odometry()])
+        for sink in self.sinks:
+            self._guard(lambda sink=sink: sink.frame(blueprint(self.dimension, self.framed)))
+            self._guard(sink.close)
+        self.problems, self.sinks = self.warnings, []
+        if self.server is not None:
+            viewer.stop(self.server)
+            self.server = None
+
+    def hold(self) -> None:
+        """Keep the web viewer served until it ends or the user interrupts."""
+        self._send(self.batcher.messages)
+        if self.server is not None:
+            try:
+                self.server.wait()
+            except KeyboardInterrupt:
+                return
+
+    def _viewer_address(self) -> str:
+        """Where a viewer takes data, or nothing and a warning."""
+        try:
+            if "web" in self.wanted:
+                self.server = viewer.start_web(self.port, self.web_port)
+                self.web_address = viewer.web_address(self.port, self.web_port)
+            elif "spawn" in self.wanted:
+                viewer.start_window(self.port)
+            elif not viewer.is_listening(self.port):
+                raise viewer.ViewerError(
+                    f"no viewer at {viewer.HOST}:{self.port}, the run goes on without it; open one with: rerun"
+                )
+        except (viewer.ViewerError, OSError) as error:
+            self.problems.append(str(error))
+            return ""
+        return viewer.grpc_address(self.port)
+
+    def _step(self, step: Step) -> list[Message]:
+        self.batcher.add(step)
+        self.odometry.append(step.T_odom_lidar)
+        self.recorded_points += len(step.points)
+        messages = self.graph.add(step)
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+            points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
+            columns = rr.Points3D.columns(positions=points).partition([len(points)])
+            messages.append(Message(entities.LOCAL_MAP, columns, Times.at(step.scan.index, step.scan.stamp_ns)))
+        return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
+
+    def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
+        path = shapes.positions(poses)
+        self.framed = path
+        line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(1.5)])
+        return [
+            Message(entities.OPTIMISED, line),
+            Message(entities.OPTIMISED_LIDAR, shapes.transforms(poses), times),
+        ]
+
+    def _odometry(self) -> list[Message]:
+        """The whole way by odometry, once the run is over."""
+        if not self.odometry:
+            return []
+        path = shapes.positions(np.array(self.odometry))
+        if not len(self.framed):
+            self.framed = path
+        self.odometry = []
+        return [Message(entities.ODOMETRY_PATH, rr.LineStrips3D([path], colors=[entities.ORANGE], radii=[entities.pixels(0.5)]))]
+
+    def _map(self, points: NDArray[np.floating]) -> list[Message]:
+        limit = max(self.config.max_map_points, self.recorded_points // 4)
+        drawn = shapes.in_space(shapes.at_most(points, limit))
+        if not len(drawn):
+            return []
+        colours = entities.height_colours(drawn) if self.dimension == 3 else [entities.WHITE]
+        return [Message(entities.MAP, rr.Points3D(drawn, colors=colours, radii=[entities.pixels(1.0)]))]
+
+    def _grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
+    ) -> list[Message]:
+        """rerun's first row is the top one, at the highest y."""
+        height, width = cells.shape
+        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)
+        grid = rr.GridMap(
+            data=pixels.tobytes(),
+            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+            cell_size=resolution_m,
+            translation=[*origin_m, -0.05],
+            colormap=rr.components.Colormap.RvizMap,
+        )
+        return [Message(entities.GRID, grid)]
+
+    def _send(self, say: Callable[[], list[Message]]) -> None:
+        """Send what ``say`` has to say to every sink."""
+        if not self.sinks:
+            return
+        messages: list[Message] = []
+        self._guard(lambda: messages.extend(say()))
+        for sink in self.sinks if messages else ():
+            sink.send(messages)
+
+    def _guard(self, act: Callable[[], object]) -> None:
+        """A recording that fails must not fail the run: say so, once for each kind of failure."""
+        try:
+            act()
+        except Exception as error:
+            problem = f"the recording lacks something: {type(error).__name__}: {error}"
+            if problem not in self.problems:
+                self.problems.append(problem)

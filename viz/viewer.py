@@ -1,0 +1,112 @@
+"""rerun's viewer as a process of its own, and whether one listens; it is never waited for without a limit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from time import monotonic, sleep
+from urllib.parse import quote
+
+from pipeline.errors import ScanchainError
+
+HOST = "127.0.0.1"
+PORT = 9876
+WEB_PORT = 9090
+_PROBE_S = 0.3
+_START_S = 8.0
+_SETTLE_S = 0.5
+
+
+class ViewerError(ScanchainError):
+    """No viewer: what failed and what to do, on one line."""
+
+
+def grpc_address(port: int) -> str:
+    """Where a viewer on this machine takes data."""
+    return f"rerun+http://{HOST}:{port}/proxy"
+
+
+def web_address(port: int, web_port: int) -> str:
+    """The page that shows what the server on ``port`` takes."""
+    return f"http://{HOST}:{web_port}/?url={quote(grpc_address(port), safe='')}"
+
+
+def is_listening(port: int) -> bool:
+    """Whether somebody accepts connections on a port of this machine."""
+    try:
+        with socket.create_connection((HOST, port), timeout=_PROBE_S):
+            return True
+    except OSError:
+        return False
+
+
+def start_window(port: int) -> None:
+    """Open the viewer's window; it outlives the run. A viewer that is open already is used as it is."""
+    if is_listening(port):
+        return
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("no viewer spawned: there is no display; use --rerun web, or open the recording later")
+    process = _launch("--port", str(port), "--expect-data-soon")
+    try:
+        _wait(process, (port,))
+    except ViewerError:
+        stop(process)
+        raise
+
+
+def start_web(port: int, web_port: int) -> subprocess.Popen[bytes]:
+    """Serve the web viewer and take data for it, on this machine only."""
+    for taken in (port, web_port):
+        if is_listening(taken):
+            raise ViewerError(f"no web viewer: port {taken} is taken; close what listens there (another viewer?)")
+    process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port))
+    try:
+        _wait(process, (port, web_port))
+    except ViewerError:
+        stop(process)
+        raise
+    return process
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    """End a viewer that was started here, with the children of its launcher."""
+    if os.name == "posix":
+        try:
+            os.killpg(process.pid, signal.SIGTERM)
+        except ProcessLookupError:
+            return
+    else:
+        process.terminate()
+    try:
+        process.wait(timeout=2.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def _launch(*arguments: str) -> subprocess.Popen[bytes]:
+    """Start rerun bound to this machine alone (its own default is every interface)."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "rerun_cli", "--bind", HOST, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
+    """Return once the viewer listens and lives on: without a display it listens for a moment, then dies."""
+    deadline = monotonic() + _START_S
+    listening_since = None
+    while monotonic() < deadline:
+        if process.poll() is not None:
+            raise ViewerError(f"no viewer: it ended at once with code {process.returncode}; try `rerun` on its own")
+        if listening_since is None and all(is_listening(port) for port in ports):
+            listening_since = monotonic()
+        if listening_since is not None and monotonic() - listening_since > _SETTLE_S:
+            return
+        sleep(0.02)
+    raise ViewerError(f"no viewer: it did not answer within {_START_S:.0f} s; try `rerun` on its own")
