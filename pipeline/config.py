@@ -111,7 +111,7 @@ class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
     optimiser: Literal["gauss-newton", "levenberg-marquardt"] = "levenberg-marquardt"
     max_iterations: Count = 50
     tolerance: Positive = 1e-6
-    robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = "geman-mcclure"
+    robust: Literal["none", "huber", "cauchy", "geman-mcclure", "truncated"] = "truncated"
     robust_scale: Positive = 3.0
 
 
@@ -120,6 +120,7 @@ class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     voxel_size_m: Positive = 0.2
     grid_resolution_m: Positive = 0.05
+    grid_max_range_m: Positive = 80.0
     slice_min_z_m: float = -0.5
     slice_max_z_m: float = 0.5
 

@@ -166,7 +166,7 @@ class Slam:
         return self._optimise()
 
     def _optimise(self) -> GraphState:
-        state = self.graph.optimise(self.config.graph).state
+        state = self.graph.optimise(self.config.graph, initialise="given").state
         self.waiting_closures, self.optimised_at = 0, len(self.keyframes)
         self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state

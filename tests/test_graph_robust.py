@@ -35,15 +35,17 @@ def position_error_m(graph, true):
     return float(np.sqrt(((graph.poses[:, :2, 2] - true.poses[:, :2, 2]) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("robust", ["geman-mcclure", "truncated"])
+@pytest.mark.parametrize(
+    ("robust", "true_lost", "error_m"), [("truncated", 0.01, 0.2), ("geman-mcclure", 0.04, 2.0)]
+)
 @pytest.mark.parametrize("name", ["intel", "manhattan"])
-def test_false_loops_are_rejected_and_true_ones_kept(name, robust):
+def test_false_loops_are_rejected_and_true_ones_kept(name, robust, true_lost, error_m):
     graph, true, false = with_false_loops(name, 0.03)
     answer = graph.optimise(GraphConfig(robust=robust))
     rejected = in_order_of_addition(graph, answer.rejected)
     assert rejected[false].mean() >= 0.99
-    assert rejected[graph.is_loop & ~false].mean() <= 0.04
-    assert position_error_m(graph, true) < 0.5
+    assert rejected[graph.is_loop & ~false].mean() <= true_lost
+    assert position_error_m(graph, true) < error_m
     weight = in_order_of_addition(graph, answer.state.weight)
     assert weight[false].max() < 0.1 and np.all(weight[~graph.is_loop] == 1.0)
     assert not rejected[~graph.is_loop].any()

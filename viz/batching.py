@@ -15,6 +15,7 @@ from viz.messages import Message, Times
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
+_WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
 
 
 class Batcher:
@@ -23,6 +24,9 @@ class Batcher:
     def __init__(self, dimension: int) -> None:
         self.steps: list[Step] = []
         self.bytes = 0
+        self.scans = 0
+        self.points = 0
+        self.box: shapes.Floats | None = None
         self.started_s = perf_counter()
         self.T_odom_before: Matrix | None = None
         self.T_world_odom: Matrix = lie.identity(dimension)
@@ -35,6 +39,8 @@ class Batcher:
             self.started_s = perf_counter()
         self.steps.append(step)
         self.bytes += 12 * len(step.points)
+        self.points += len(step.points)
+        self.scans += 1
 
     @property
     def is_due(self) -> bool:
@@ -56,6 +62,7 @@ class Batcher:
         )
         odom = np.array([step.T_odom_lidar for step in steps])
         world = np.array([step.T_world_lidar for step in steps])
+        self._frame(shapes.positions(world))
         return [
             Message(entities.LIDAR, shapes.transforms(world), times),
             Message(entities.SCAN, _scans(steps), times),
@@ -64,6 +71,11 @@ class Batcher:
             Message(entities.TIME, _times_by_stage(steps), times),
             *self._states(steps, times),
         ]
+
+    def _frame(self, positions: shapes.Floats) -> None:
+        """Widen the box around everything that was passed, (2, 3)."""
+        known = positions if self.box is None else np.concatenate([self.box, positions])
+        self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
     def _trails(self, times: Times, odom: Matrix, world: Matrix) -> list[Message]:
         """Each scan's piece of the way, before and after correction, and the correction where it changed.
@@ -101,11 +113,11 @@ class Batcher:
             if changed[row] and step.state is not State.OK:
                 rows.append(row)
                 texts.append(f"{step.state}: {step.reason}")
-                levels.append(rr.TextLogLevel.WARN)
+                levels.append(_WARNING)
             for closure in step.closures:
                 rows.append(row)
                 texts.append(f"closure {closure.target} to {closure.source} {closure.verdict}: {closure.reason}")
-                levels.append(rr.TextLogLevel.INFO)
+                levels.append(_INFORMATION)
         messages = []
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
@@ -146,8 +158,6 @@ def _matches(matches: list[Match], times: Times) -> list[Message]:
 
 def _times_by_stage(steps: list[Step]) -> rr.ComponentColumnList:
     """Milliseconds of every stage, one series each, in the order of ``entities.STAGES``."""
-    seconds = [
-        (t.read_s, t.preprocess_s, t.match_s, t.map_s, t.loops_s) for t in (step.timing for step in steps)
-    ]
+    seconds = [(t.read_s, t.preprocess_s, t.match_s, t.map_s, t.loops_s) for t in (step.timing for step in steps)]
     milliseconds = 1e3 * np.array(seconds).reshape(-1)
     return rr.Scalars.columns(scalars=milliseconds).partition([len(entities.STAGES)] * len(steps))

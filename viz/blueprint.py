@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from viz import entities
 from viz.shapes import Floats
 
+_PLAY_S = 30.0
 _PLOTS = {
     "time by stage": entities.TIME,
     "inliers": entities.INLIERS,
@@ -19,24 +20,33 @@ _PLOTS = {
 }
 
 
-def blueprint(dimension: int, path: Floats | None = None) -> rrb.Blueprint:
-    """The layout of a 2D log (seen from above) or a 3D one; ``path`` (N, 3) is what the view should frame."""
-    plots = rrb.Tabs(*(rrb.TimeSeriesView(origin=entity, name=name) for name, entity in _PLOTS.items()))
+def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.Blueprint:
+    """The layout of a 2D log (seen from above) or a 3D one.
+
+    box : (2, 3) lowest and highest coordinates that the view should frame
+    scans : how many there are, where that is known: they are played in half a minute, but no slower than 30 Hz
+    """
+    whole = rrb.TimeAxis(
+        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    )
+    plots = rrb.Tabs(
+        *(rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole) for name, entity in _PLOTS.items())
+    )
     texts = rrb.Tabs(
         rrb.TextDocumentView(origin=entities.LEGEND, name="legend"),
         rrb.TextLogView(origin=entities.EVENTS, name="events"),
     )
-    state = rrb.StateTimelineView(origin=entities.STATE, name="state")
+    state = rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole)
     side = rrb.Vertical(plots, state, texts, row_shares=[4, 1, 3])
     return rrb.Blueprint(
-        rrb.Horizontal(_scene(dimension, path), side, column_shares=[5, 3]),
-        rrb.TimePanel(timeline="scan", state="collapsed"),
+        rrb.Horizontal(_scene(dimension, box), side, column_shares=[5, 3]),
+        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
 
 
-def _scene(dimension: int, path: Floats | None) -> rrb.Spatial3DView:
+def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
     """The world; the two ways grow with the time cursor instead of showing their last piece only."""
     so_far = rrb.VisibleTimeRanges(
         [
@@ -53,17 +63,15 @@ def _scene(dimension: int, path: Floats | None) -> rrb.Spatial3DView:
         name="seen from above" if dimension == 2 else "scene",
         overrides={entities.ODOMETRY: so_far, entities.TRAJECTORY: so_far},
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_eye(dimension, path),
+        eye_controls=_eye(dimension, box),
     )
 
 
-def _eye(dimension: int, path: Floats | None) -> rrb.EyeControls3D | None:
+def _eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole way."""
-    if path is None or not len(path):
-        path = np.array([[-20.0, -20.0, 0.0], [20.0, 20.0, 0.0]], np.float32)
-    low, high = path.min(axis=0), path.max(axis=0)
+    low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
     centre = 0.5 * (low + high)
-    size_m = max(float(np.linalg.norm(high - low)), 20.0)
+    size_m = max(float(np.linalg.norm(high - low)), 20.0 if dimension == 2 else 60.0)
     away = (0.0, 0.0, 1.3) if dimension == 2 else (-0.35, -0.7, 0.7)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,

@@ -20,7 +20,6 @@ LIDAR = "world/lidar"
 SCAN = "world/lidar/scan"
 COVARIANCE = "world/lidar/covariance"
 ODOMETRY = "world/odometry"
-ODOMETRY_PATH = "world/odometry/whole"
 TRAJECTORY = "world/trajectory"
 OPTIMISED = "world/optimised"
 OPTIMISED_LIDAR = "world/optimised/lidar"
@@ -47,7 +46,9 @@ YELLOW, GREY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
 CYAN = (70, 210, 210)
 
-_HEIGHT_COLOURS = np.array([(50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230)], np.float64)
+_HEIGHT_COLOURS = np.array(
+    [(50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230)], np.float64
+)
 
 _LEGEND = f"""
 | drawn | is |

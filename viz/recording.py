@@ -15,6 +15,7 @@ from uuid import uuid4
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.error_utils import catch_and_log_exceptions
 
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
@@ -63,9 +64,6 @@ class Recording:
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher(dimension)
         self.graph = KeyframeGraph()
-        self.odometry: list[Matrix] = []
-        self.framed = np.empty((0, 3), np.float32)
-        self.recorded_points = 0
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
@@ -95,8 +93,10 @@ class Recording:
         if self.sinks:
             self._send(lambda: self._step(step))
 
-    def log_trajectory(self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]) -> None:
-        """Record the way after optimisation: poses (N, d+1, d+1) of the scans ``indices``, as a line and over time."""
+    def log_trajectory(
+        self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]
+    ) -> None:
+        """Record the way after optimisation: poses (N, d+1, d+1) of the scans ``indices``."""
         self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimised))
 
     def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
@@ -104,7 +104,7 @@ class Recording:
         self._send(lambda: self.graph.settle(closures, graph))
 
     def log_map(self, points: NDArray[np.floating]) -> None:
-        """Record the finished map (N, d); thinned to a quarter of the points that the scans took."""
+        """Record the finished map (N, d); thinned to a third of the points that the scans took."""
         self._send(lambda: self._map(points))
 
     def log_grid(
@@ -119,9 +119,10 @@ class Recording:
 
     def close(self) -> None:
         """Write what is gathered, frame the view, and let go of file and viewer; once is enough."""
-        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(), *self._odometry()])
+        self._send(lambda: [*self.batcher.messages(), *self.graph.draw()])
+        layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
         for sink in self.sinks:
-            self._guard(lambda sink=sink: sink.frame(blueprint(self.dimension, self.framed)))
+            self._guard(lambda sink=sink: sink.frame(layout))
             self._guard(sink.close)
         self.problems, self.sinks = self.warnings, []
         if self.server is not None:
@@ -156,8 +157,6 @@ class Recording:
 
     def _step(self, step: Step) -> list[Message]:
         self.batcher.add(step)
-        self.odometry.append(step.T_odom_lidar)
-        self.recorded_points += len(step.points)
         messages = self.graph.add(step)
         if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
@@ -167,25 +166,14 @@ class Recording:
 
     def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
         path = shapes.positions(poses)
-        self.framed = path
-        line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(1.5)])
+        line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(0.75)])
         return [
             Message(entities.OPTIMISED, line),
             Message(entities.OPTIMISED_LIDAR, shapes.transforms(poses), times),
         ]
 
-    def _odometry(self) -> list[Message]:
-        """The whole way by odometry, once the run is over."""
-        if not self.odometry:
-            return []
-        path = shapes.positions(np.array(self.odometry))
-        if not len(self.framed):
-            self.framed = path
-        self.odometry = []
-        return [Message(entities.ODOMETRY_PATH, rr.LineStrips3D([path], colors=[entities.ORANGE], radii=[entities.pixels(0.5)]))]
-
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
-        limit = max(self.config.max_map_points, self.recorded_points // 4)
+        limit = max(self.config.max_map_points, self.batcher.points // 3)
         drawn = shapes.in_space(shapes.at_most(points, limit))
         if not len(drawn):
             return []
@@ -195,7 +183,7 @@ class Recording:
     def _grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
     ) -> list[Message]:
-        """rerun's first row is the top one, at the highest y."""
+        """Rerun's first row is the top one, at the highest y."""
         height, width = cells.shape
         pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)
         grid = rr.GridMap(
@@ -219,7 +207,8 @@ class Recording:
     def _guard(self, act: Callable[[], object]) -> None:
         """A recording that fails must not fail the run: say so, once for each kind of failure."""
         try:
-            act()
+            with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
+                act()
         except Exception as error:
             problem = f"the recording lacks something: {type(error).__name__}: {error}"
             if problem not in self.problems:

@@ -6,6 +6,7 @@ The two are two streams of one recording. rerun can tee one stream to both, but 
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 from pathlib import Path
@@ -58,7 +59,9 @@ class FileSink:
         try:
             stream.set_sinks(rr.FileSink(path), default_blueprint=blueprint)
         except RuntimeError as error:
-            raise InputError(f"{path}: cannot write the recording: {error}; use another --out or --rerun off") from error
+            raise InputError(
+                f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
+            ) from error
 
     def send(self, messages: list[Message]) -> None:
         """Write a batch; a broken disk is told once, and then nothing more is written."""
@@ -109,10 +112,8 @@ class LiveSink:
 
     def close(self) -> None:
         """Give the viewer a few seconds to take the rest, then go on without it."""
-        try:
+        with contextlib.suppress(queue.Full):
             self.waiting.put(None, timeout=_FLUSH_S)
-        except queue.Full:
-            pass
         self.thread.join(_FLUSH_S)
         if self.thread.is_alive():
             rr.unregister_shutdown()  # it would wait for the viewer when Python ends, without a limit

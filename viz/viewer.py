@@ -103,7 +103,9 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
     listening_since = None
     while monotonic() < deadline:
         if process.poll() is not None:
-            raise ViewerError(f"no viewer: it ended at once with code {process.returncode}; try `rerun` on its own")
+            raise ViewerError(
+                f"no viewer: it ended at once with code {process.returncode}; try `rerun` on its own"
+            )
         if listening_since is None and all(is_listening(port) for port in ports):
             listening_since = monotonic()
         if listening_since is not None and monotonic() - listening_since > _SETTLE_S:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.data import Matrix
-from pipeline.graph.cholesky import BlockPattern, SparseCholesky
+from pipeline.graph.cholesky import BlockPattern, SparseCholesky, analyse
 from pipeline.kernels import graph_between_se2, graph_between_se3, graph_scatter
 
 
@@ -42,13 +42,15 @@ class BetweenProblem:
         self.variable = variable
         ends = variable[edges].reshape(-1, 2)
         joined = (ends >= 0).all(axis=1)
-        pairs, which = np.unique(np.sort(ends[joined], axis=1)[:, ::-1], axis=0, return_inverse=True)
+        count = max(len(self.free), 1)
+        keys = ends[joined].max(axis=1, initial=0) * count + ends[joined].min(axis=1, initial=count)
+        unique, which = np.unique(keys, return_inverse=True)
         self.slots = np.full((len(edges), 3), -1, np.int64)
         self.slots[:, :2] = ends
-        self.slots[joined, 2] = len(self.free) + which.reshape(-1)
+        self.slots[joined, 2] = len(self.free) + which
         sizes = np.full(len(self.free), self.freedom, np.int64)
-        self.pattern = BlockPattern(sizes, np.ascontiguousarray(pairs).reshape(-1, 2))
-        self.cholesky = SparseCholesky(self.pattern)
+        self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
+        self.cholesky = SparseCholesky(self.pattern, analyse(self.pattern))
 
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -47,25 +49,39 @@ class BlockPattern:
         return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
 
 
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What follows from the pairs alone: elimination order (n,), tree (n,), rows of the factor by column."""
+
+    order: NDArray[np.int64]
+    parent: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+
+def analyse(pattern: BlockPattern) -> Analysis:
+    """Fill-reducing order of the variables, and where the factor fills in; the same for blocks of any size."""
+    start, neighbours = _adjacency(pattern)
+    order = _fill_reducing_order(start, neighbours)
+    order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))]
+    parent = graph_symbolic.elimination_tree(start, neighbours, order)
+    return Analysis(order, parent, *graph_symbolic.column_structures(start, neighbours, order, parent))
+
+
 class SparseCholesky:
     """The factor A = Uᵀ U of a block-sparse matrix; the fill-reducing ordering and the symbolic analysis are kept.
 
     ``factorise`` may be called any number of times with new values of the same pattern.
     """
 
-    def __init__(self, pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> None:
-        """Order the variables, unless an order (n,) of the same structure is at hand, and lay out the fronts."""
+    def __init__(self, pattern: BlockPattern, analysis: Analysis) -> None:
+        """Lay out the fronts; the analysis may come from a pattern of the same pairs and other sizes."""
         self.pattern = pattern
-        start, neighbours = _adjacency(pattern)
-        if order is None:
-            order = _fill_reducing_order(start, neighbours)
-        order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))]
-        parent = graph_symbolic.elimination_tree(start, neighbours, order)
-        begin, rows = graph_symbolic.column_structures(start, neighbours, order, parent)
+        self.analysis = analysis
+        order, parent, begin, rows = analysis.order, analysis.parent, analysis.begin, analysis.rows
         sizes = pattern.sizes[order]
         groups = graph_symbolic.group_columns(parent, begin, rows, sizes)
         self._fronts = graph_fronts.lay_out_fronts(groups, begin, rows, sizes)
-        self.order = order
         places = np.empty(len(order), np.int64)
         places[order] = np.cumsum(sizes) - sizes
         self._blocks = graph_fronts.lay_out_blocks(

@@ -55,7 +55,7 @@ def _least_squares(
         np.add.at(degree, end[end >= 0], weight[end >= 0])
     blocks[:n] = degree[:, None, None] * np.eye(size)
     pattern = BlockPattern(np.full(n, size, np.int64), problem.pattern.pairs)
-    factor = SparseCholesky(pattern, problem.cholesky.order)
+    factor = SparseCholesky(pattern, problem.cholesky.analysis)
     factor.factorise(blocks.reshape(-1))
     result = known.copy()
     result[problem.free] = factor.solve(right.reshape(-1, columns)).reshape(-1, size, columns)
@@ -64,6 +64,11 @@ def _least_squares(
 
 def _nearest_rotation(matrices: Matrix) -> Matrix:
     """The rotation nearest to each matrix (K, d, d): U diag(1, …, det U Vᵀ) Vᵀ (Umeyama 1991)."""
+    if matrices.shape[-1] == 2:
+        cosine, sine = matrices[:, 0, 0] + matrices[:, 1, 1], matrices[:, 1, 0] - matrices[:, 0, 1]
+        angle = np.arctan2(sine, cosine)
+        c, s = np.cos(angle), np.sin(angle)
+        return np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
     U, _, Vt = np.linalg.svd(matrices)
     U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]
     return U @ Vt

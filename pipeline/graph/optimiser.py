@@ -16,7 +16,8 @@ from pipeline.graph.robust import GRADUATED, RobustLoss
 Optimiser = Literal["gauss-newton", "levenberg-marquardt"]
 
 _MOST_DAMPING = 1e12
-_FIRST_DAMPING = 1e-9  # nearly Gauss-Newton; a step that fails raises it fast
+_FIRST_DAMPING = 1e-12  # all but Gauss-Newton: the weakest modes of a long chain have 1e-9 of diag H
+_GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Minimiser:
         self._problem = problem
         self._loops = np.flatnonzero(is_loop)
         self._damped = optimiser == "levenberg-marquardt"
-        self._damping, self._growth = _FIRST_DAMPING, 2.0
+        self._damping, self._growth = _FIRST_DAMPING, _GROWTH
 
     def evaluate(self, poses: Matrix, loss: RobustLoss) -> Estimate:
         """Residuals, χ² and cost at these poses."""
@@ -119,8 +120,8 @@ class Minimiser:
             if not self._damped:
                 break
             self._damping *= self._growth
-            self._growth *= 2.0
-        self._damping, self._growth = _FIRST_DAMPING, 2.0
+            self._growth *= 4.0
+        self._damping, self._growth = _FIRST_DAMPING, _GROWTH
         return np.zeros(0), None
 
     def _solve(self, equations: NormalEquations) -> NDArray[np.float64] | None:
@@ -144,8 +145,8 @@ class Minimiser:
         if not gained >= 0.0:
             return False
         gain = min(gained / max(predicted, 1e-300), 1.0)
-        self._damping = max(self._damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
-        self._growth = 2.0
+        self._damping = max(self._damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
+        self._growth = _GROWTH
         return True
 
     def _flat(self, equations: NormalEquations, tolerance: float) -> bool:

@@ -1,0 +1,62 @@
+"""loops.parquet: one row a loop closure tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.data import Closure, GraphState, Keyframe, Verdict
+from pipeline.step_table import pose_columns
+
+
+def write_closures(
+    path: Path, closures: Sequence[Closure], keyframes: Sequence[Keyframe], graph: GraphState, dimension: int
+) -> None:
+    """Write every closure tried, with the verdict and the robust weight that the optimiser left to it."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    k = 3 if dimension == 2 else 6
+    matches = [closure.match for closure in closures]
+    relative = np.array([match.T_target_source for match in matches])
+    columns: dict[str, object] = {
+        "target": pa.array([closure.target for closure in closures], pa.int64()),
+        "source": pa.array([closure.source for closure in closures], pa.int64()),
+        "target_scan": pa.array([keyframes[closure.target].scan_index for closure in closures], pa.int64()),
+        "source_scan": pa.array([keyframes[closure.source].scan_index for closure in closures], pa.int64()),
+        "target_stamp_ns": pa.array([keyframes[closure.target].stamp_ns for closure in closures], pa.int64()),
+        "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
+        "verdict": pa.array([str(closure.verdict) for closure in closures], pa.string()),
+        "reason": pa.array([closure.reason for closure in closures], pa.string()),
+        "weight": pa.array(_weights(closures, graph), pa.float64()),
+        **{
+            name: pa.array(values, pa.float64())
+            for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()
+        },
+        "information": pa.array([match.information.ravel().tolist() for match in matches], pa.list_(pa.float64(), k * k)),
+        "overlap": pa.array([closure.overlap for closure in closures], pa.float64()),
+        "points": pa.array([match.points for match in matches], pa.int64()),
+        "inliers": pa.array([match.inliers for match in matches], pa.int64()),
+        "iterations": pa.array([match.iterations for match in matches], pa.int64()),
+        "residual_m": pa.array([match.residual_m for match in matches], pa.float64()),
+        "converged": pa.array([match.converged for match in matches], pa.bool_()),
+        "degeneracy_eigenvalue": pa.array([match.degeneracy_eigenvalue for match in matches], pa.float64()),
+    }
+    notes = {
+        "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
+        "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
+        "weight": "robust weight after the last optimisation, null for rejected closures",
+    }
+    pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")
+
+
+def _weights(closures: Sequence[Closure], graph: GraphState) -> list[float | None]:
+    """Robust weight of each closure; the graph holds the accepted ones as its loop edges."""
+    pairs = zip(graph.edges[graph.is_loop].tolist(), graph.weight[graph.is_loop].tolist(), strict=True)
+    weight = {(i, j): value for (i, j), value in pairs}
+    return [
+        weight.get((closure.target, closure.source)) if closure.verdict is Verdict.ACCEPTED else None
+        for closure in closures
+    ]

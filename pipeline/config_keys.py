@@ -1,0 +1,168 @@
+"""Every key of the configuration tree, flat: its type, unit, range and default."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from msgspec import inspect
+
+from pipeline.config import Config
+from pipeline.errors import InputError
+
+Value = bool | int | float | str
+Kind = Literal["bool", "int", "float", "choice", "str"]
+
+_UNITS = {"_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_voxels": "voxels", "_keyframes": "keyframes"}
+_YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigKey:
+    """One leaf of the tree.
+
+    Attributes
+    ----------
+    name : with its section, ``matching.max_distance_m``
+    kind : what it holds
+    default : before presets, files and flags
+    low, high : limits of a number; ``low_is_allowed`` is False where it must be exceeded
+    choices : what a choice offers
+    """
+
+    name: str
+    kind: Kind
+    default: Value
+    low: float
+    high: float
+    low_is_allowed: bool
+    choices: tuple[str, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit by the ending of the name, empty for counts, shares and words."""
+        return next((unit for ending, unit in _UNITS.items() if self.name.endswith(ending)), "")
+
+    @property
+    def range(self) -> str:
+        """What it may hold, in words."""
+        if self.kind == "choice":
+            return " | ".join(self.choices)
+        if self.kind in ("bool", "str"):
+            return "true | false" if self.kind == "bool" else "text"
+        whole = "whole number" if self.kind == "int" else "number"
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            return f"{whole} from {self.low:g} to {self.high:g}"
+        if math.isfinite(self.low):
+            return f"{whole} {'>=' if self.low_is_allowed else '>'} {self.low:g}"
+        return whole
+
+    def check(self, value: object, source: str, *, shown: str = "") -> Value:
+        """The value as this key holds it; ``source``, a file or a flag, is named in the error."""
+        parsed = self._word(value) if self.kind in ("bool", "choice", "str") else self._number(value)
+        if parsed is None:
+            subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
+            unit = f", in {self.unit}" if self.unit else ""
+            raise InputError(f"{subject} {shown or repr(value)}; it must be {self._demand}{unit}")
+        return parsed
+
+    def parse(self, text: str, source: str) -> Value:
+        """The value that a flag's text stands for."""
+        value: object = text
+        if self.kind == "bool":
+            value = True if text.lower() in _YES else False if text.lower() in _NO else text
+        elif self.kind in ("int", "float"):
+            try:
+                value = float(text)
+            except ValueError:
+                value = text
+        return self.check(value, source, shown=repr(text) if value is text else text)
+
+    @property
+    def _demand(self) -> str:
+        match self.kind:
+            case "choice":
+                return "one of " + ", ".join(self.choices)
+            case "bool":
+                return "true or false"
+            case "str":
+                return "text"
+            case _:
+                return f"a {self.range}"
+
+    def _word(self, value: object) -> Value | None:
+        if self.kind == "bool":
+            return value if isinstance(value, bool) else None
+        return value if isinstance(value, str) and (self.kind == "str" or value in self.choices) else None
+
+    def _number(self, value: object) -> Value | None:
+        """The number if it is one and lies within the limits; −∞ and NaN never do, +∞ where it means no limit."""
+        if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+            return None
+        above = value >= self.low if self.low_is_allowed else value > self.low
+        if not above or value > self.high or value == -math.inf:
+            return None
+        if self.kind == "float":
+            return float(value)
+        return int(value) if math.isfinite(value) and value == int(value) else None
+
+
+@functools.cache
+def config_keys() -> dict[str, ConfigKey]:
+    """All keys by name, in the order of the tree."""
+    tree = inspect.type_info(Config)
+    assert isinstance(tree, inspect.StructType)
+    return {key.name: key for key in _leaves(tree, "")}
+
+
+def find_key(name: str, source: str) -> ConfigKey:
+    """The key of that name; else the error names the nearest one there is."""
+    keys = config_keys()
+    if name in keys:
+        return keys[name]
+    subject = source if name in source else f"{source}: {name}"
+    raise InputError(f"{subject} is not a configuration key; {_remedy(name, tuple(keys))}")
+
+
+def _remedy(name: str, keys: tuple[str, ...]) -> str:
+    section, _, leaf = name.rpartition(".")
+    same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
+    inside = [key for key in keys if key.startswith(f"{section}.")]
+    near = same_leaf or difflib.get_close_matches(name, inside or keys, n=1, cutoff=0.5)
+    if not near:
+        near = difflib.get_close_matches(name, keys, n=1, cutoff=0.5)
+    listing = "all keys: scanchain config show"
+    return f"did you mean {near[0]}? ({listing})" if near else listing
+
+
+def _leaves(tree: inspect.StructType, prefix: str) -> Iterator[ConfigKey]:
+    for field in tree.fields:
+        name = f"{prefix}{field.name}"
+        if isinstance(field.type, inspect.StructType):
+            yield from _leaves(field.type, f"{name}.")
+        else:
+            yield _leaf(name, field.type, field.default)
+
+
+def _leaf(name: str, kind: inspect.Type, default: Value) -> ConfigKey:
+    low, high, low_is_allowed = -math.inf, math.inf, True
+    choices: tuple[str, ...] = ()
+    match kind:
+        case inspect.BoolType():
+            word: Kind = "bool"
+        case inspect.StrType():
+            word = "str"
+        case inspect.LiteralType():
+            word, choices = "choice", tuple(str(value) for value in kind.values)
+        case inspect.IntType() | inspect.FloatType():
+            word = "int" if isinstance(kind, inspect.IntType) else "float"
+            low_is_allowed = kind.gt is None
+            low = next((float(limit) for limit in (kind.gt, kind.ge) if limit is not None), low)
+            high = float(kind.le) if kind.le is not None else high
+        case _:
+            raise TypeError(f"{name}: configuration keys are bool, int, float, str or a choice, not {kind}")
+    return ConfigKey(name, word, default, low, high, low_is_allowed, choices)

@@ -1,0 +1,106 @@
+"""run.json: what was run, on what, with which versions."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import threading
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+_PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
+_BLOCK = 1 << 22
+
+
+class LogFile(Struct, frozen=True):
+    """A file that was read; ``sha256`` is empty until it is known."""
+
+    path: str
+    size_bytes: int
+    sha256: str
+
+
+class Provenance(Struct, frozen=True):
+    """Who made a run directory. ``complete`` is False while it is written and in one marked partial."""
+
+    complete: bool
+    stopped: str
+    command: list[str]
+    started: str
+    duration_s: float
+    logs: list[LogFile]
+    configuration: str
+    python: str
+    platform: str
+    cores: int
+    versions: dict[str, str]
+
+    def write(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+
+
+def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: str) -> Provenance:
+    """What is known when a run starts."""
+    return Provenance(
+        complete=False,
+        stopped="",
+        command=list(command),
+        started=datetime.now(UTC).isoformat(timespec="seconds"),
+        duration_s=0.0,
+        logs=[LogFile(str(path.resolve()), path.stat().st_size, "") for path in logs],
+        configuration=configuration,
+        python=platform.python_version(),
+        platform=platform.platform(),
+        cores=os.cpu_count() or 0,
+        versions={name: _version(name) for name in _PACKAGES},
+    )
+
+
+class Hashing:
+    """SHA-256 of files, computed in a thread beside the run; a context manager."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = tuple(paths)
+        self._digests: dict[Path, str] = {}
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="log hash", daemon=True)
+
+    def __enter__(self) -> Hashing:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._cancelled.set()
+        self._thread.join()
+
+    def digests(self) -> list[str]:
+        """The hashes, in the order of the paths, waited for."""
+        self._thread.join()
+        return [self._digests.get(path, "") for path in self._paths]
+
+    def _work(self) -> None:
+        for path in self._paths:
+            digest = hashlib.sha256()
+            try:
+                with path.open("rb") as file:
+                    while block := file.read(_BLOCK):
+                        if self._cancelled.is_set():
+                            return
+                        digest.update(block)
+            except OSError:
+                continue
+            self._digests[path] = digest.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""

@@ -1,0 +1,82 @@
+"""What a run asks of whoever records it; the command line brings rerun in, tests may bring their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import RecordingConfig
+from pipeline.data import Closure, GraphState, Matrix, Step
+
+SinkName = Literal["save", "spawn", "connect", "web"]
+
+
+class Recorder(Protocol):
+    """A context that takes in steps and, after the last one, results."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What went wrong so far, a line each; nothing that goes wrong ends a run."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def log(self, step: Step) -> None:
+        """Record one step."""
+        ...
+
+    def log_trajectory(
+        self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]
+    ) -> None:
+        """Record the optimised way: poses (N, d+1, d+1) of the scans ``indices``."""
+        ...
+
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
+        """Record the final graph and what became of every closure."""
+        ...
+
+    def log_map(self, points: NDArray[np.floating]) -> None:
+        """Record the finished map (N, d)."""
+        ...
+
+    def log_grid(self, cells: NDArray[np.int8], *, resolution_m: float, origin_m: tuple[float, float]) -> None:
+        """Record the finished occupancy grid: 0 free to 100 occupied, −1 unknown, row 0 at the lowest y."""
+        ...
+
+    def hold(self) -> None:
+        """Stay until the user is done looking, where the viewer lives in this process."""
+        ...
+
+
+class OpenRecorder(Protocol):
+    """Makes a recorder; ``path`` is used by the sink "save" alone."""
+
+    def __call__(
+        self,
+        path: Path | None,
+        *,
+        dimension: int,
+        name: str,
+        sinks: frozenset[SinkName],
+        config: RecordingConfig,
+    ) -> Recorder:
+        """Make the recorder; it is entered before the first step."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Viewing:
+    """The two things that the pipeline asks of a viewer: record a run, show a recording."""
+
+    record: OpenRecorder
+    show: Callable[[Path], None]

@@ -1,0 +1,170 @@
+"""metrics.json and summary.txt: what a run amounts to in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from pipeline.data import State, Trajectory, Verdict
+from pipeline.errors import InputError
+from pipeline.evaluate import Alignment, absolute_error, kitti_error, lengths_for, pair
+from pipeline.evaluate.absolute import path_length
+from pipeline.slam import SlamResult
+from pipeline.step_table import STAGES, StepTable
+
+
+class Accuracy(Struct, frozen=True):
+    """A trajectory against the ground truth; ``kitti_*`` are null where the path is too short."""
+
+    pairs: int
+    ate_rmse_m: float
+    ate_mean_m: float
+    ate_max_m: float
+    ate_share_of_path: float
+    ate_rotation_rmse_rad: float
+    kitti_translation_share: float | None
+    kitti_rotation_rad_per_m: float | None
+    definition: str
+
+
+class GroundTruth(Struct, frozen=True):
+    """How good the run is: after optimisation and before."""
+
+    source: str
+    path_length_m: float
+    optimised: Accuracy
+    odometry: Accuracy
+
+
+class Metrics(Struct, frozen=True):
+    """A run in numbers; ``*_ms`` are medians over the scans, by stage."""
+
+    scans: int
+    dimension: int
+    log_span_s: float
+    run_s: float
+    scans_per_s: float
+    times_real_time: float
+    travelled_m: float
+    scan_points: int
+    dropped_points: int
+    ok: int
+    degenerate: int
+    lost: int
+    keyframes: int
+    closures_tried: int
+    closures_accepted: int
+    closures_upheld: int
+    chi2: float
+    median_ms: dict[str, float]
+    p95_ms: dict[str, float]
+    median_inlier_share: float
+    median_residual_m: float
+    median_iterations: float
+    ground_truth: GroundTruth | None
+
+    def write(self, path: Path) -> None:
+        """Write as JSON; what is not finite becomes null."""
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+
+
+def measure(steps: StepTable, result: SlamResult, run_s: float, ground_truth: GroundTruth | None) -> Metrics:
+    """The numbers of a finished run."""
+    matches = [row.match for row in steps.rows]
+    states = steps.states()
+    stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
+    total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
+    names = (*STAGES, "all_but_read")
+    accepted = [closure for closure in result.closures if closure.verdict is Verdict.ACCEPTED]
+    return Metrics(
+        scans=len(steps),
+        dimension=result.trajectory.dimension,
+        log_span_s=steps.span_s,
+        run_s=run_s,
+        scans_per_s=len(steps) / run_s,
+        times_real_time=steps.span_s / run_s,
+        travelled_m=float(path_length(result.trajectory.poses)[-1]),
+        scan_points=sum(row.points for row in steps.rows),
+        dropped_points=sum(row.dropped for row in steps.rows),
+        ok=states[State.OK],
+        degenerate=states[State.DEGENERATE],
+        lost=states[State.LOST],
+        keyframes=len(result.keyframes),
+        closures_tried=len(result.closures),
+        closures_accepted=len(accepted),
+        closures_upheld=int((result.state.weight[result.state.is_loop] >= 0.5).sum()),
+        chi2=result.state.chi2,
+        median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
+        p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
+        median_inlier_share=float(np.median([match.inlier_share for match in matches])),
+        median_residual_m=float(np.median([match.residual_m for match in matches])),
+        median_iterations=float(np.median([match.iterations for match in matches])),
+        ground_truth=ground_truth,
+    )
+
+
+def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth:
+    """Both trajectories of a result against the ground truth."""
+    optimised, length_m = _accuracy(result.trajectory, reference)
+    odometry, _ = _accuracy(result.odometry, reference)
+    return GroundTruth(source, length_m, optimised, odometry)
+
+
+def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
+    """The numbers as a person reads them."""
+    m = metrics
+    dropped = f", {m.dropped_points:,} invalid returns left out" if m.dropped_points else ""
+    lines = [
+        heading,
+        f"configuration  {configuration}",
+        f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
+        f"{m.lost:,} lost{dropped}",
+        f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; {m.closures_accepted:,} of "
+        f"{m.closures_tried:,} loop closures accepted, {m.closures_upheld:,} upheld by the optimiser; "
+        f"chi2 {m.chi2:.4g}",
+        f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, residual {1e3 * m.median_residual_m:.1f} mm, "
+        f"{m.median_iterations:.0f} iterations (medians)",
+        f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time; "
+        f"median ms a scan: " + ", ".join(f"{stage} {m.median_ms[stage]:.2f}" for stage in STAGES),
+    ]
+    if m.ground_truth is not None:
+        lines += _accuracy_lines(m.ground_truth)
+    return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
+
+
+def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, float]:
+    pairs = pair(trajectory, reference)
+    try:
+        ate = absolute_error(pairs)
+    except InputError:  # a way on a line leaves the alignment a free rotation
+        ate = absolute_error(pairs, Alignment.FIRST)
+    try:
+        kitti = kitti_error(pairs, lengths_for(ate.path_length_m))
+    except InputError:
+        kitti = None
+    accuracy = Accuracy(
+        pairs=len(pairs),
+        ate_rmse_m=ate.translation_m.rmse,
+        ate_mean_m=ate.translation_m.mean,
+        ate_max_m=ate.translation_m.maximum,
+        ate_share_of_path=ate.share_of_path,
+        ate_rotation_rmse_rad=ate.rotation_rad.rmse,
+        kitti_translation_share=None if kitti is None else kitti.translation_share,
+        kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
+        definition=ate.definition,
+    )
+    return accuracy, ate.path_length_m
+
+
+def _accuracy_lines(truth: GroundTruth) -> list[str]:
+    lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
+    for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
+        lines.append(
+            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m ({100.0 * accuracy.ate_share_of_path:.3f} % of the path), "
+            f"max {accuracy.ate_max_m:.4f} m, rotation rmse {np.degrees(accuracy.ate_rotation_rmse_rad):.3f} deg"
+        )
+    return lines

@@ -1,0 +1,151 @@
+"""steps.parquet: one row a scan."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
+
+_SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix that is not inverted
+
+
+@dataclass(frozen=True, slots=True)
+class StepRow:
+    """What is kept of a step: all but its points."""
+
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    points: int
+    dropped: int
+    T_odom_lidar: Pose
+    T_world_lidar: Pose
+    match: Match
+    state: State
+    reason: str
+    keyframe: int
+    timing: Timing
+
+
+class StepTable:
+    """Takes in steps, a few microseconds each; everything columnwise is done when it is written."""
+
+    def __init__(self) -> None:
+        self.rows: list[StepRow] = []
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def append(self, step: Step) -> None:
+        """Keep one step."""
+        scan = step.scan
+        self.rows.append(
+            StepRow(
+                scan.index,
+                scan.stamp_ns,
+                scan.log_time_ns,
+                len(scan.points),
+                scan.dropped,
+                step.T_odom_lidar,
+                step.T_world_lidar,
+                step.match,
+                step.state,
+                step.reason,
+                step.keyframe,
+                step.timing,
+            )
+        )
+
+    @property
+    def odometry(self) -> Trajectory:
+        """T_odom_lidar of the steps so far."""
+        return self._trajectory([row.T_odom_lidar for row in self.rows])
+
+    @property
+    def best_known(self) -> Trajectory:
+        """T_world_lidar of the steps so far, each as it was known at its time."""
+        return self._trajectory([row.T_world_lidar for row in self.rows])
+
+    @property
+    def span_s(self) -> float:
+        """Log time from the first step to the last."""
+        return (self.rows[-1].log_time_ns - self.rows[0].log_time_ns) * 1e-9 if self.rows else 0.0
+
+    def states(self) -> Counter[State]:
+        """How many steps ended in each state."""
+        return Counter(row.state for row in self.rows)
+
+    def write(self, path: Path, trajectory: Trajectory) -> None:
+        """Write the table; ``trajectory`` holds the final pose of every step."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows, matches = self.rows, [row.match for row in self.rows]
+        timings = [row.timing for row in rows]
+        k = len(matches[0].information) if matches else 0
+        columns: dict[str, object] = {
+            "index": [row.index for row in rows],
+            "stamp_ns": [row.stamp_ns for row in rows],
+            "log_time_ns": [row.log_time_ns for row in rows],
+            **pose_columns(trajectory.poses),
+            **{f"odom_{name}": values for name, values in pose_columns(self.odometry.poses).items()},
+            "covariance": pa.array(
+                _covariances(np.array([match.information for match in matches])), pa.list_(pa.float64(), k * k)
+            ),
+            "scan_points": [row.points for row in rows],
+            "dropped": [row.dropped for row in rows],
+            "points": [match.points for match in matches],
+            "inliers": [match.inliers for match in matches],
+            "iterations": [match.iterations for match in matches],
+            "residual_m": [match.residual_m for match in matches],
+            "cost_m2": [match.cost for match in matches],
+            "converged": [match.converged for match in matches],
+            "match_reason": pa.array([match.reason for match in matches]).dictionary_encode(),
+            "degeneracy_eigenvalue": [match.degeneracy_eigenvalue for match in matches],
+            "degeneracy_direction": pa.array(
+                [match.degeneracy_direction.tolist() for match in matches], pa.list_(pa.float64(), k)
+            ),
+            "state": pa.array([str(row.state) for row in rows]).dictionary_encode(),
+            "reason": pa.array([row.reason for row in rows]).dictionary_encode(),
+            "keyframe": [row.keyframe for row in rows],
+            **{f"{stage}_s": [getattr(timing, f"{stage}_s") for timing in timings] for stage in STAGES},
+        }
+        table = pa.table(columns).replace_schema_metadata(_NOTES)
+        pq.write_table(table, path, compression="zstd")
+
+    def _trajectory(self, poses: list[Pose]) -> Trajectory:
+        stamps_ns = np.array([row.stamp_ns for row in self.rows], np.int64)
+        return Trajectory(stamps_ns, np.array(poses))
+
+
+STAGES = ("read", "preprocess", "match", "map", "loops")
+_NOTES = {
+    "x y z qx qy qz qw": "T_world_lidar after optimisation, metres; odom_*: T_odom_lidar before it",
+    "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
+    "SE(2) 3x3, SE(3) 6x6; null where the match leaves a direction undetermined",
+    "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
+    "keyframe": "number in the graph, -1 if none was made",
+}
+
+
+def pose_columns(poses: Matrix) -> dict[str, list[float]]:
+    """Columns x, y, z, qx, qy, qz, qw of poses (N, d+1, d+1)."""
+    lifted = lie.lift(poses)
+    values = np.hstack([lifted[:, :3, 3], lie.to_quaternion(lifted[:, :3, :3])])
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    return {name: column.tolist() for name, column in zip(names, values.T, strict=True)}
+
+
+def _covariances(informations: Matrix) -> list[list[float] | None]:
+    """Inverses (k · k) of (N, k, k), None where there is none."""
+    finite = np.isfinite(informations).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
+    sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
+    scaled = vectors / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
+    flat = (scaled @ np.swapaxes(scaled, 1, 2)).reshape(len(values), -1).tolist()
+    return [row if good else None for row, good in zip(flat, sound.tolist(), strict=True)]

@@ -1,0 +1,161 @@
+"""Pose-graph optimisation against GTSAM on the published graphs, interleaved: python -m tests.benchmarks.graphs.
+
+Each method optimises what it has read; reading is not timed, building the problem and the first guess are. GTSAM
+runs from the file's guess and from its own (chordal in 3D; LAGO in 2D, which takes diagonal information only and
+gets the diagonal), with Gauss-Newton and with Levenberg-Marquardt. All ½χ² are evaluated by the same code:
+½ Σ eᵀΩe with e = log(Z⁻¹ T_i⁻¹ T_j).
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pipeline import lie
+from pipeline.config import GraphConfig
+from pipeline.graph.between import BetweenProblem
+from pipeline.graph.g2o import read_g2o, write_g2o
+
+ROOT = Path(__file__).resolve().parents[2]
+SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
+GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")
+BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}
+
+
+@dataclass
+class Run:
+    """One method on one graph: its times, and where it ended."""
+
+    seconds: list[float]
+    iterations: int = 0
+    half_chi2: float = float("nan")
+    failure: str = ""
+
+
+class Ours:
+    def __init__(self, path, optimiser):
+        self.path, self.config = path, GraphConfig(optimiser=optimiser)
+
+    def run(self):
+        graph = read_g2o(self.path).graph
+        begin = time.perf_counter()
+        answer = graph.optimise(self.config)
+        return time.perf_counter() - begin, answer.iterations, graph.poses
+
+
+class Gtsam:
+    """GTSAM on the same file, with vertices written where it has none."""
+
+    def __init__(self, path, optimiser, guess):
+        source = read_g2o(path).graph
+        self.dimension, self.optimiser, self.guess = source.dimension, optimiser, guess
+        self.factors, self.initial = gtsam.readG2o(str(path), self.dimension == 3)
+        if not self.initial.size():
+            raise ValueError(f"{path} has no vertices")
+        sigmas = np.full(source.freedom, 1e-6)
+        self.prior_type = gtsam.PriorFactorPose2 if self.dimension == 2 else gtsam.PriorFactorPose3
+        self.first = self.initial.atPose2(0) if self.dimension == 2 else self.initial.atPose3(0)
+        self.noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        self.for_lago = gtsam.NonlinearFactorGraph()
+        if self.dimension == 2 and guess == "own":
+            for (i, j), Z, omega in zip(source.edges, source.measurements, source.information, strict=True):
+                noise = gtsam.noiseModel.Diagonal.Precisions(np.diag(omega))
+                self.for_lago.add(
+                    gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*Z[:2, 2], float(lie.yaw(Z))), noise)
+                )
+            self.for_lago.add(self.prior_type(0, self.first, self.noise))
+
+    def run(self):
+        factors = self.factors.clone()
+        begin = time.perf_counter()
+        factors.add(self.prior_type(0, self.first, self.noise))
+        initial = self.initial
+        if self.guess == "own":
+            flat = self.dimension == 2
+            initial = gtsam.lago.initialize(self.for_lago) if flat else gtsam.InitializePose3.initialize(factors)
+        if self.optimiser == "gauss-newton":
+            solver = gtsam.GaussNewtonOptimizer(factors, initial, gtsam.GaussNewtonParams())
+        else:
+            solver = gtsam.LevenbergMarquardtOptimizer(factors, initial, gtsam.LevenbergMarquardtParams())
+        values = solver.optimize()
+        seconds = time.perf_counter() - begin
+        at = values.atPose2 if self.dimension == 2 else values.atPose3
+        return seconds, solver.iterations(), np.array([at(key).matrix() for key in range(values.size())])
+
+
+def half_chi2(path, poses):
+    graph = read_g2o(path).graph
+    problem = BetweenProblem(graph.edges, graph.measurements, graph.information, graph.fixed)
+    return 0.5 * float(problem.chi2(problem.errors(lie.inverse(poses[0]) @ poses)).sum())
+
+
+def compare(path, repeats, slow_s):
+    """Runs of every method, one after the other, ``repeats`` times; a slow one (or one that fails) only once."""
+    methods = {f"ours {short}": Ours(path, name) for short, name in SHORT}
+    for guess in ("file", "own"):
+        for short, name in SHORT:
+            methods[f"gtsam {short} from {guess}"] = Gtsam(path, name, guess)
+    runs = {name: Run([]) for name in methods}
+    for _ in range(repeats):
+        for name, method in methods.items():
+            run = runs[name]
+            if run.failure or (run.seconds and run.seconds[0] > slow_s):
+                continue
+            try:
+                seconds, run.iterations, poses = method.run()
+            except (RuntimeError, ValueError) as error:
+                run.failure = str(error).strip().splitlines()[0][:60] or "failed"
+                continue
+            run.half_chi2 = half_chi2(path, poses)
+            run.seconds.append(seconds)
+    return runs
+
+
+def report(name, runs):
+    best = min(run.half_chi2 for run in runs.values() if run.seconds)
+    print(f"\n{name}: best known ½χ² {BEST.get(name, '-')}")
+    print(f"  {'method':22} {'median ms':>10} {'min ms':>9} {'iterations':>10} {'½χ²':>14}")
+    for method, run in runs.items():
+        if run.failure:
+            print(f"  {method:22} failed: {run.failure}")
+            continue
+        milliseconds = 1e3 * np.array(run.seconds)
+        note = "" if run.half_chi2 <= best * (1.0 + 1e-4) else "  not the minimum"
+        print(
+            f"  {method:22} {np.median(milliseconds):10.1f} {milliseconds.min():9.1f} {run.iterations:10d}"
+            f" {run.half_chi2:14.4f}{note}"
+        )
+    right = [
+        r for m, r in runs.items() if m.startswith("gtsam") and r.seconds and r.half_chi2 <= best * (1 + 1e-4)
+    ]
+    ours = np.median(runs["ours LM"].seconds)
+    if right:
+        theirs = min(np.median(run.seconds) for run in right)
+        print(f"  GTSAM's fastest that reaches it takes {theirs / ours:.1f} × our LM")
+    else:
+        print("  GTSAM does not reach it")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("graphs", nargs="*", default=GRAPHS)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "graphs")
+    parser.add_argument("--scratch", type=Path, default=Path("/tmp"))
+    options = parser.parse_args()
+    for name in options.graphs:
+        path = options.data / f"{name}.g2o"
+        file = read_g2o(path)
+        for warm in ("levenberg-marquardt", "gauss-newton"):
+            read_g2o(path).graph.optimise(GraphConfig(optimiser=warm))
+        if not file.has_guess:  # GTSAM needs vertices: give it the odometry, as ours gets
+            path = options.scratch / f"{name}_with_vertices.g2o"
+            write_g2o(path, file.graph)
+        report(name, compare(path, options.repeats, slow_s=2.0))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,372 @@
+"""From files to scans: containers, order, prior, mounting, selection; then the real logs."""
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import IndexType
+from mcap_ros2.decoder import DecoderFactory
+from naive_logs import (
+    SECOND,
+    STAMP_NS,
+    cloud_said,
+    laser_points,
+    laser_scan,
+    odometry,
+    odometry_said,
+    office,
+    point_cloud,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
+from scenes import shared_data
+
+from pipeline import lie
+from pipeline.config import LogConfig
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+
+
+def read(*paths, **config):
+    log = open_log(list(paths), LogConfig(**config))
+    return log, list(log.scans())
+
+
+def assert_office(log, scans, count=40):
+    assert (log.dimension, log.topic, log.scan_count, len(scans)) == (2, "/scan", count, count)
+    assert [scan.index for scan in scans] == list(range(count))
+    assert log.damage == () or list(log.damage) == []
+    for k, scan in enumerate(scans):
+        assert scan.stamp_ns == scan.log_time_ns == STAMP_NS + k * SECOND // 10
+        assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+        np.testing.assert_allclose(scan.points, laser_points(1.0 + k / 100 + 0.05 * np.arange(31)), atol=1e-6)
+        assert scan.times_s.shape == (0,) and scan.dropped == 0
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
+
+
+def test_messages_packed_by_hand_are_what_an_independent_decoder_reads(tmp_path):
+    rows = np.array([(1, 2, 3, 4)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f8"), ("t", "u4")])
+    said = [*office(1), cloud_said(STAMP_NS + 1, point_cloud(STAMP_NS, rows, padding=3))]
+    path = write(tmp_path / "a.mcap", said)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        mount, wheels, scan, cloud = [message[3] for message in reader.iter_decoded_messages()]
+    assert mount.transforms[0].child_frame_id == "laser" and mount.transforms[0].transform.translation.z == 0.5
+    assert wheels.child_frame_id == "base_link" and wheels.pose.pose.orientation.w == 1.0
+    assert scan.header.frame_id == "laser" and scan.ranges[1] == pytest.approx(1.05) and scan.range_max == 30.0
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "t"] and len(cloud.data) == cloud.row_step == 23
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+@pytest.mark.parametrize("summary", [True, False])
+def test_every_container_gives_the_same_scans(tmp_path, chunked, compression, summary):
+    path = write(tmp_path / "a.mcap", office(), chunked=chunked, compression=compression, summary=summary)
+    log, scans = read(path)
+    assert_office(log, scans)
+    assert log.has_odometry and log.duration_s == pytest.approx(3.9)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.1, 0.3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_statistics": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK, "use_statistics": False},
+        {"use_summary_offsets": False},
+        {"crcs": False},
+        {"chunk_size": 100},
+        {"chunk_size": 10_000_000},
+        {"enable_data_crcs": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_summary_may_leave_anything_out(tmp_path, chunked, options):
+    assert_office(*read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options)))
+
+
+@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
+@pytest.mark.parametrize("short", [True, False])
+def test_type_names_of_either_form_are_known(tmp_path, encoding, short):
+    def rename(kind):
+        return kind.replace("/msg/", "/") if short else kind
+
+    assert_office(*read(write(tmp_path / "a.mcap", office(), encoding=encoding, rename=rename)))
+
+
+def test_messages_come_by_log_time_even_where_chunks_overlap(tmp_path):
+    said = office()
+    shuffled = [said[i] for i in np.random.default_rng(1).permutation(len(said))]
+    for chunked in (True, False):
+        assert_office(*read(write(tmp_path / f"{chunked}.mcap", shuffled, chunked=chunked, chunk_size=600)))
+
+
+def test_several_files_are_one_log_whatever_their_order_and_ids(tmp_path):
+    said = office()
+    first = write(tmp_path / "0.mcap", said[:31])
+    second = write(tmp_path / "1.mcap", [said[32], said[31], *said[33:]], compression="lz4", chunked=False)
+    assert_office(*read(first, second))
+    assert_office(*read(second, first))
+
+
+def test_interleaved_files_with_equal_times_keep_the_order_of_the_files(tmp_path):
+    near = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [1.0, 1.0])) for k in range(5)]
+    far = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [2.0, 2.0])) for k in range(5)]
+    _, scans = read(write(tmp_path / "near.mcap", near), write(tmp_path / "far.mcap", far))
+    ranges = [np.linalg.norm(scan.points[0]) for scan in scans]
+    assert ranges == pytest.approx([1.0, 2.0] * 5)
+    assert [scan.log_time_ns for scan in scans] == sorted(scan.log_time_ns for scan in scans)
+
+
+def test_a_channel_announced_in_an_empty_chunk_does_not_stretch_the_log(tmp_path):
+    empty = [scan_said(0, b"", "/quiet/scan_of_nothing")]
+    path = write(tmp_path / "a.mcap", office(), announced=[odometry_said(0, b"", "/other")], chunk_size=1)
+    log, scans = read(path, odometry_topic="/odom")
+    assert log.duration_s == pytest.approx(3.9)
+    assert_office(log, scans)
+    assert empty[0].data == b""
+
+
+def test_start_end_and_every_choose_scans_by_log_time(tmp_path):
+    path = write(tmp_path / "a.mcap", office())
+    log, scans = read(path, start_s=1.0, end_s=2.0)
+    assert [scan.stamp_ns - STAMP_NS for scan in scans] == [k * SECOND // 10 for k in range(10, 21)]
+    assert log.scan_count == 11
+    log, scans = read(path, start_s=0.5, every=3)
+    assert [scan.stamp_ns - STAMP_NS for scan in scans] == [k * SECOND // 10 for k in range(5, 40, 3)]
+    assert log.scan_count == len(scans) == 12
+    assert [scan.index for scan in scans] == list(range(12))
+
+
+def test_ranges_of_the_configuration_drop_and_count(tmp_path):
+    path = write(tmp_path / "a.mcap", office(1))
+    _, (scan,) = read(path, min_range_m=1.5, max_range_m=2.0)
+    distance = np.linalg.norm(scan.points, axis=1)
+    assert distance.min() >= 1.5 and distance.max() <= 2.0
+    assert scan.dropped == 31 - len(scan.points) > 0
+
+
+def test_the_log_can_be_read_again_and_closed_early(tmp_path):
+    path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
+    before = threading.active_count()
+    log = open_log([path], LogConfig())
+    iterator = log.scans()
+    assert [scan.index for scan in itertools.islice(iterator, 3)] == [0, 1, 2]
+    iterator.close()
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and "scanchain" in thread.name:
+            thread.join(5.0)
+    assert threading.active_count() == before
+    assert len(list(log.scans())) == len(list(log.scans())) == 400
+
+
+def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
+    from pipeline.logs import stream
+
+    path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
+    opened = []
+    real = stream.read_block
+    monkeypatch.setattr(stream, "read_block", lambda *args: opened.append(1) or real(*args))
+    iterator = open_log([path], LogConfig(prefetch_chunks=3)).scans()
+    next(iterator)
+    iterator.close()
+    assert 1 <= len(opened) <= 12
+
+
+# the wheel-odometry prior
+
+
+def wheels(*entries, topic="/odom"):
+    """Readings (log time s, stamp s, x)."""
+    return [
+        odometry_said(STAMP_NS + round(at * SECOND), odometry(STAMP_NS + round(stamp * SECOND), x, 0.0), topic)
+        for at, stamp, x in entries
+    ]
+
+
+def one_scan(at, stamp):
+    return scan_said(
+        STAMP_NS + round(at * SECOND), laser_scan(STAMP_NS + round(stamp * SECOND), [1.0, 2.0], beam_s=1e-3)
+    )
+
+
+def prior_x(path, **config):
+    _, (scan,) = read(path, **config)
+    return None if scan.T_odom_base is None else scan.T_odom_base[0, 2]
+
+
+def test_the_prior_is_interpolated_between_the_readings_around_the_stamp(tmp_path):
+    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 1.0)), one_scan(0.05, 0.05), *wheels((0.2, 0.2, 3.0))])
+    assert prior_x(path) == pytest.approx(1.5)
+
+
+def test_a_reading_with_the_scans_own_stamp_is_taken_as_it_is(tmp_path):
+    said = [*wheels((0.0, 0.3, 7.0), (0.1, 0.05, 5.0)), one_scan(0.11, 0.05), *wheels((0.2, 0.01, 9.0))]
+    assert prior_x(write(tmp_path / "a.mcap", said)) == 5.0
+
+
+def test_the_prior_turns_the_short_way_round(tmp_path):
+    said = [
+        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, 3.1)),
+        one_scan(0.1, 0.1),
+        odometry_said(STAMP_NS + SECOND // 5, odometry(STAMP_NS + SECOND // 5, 0.0, 0.0, -3.1)),
+    ]
+    _, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert abs(lie.yaw(scan.T_odom_base)) == pytest.approx(np.pi)
+
+
+def test_the_nearest_reading_serves_up_to_half_a_second_and_none_beyond(tmp_path):
+    near = write(tmp_path / "near.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.4, 0.4)])
+    late = write(tmp_path / "late.mcap", [one_scan(0.0, 0.0), *wheels((0.4, 0.4, 6.0))])
+    far = write(tmp_path / "far.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.6, 0.6)])
+    assert prior_x(near) == 4.0 and prior_x(late) == 6.0 and prior_x(far) is None
+
+
+def test_a_scan_does_not_wait_for_ever_for_a_reading(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0)), *(one_scan(0.01 * k, 0.01 * k) for k in range(1, 200))]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert len(scans) == 199
+    assert all(scan.T_odom_base is not None for scan in scans[:50]) and scans[-1].T_odom_base is None
+
+
+def test_ground_truth_is_never_a_prior(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)]
+    log, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert not log.has_odometry and scan.T_odom_base is None
+
+
+def test_of_several_odometry_topics_none_is_used_until_one_is_chosen(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0)), *wheels((0.0, 0.0, 8.0), topic="/visual"), one_scan(0.01, 0.0)]
+    path = write(tmp_path / "a.mcap", said)
+    log, (scan,) = read(path)
+    assert scan.T_odom_base is None and not log.has_odometry
+    assert any("/odom" in note and "/visual" in note for note in log.notes)
+    assert prior_x(path, odometry_topic="/visual") == 8.0
+
+
+# the mounting
+
+
+def mounted(path, *entries):
+    said = [transforms_said(STAMP_NS, transforms(*entries)), *wheels((0.0, 0.0, 0.0)), one_scan(0.1, 0.1)]
+    log, (scan,) = read(write(path, said))
+    return log.T_base_lidar, scan.points
+
+
+def test_the_mounting_is_chained_through_the_static_tree(tmp_path):
+    T, _ = mounted(
+        tmp_path / "a.mcap",
+        ("base_link", "mast", 1.0, 0.0, np.pi / 2, 0.0),
+        ("mast", "laser", 0.5, 0.0, 0.0, 0.0),
+    )
+    np.testing.assert_allclose(T, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+
+
+def test_the_mounting_is_the_identity_where_no_chain_joins_the_frames(tmp_path):
+    T, _ = mounted(tmp_path / "a.mcap", ("map", "camera", 1.0, 0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(T, np.eye(3))
+
+
+def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
+    yaw, x, y = 0.4, 0.2, -0.1
+    T, points = mounted(tmp_path / "a.mcap", ("base_link", "laser", x, y, yaw, np.pi))
+    raw = np.column_stack([laser_points(np.array([1.0, 2.0])), np.zeros(2)])
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0])
+    in_base = (raw @ R.T)[:, :2] + [x, y]
+    np.testing.assert_allclose(lie.transform(T, points), in_base, atol=1e-6)
+    assert points.flags.c_contiguous and points.dtype == np.float32
+    assert np.linalg.det(T[:2, :2]) == pytest.approx(1.0)
+
+
+def test_a_cloud_keeps_the_full_mounting(tmp_path):
+    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = [
+        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.0, np.pi))),
+        *wheels((0.0, 0.0, 3.0)),
+        cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
+    ]
+    log, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert log.dimension == 3 and scan.T_odom_base.shape == (4, 4) and scan.T_odom_base[0, 3] == 3.0
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
+    np.testing.assert_allclose(log.T_base_lidar[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+    np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
+
+
+# real logs
+
+
+def test_intel_is_read_whole_in_log_time_order_with_a_prior_on_every_scan():
+    log, scans = read(shared_data("2d/intel.mcap"))
+    assert (log.dimension, log.topic, log.scan_count, len(scans)) == (2, "/scan", 13631, 13631)
+    log_times = np.array([scan.log_time_ns for scan in scans])
+    assert np.all(np.diff(log_times) >= 0)
+    assert np.count_nonzero(np.diff([scan.stamp_ns for scan in scans]) < 0) == 631
+    assert all(scan.T_odom_base is not None for scan in scans)
+    assert not log.damage
+
+
+def test_intel_scans_equal_an_independent_decoders():
+    path = shared_data("2d/intel.mcap")
+    _, scans = read(path, end_s=60.0)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        latest = {}
+        checked = 0
+        for _, channel, _, message in reader.iter_decoded_messages(["/scan", "/odom"]):
+            latest[channel.topic] = message
+            if channel.topic != "/scan":
+                continue
+            if checked == len(scans):
+                break
+            scan = scans[checked]
+            ranges = np.array(message.ranges)
+            angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+            valid = (ranges > message.range_min) & (ranges < message.range_max)
+            points = (ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))[valid]
+            np.testing.assert_allclose(scan.points, points, atol=1e-5)
+            position = latest["/odom"].pose.pose.position
+            np.testing.assert_allclose(scan.T_odom_base[:2, 2], [position.x, position.y])
+            checked += 1
+    assert checked == len(scans) > 100
+
+
+def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
+    path = shared_data("3d/kitti_0005_first60.mcap")
+    log = open_log([path], LogConfig())
+    assert (log.dimension, log.scan_count) == (3, 60)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for (_, _, message, cloud), scan in zip(reader.iter_decoded_messages(), log.scans(), strict=True):
+            rows = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)[:, :3]
+            rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
+            assert message.log_time == scan.log_time_ns
+            assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
+
+
+def test_kitti_ground_truth_is_that_of_the_published_file():
+    log = open_log([shared_data("3d/kitti_0001_first54.mcap")], LogConfig())
+    truth = log.ground_truth("/ground_truth")
+    published = np.loadtxt(shared_data("3d/kitti_0001_first54.tum"))
+    assert truth.poses.shape == (54, 4, 4)
+    np.testing.assert_allclose(truth.stamps_ns * 1e-9, published[:, 0], atol=1e-5)
+    np.testing.assert_allclose(truth.poses[:, :3, 3], published[:, 1:4], atol=1e-6)
+    np.testing.assert_allclose(truth.poses[:, :3, :3], lie.from_quaternion(published[:, 4:]), atol=1e-6)
+
+
+def test_ground_truth_of_a_planar_log_is_planar_and_a_missing_topic_is_named(tmp_path):
+    path = write(tmp_path / "a.mcap", [*office(3), *wheels((0.05, 0.05, 2.0), topic="/ground_truth")])
+    log = open_log([path], LogConfig())
+    truth = log.ground_truth("/ground_truth")
+    assert truth.poses.shape == (1, 3, 3) and truth.poses[0, 0, 2] == 2.0
+    with pytest.raises(InputError, match=r"a\.mcap.*?/nowhere.*?/odom"):
+        log.ground_truth("/nowhere")
