@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data import Closure, GraphState, Keyframe, Verdict
+from pipeline.data import Keyframe
 from pipeline.step_table import pose_columns
+from pipeline.verdicts import JudgedClosure
 
 
 def write_closures(
-    path: Path, closures: Sequence[Closure], keyframes: Sequence[Keyframe], graph: GraphState, dimension: int
+    path: Path, judged: Sequence[JudgedClosure], keyframes: Sequence[Keyframe], dimension: int
 ) -> None:
-    """Write every closure tried, with the verdict and the robust weight that the optimiser left to it."""
+    """Write every closure tried, with its final verdict and the robust weight that the optimiser left to it."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     k = 3 if dimension == 2 else 6
+    closures = [item.closure for item in judged]
     matches = [closure.match for closure in closures]
     relative = np.array([match.T_target_source for match in matches])
     columns: dict[str, object] = {
@@ -28,9 +30,9 @@ def write_closures(
         "source_scan": pa.array([keyframes[closure.source].scan_index for closure in closures], pa.int64()),
         "target_stamp_ns": pa.array([keyframes[closure.target].stamp_ns for closure in closures], pa.int64()),
         "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
-        "verdict": pa.array([str(closure.verdict) for closure in closures], pa.string()),
-        "reason": pa.array([closure.reason for closure in closures], pa.string()),
-        "weight": pa.array(_weights(closures, graph), pa.float64()),
+        "verdict": pa.array([str(item.verdict) for item in judged], pa.string()),
+        "reason": pa.array([item.reason for item in judged], pa.string()),
+        "weight": pa.array([item.weight for item in judged], pa.float64()),
         **{
             name: pa.array(values, pa.float64())
             for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()
@@ -47,16 +49,7 @@ def write_closures(
     notes = {
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
         "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
-        "weight": "robust weight after the last optimisation, null for rejected closures",
+        "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
     }
     pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")
 
-
-def _weights(closures: Sequence[Closure], graph: GraphState) -> list[float | None]:
-    """Robust weight of each closure; the graph holds the accepted ones as its loop edges."""
-    pairs = zip(graph.edges[graph.is_loop].tolist(), graph.weight[graph.is_loop].tolist(), strict=True)
-    weight = {(i, j): value for (i, j), value in pairs}
-    return [
-        weight.get((closure.target, closure.source)) if closure.verdict is Verdict.ACCEPTED else None
-        for closure in closures
-    ]

@@ -15,6 +15,7 @@ from pipeline.evaluate import Alignment, absolute_error, kitti_error, lengths_fo
 from pipeline.evaluate.absolute import path_length
 from pipeline.slam import SlamResult
 from pipeline.step_table import STAGES, StepTable
+from pipeline.verdicts import JudgedClosure
 
 
 class Accuracy(Struct, frozen=True):
@@ -41,7 +42,10 @@ class GroundTruth(Struct, frozen=True):
 
 
 class Metrics(Struct, frozen=True):
-    """A run in numbers; ``*_ms`` are medians over the scans, by stage."""
+    """A run in numbers; ``*_ms`` are over the scans, by stage.
+
+    Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
+    """
 
     scans: int
     dimension: int
@@ -57,8 +61,8 @@ class Metrics(Struct, frozen=True):
     lost: int
     keyframes: int
     closures_tried: int
+    closures_verified: int
     closures_accepted: int
-    closures_upheld: int
     chi2: float
     median_ms: dict[str, float]
     p95_ms: dict[str, float]
@@ -72,14 +76,20 @@ class Metrics(Struct, frozen=True):
         path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
 
-def measure(steps: StepTable, result: SlamResult, run_s: float, ground_truth: GroundTruth | None) -> Metrics:
+def measure(
+    steps: StepTable,
+    result: SlamResult,
+    judged: Sequence[JudgedClosure],
+    *,
+    run_s: float,
+    ground_truth: GroundTruth | None,
+) -> Metrics:
     """The numbers of a finished run."""
     matches = [row.match for row in steps.rows]
     states = steps.states()
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
-    accepted = [closure for closure in result.closures if closure.verdict is Verdict.ACCEPTED]
     return Metrics(
         scans=len(steps),
         dimension=result.trajectory.dimension,
@@ -94,9 +104,9 @@ def measure(steps: StepTable, result: SlamResult, run_s: float, ground_truth: Gr
         degenerate=states[State.DEGENERATE],
         lost=states[State.LOST],
         keyframes=len(result.keyframes),
-        closures_tried=len(result.closures),
-        closures_accepted=len(accepted),
-        closures_upheld=int((result.state.weight[result.state.is_loop] >= 0.5).sum()),
+        closures_tried=len(judged),
+        closures_verified=sum(item.closure.verdict is Verdict.ACCEPTED for item in judged),
+        closures_accepted=sum(item.verdict is Verdict.ACCEPTED for item in judged),
         chi2=result.state.chi2,
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
@@ -123,9 +133,9 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
         f"{m.lost:,} lost{dropped}",
-        f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; {m.closures_accepted:,} of "
-        f"{m.closures_tried:,} loop closures accepted, {m.closures_upheld:,} upheld by the optimiser; "
-        f"chi2 {m.chi2:.4g}",
+        f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
+        f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
+        f"accepted; chi2 {m.chi2:.4g}",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, residual {1e3 * m.median_residual_m:.1f} mm, "
         f"{m.median_iterations:.0f} iterations (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time; "

@@ -1,9 +1,13 @@
 """What several tests share: where the real logs lie."""
 
 import os
+import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
+
+from pipeline.config import Config
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -15,3 +19,15 @@ def shared_data(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{path} is absent: real recordings are not part of the project (set SCANCHAIN_DATA)")
     return path
+
+
+def configured(dimension, changes=None):
+    """The preset of a dimension, some keys changed."""
+    preset = ROOT / "configs" / f"lidar{dimension}d.toml"
+    tree = msgspec.to_builtins(Config())
+    for section, keys in tomllib.loads(preset.read_text()).items():
+        tree[section] |= keys
+    for key, value in (changes or {}).items():
+        section, name = key.split(".")
+        tree[section][name] = value
+    return msgspec.convert(tree, Config)

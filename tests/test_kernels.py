@@ -184,7 +184,9 @@ def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimensio
     np.testing.assert_allclose(H, 0.5 * (numeric + numeric.T), rtol=1e-4, atol=1e-3 * np.abs(H).max())
 
 
-@pytest.mark.parametrize("twist", [[0.1, -0.2, 1e-12], [0.5, 0.1, 3.1], [1, 2, 3, 1e-7, 0, 0], [1, 2, 3, 0.5, -2, 2]])
+@pytest.mark.parametrize(
+    "twist", [[0.1, -0.2, 1e-12], [0.5, 0.1, 3.1], [1, 2, 3, 1e-7, 0, 0], [1, 2, 3, 0.5, -2, 2]]
+)
 def test_perturbation_is_the_exponential_about_the_origin(twist):
     twist = np.array(twist, float)
     T = lie.exp(twist[::-1].copy())

@@ -79,7 +79,9 @@ def test_second_order_methods_need_far_fewer_steps_than_gradient_descent(dimensi
     for optimiser in OPTIMISERS:
         matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=20_000)
         T = truth(dimension)
-        steps[optimiser] = matcher.align(scan_at(T), target, lie.identity(dimension), no_prior(dimension)).iterations
+        steps[optimiser] = matcher.align(
+            scan_at(T), target, lie.identity(dimension), no_prior(dimension)
+        ).iterations
     assert max(steps["newton"], steps["gauss-newton"], steps["levenberg-marquardt"]) < 20
     assert steps["gradient-descent"] > 2 * steps["levenberg-marquardt"]
 
@@ -90,7 +92,9 @@ def test_metres_or_centimetres_same_motion(dimension, matcher_name):
     answers = []
     for unit in (1.0, 100.0):
         matcher, target = set_up(dimension, unit, matcher=matcher_name)
-        match = matcher.align(scan_at(truth(dimension, unit), unit), target, lie.identity(dimension), no_prior(dimension))
+        match = matcher.align(
+            scan_at(truth(dimension, unit), unit), target, lie.identity(dimension), no_prior(dimension)
+        )
         T = match.T_target_source.copy()
         T[:-1, -1] /= unit
         answers.append((T, match.iterations, match.inliers, match.degeneracy_eigenvalue))
@@ -118,7 +122,8 @@ def test_the_information_predicts_the_spread_of_repeated_matches(dimension):
     clean = scan_at(T)
     rng = np.random.default_rng(3)
     matches = [
-        matcher.align(clean + 0.05 * rng.normal(size=clean.shape), target, T, no_prior(dimension)) for _ in range(60)
+        matcher.align(clean + 0.05 * rng.normal(size=clean.shape), target, T, no_prior(dimension))
+        for _ in range(60)
     ]
     mean = np.mean([lie.log(lie.inverse(T) @ match.T_target_source) for match in matches], axis=0)
     errors = [lie.log(lie.inverse(T) @ match.T_target_source) - mean for match in matches]

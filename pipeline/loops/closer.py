@@ -73,11 +73,11 @@ class LoopCloser:
         elif overlap < limits.min_overlap:
             reason = f"overlap {overlap:.2f} < loops.min_overlap ({limits.min_overlap:g})"
         elif match.degeneracy_eigenvalue < limits.min_information:
-            reason = (
-                f"information {match.degeneracy_eigenvalue:.1e} < loops.min_information ({limits.min_information:g})"
-            )
+            reason = f"information {match.degeneracy_eigenvalue:.1e} < loops.min_information ({limits.min_information:g})"
         elif moved_m > limits.max_radius_m:
-            reason = f"moved {moved_m:.1f} m from the prediction, beyond loops.max_radius_m ({limits.max_radius_m:g})"
+            reason = (
+                f"moved {moved_m:.1f} m from the prediction, beyond loops.max_radius_m ({limits.max_radius_m:g})"
+            )
         else:
             return Closure(target, source, match, overlap, Verdict.ACCEPTED, "verified by matching")
         return Closure(target, source, match, overlap, Verdict.REJECTED, reason)

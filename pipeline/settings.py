@@ -1,0 +1,122 @@
+"""The effective configuration: defaults, then a preset or a file, then flags."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import tomli_w
+
+from pipeline.config import Config
+from pipeline.config_keys import Value, config_keys, find_key
+from pipeline.errors import InputError
+
+PRESETS = {2: "lidar2d", 3: "lidar3d"}
+_ORDERED = (
+    ("log.start_s", "log.end_s"),
+    ("log.min_range_m", "log.max_range_m"),
+    ("preprocess.min_range_m", "preprocess.max_range_m"),
+    ("loops.min_radius_m", "loops.max_radius_m"),
+    ("maps.slice_min_z_m", "maps.slice_max_z_m"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A key set on the command line; ``flag`` is how the user wrote it, for errors."""
+
+    key: str
+    text: str
+    flag: str
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """A configuration and where it came from, in words."""
+
+    config: Config
+    source: str
+
+
+def load_settings(
+    dimension: int | None = None, *, file: Path | None = None, overrides: Sequence[Override] = ()
+) -> Settings:
+    """Defaults < ``file``, or without one the preset for logs of this dimension < ``overrides``.
+
+    Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
+    """
+    if file is not None:
+        layer, source = read_layer(file), str(file)
+    elif dimension is not None:
+        name = PRESETS[dimension]
+        layer = read_layer(preset_path(name))
+        source = f"preset {name}, chosen because the log is {dimension}D"
+    else:
+        layer, source = {}, "defaults"
+    values = {key: spec.default for key, spec in config_keys().items()} | layer
+    for override in overrides:
+        values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
+    flags = {override.key: override.flag for override in overrides}
+    _check_order(values, source, flags)
+    changed = "".join(f", {key} {values[key]}" for key in flags)
+    return Settings(msgspec.convert(_tree(values), Config), source + changed)
+
+
+def read_layer(file: Path) -> dict[str, Value]:
+    """The keys that a TOML file sets, checked one by one."""
+    try:
+        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{file}: no such file; check --config, or leave it out to use a preset") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: is not TOML: {' '.join(str(error).split())}") from None
+    layer: dict[str, Value] = {}
+    for section, branch in tree.items():
+        if not isinstance(branch, Mapping):
+            find_key(section, str(file))
+            continue
+        for leaf, value in branch.items():
+            key = find_key(f"{section}.{leaf}", str(file))
+            layer[key.name] = key.check(value, str(file))
+    return layer
+
+
+def preset_path(name: str) -> Path:
+    """Where a preset lies: in the installed package, or beside it in a checkout."""
+    here = Path(__file__).resolve().parent
+    for folder in (here / "presets", here.parent / "configs"):
+        if (folder / f"{name}.toml").is_file():
+            return folder / f"{name}.toml"
+    raise InputError(f"preset {name} is not installed under {here / 'presets'}; install scanchain again")
+
+
+def dump(config: Config) -> str:
+    """The whole configuration as TOML; reading it back gives the same one."""
+    return tomli_w.dumps(msgspec.to_builtins(config))
+
+
+def flatten(config: Config) -> dict[str, Value]:
+    """Every key with its value, in the order of the tree."""
+    tree: dict[str, dict[str, Value]] = msgspec.to_builtins(config)
+    return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
+
+
+def _tree(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
+    tree: dict[str, dict[str, Value]] = {}
+    for key, value in values.items():
+        section, _, leaf = key.partition(".")
+        tree.setdefault(section, {})[leaf] = value
+    return tree
+
+
+def _check_order(values: Mapping[str, Value], source: str, flags: Mapping[str, str]) -> None:
+    for lower, upper in _ORDERED:
+        low, high = values[lower], values[upper]
+        if isinstance(low, float) and isinstance(high, float) and not low < high:
+            where = flags.get(lower) or flags.get(upper) or source
+            raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")

@@ -1,0 +1,202 @@
+"""Odometry and the whole chain on simulated drives with exact truth, and on the real logs' published bars."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from scenes import configured, shared_data
+
+from pipeline import lie
+from pipeline.config import Config
+from pipeline.data import Scan, State, Trajectory, Verdict
+from pipeline.errors import InputError
+from pipeline.evaluate import absolute_error, pair, read_relations, relation_error
+from pipeline.logs import open_log
+from pipeline.odometry import Odometry
+from pipeline.simulate import simulate
+from pipeline.slam import Slam
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """A minute in the simulated office: scans, mounting and truth."""
+    path = tmp_path_factory.mktemp("office") / "office.mcap"
+    truth = simulate("office", path, duration_s=60.0, seed=7)
+    log = open_log([path], Config().log)
+    return list(log.scans()), log.T_base_lidar, truth
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """Six seconds in the simulated town, with 32 rings."""
+    path = tmp_path_factory.mktemp("town") / "town.mcap"
+    truth = simulate("town", path, duration_s=6.0, seed=7, sensor="os1-32")
+    log = open_log([path], Config().log)
+    return list(log.scans()), log.T_base_lidar, truth
+
+
+def tracked(scans, T_base_lidar, config):
+    odometry = Odometry(config, T_base_lidar)
+    return [odometry.track(scan) for scan in scans]
+
+
+def trajectory(steps):
+    return Trajectory(
+        np.array([step.scan.stamp_ns for step in steps]), np.array([step.T_odom_lidar for step in steps])
+    )
+
+
+def ate_m(estimate, truth):
+    return absolute_error(pair(estimate, truth)).translation_m.rmse
+
+
+@pytest.mark.parametrize("prior", ["auto", "constant-velocity"])
+@pytest.mark.parametrize("matcher", ["plicp", "svd"])
+def test_a_minute_in_the_office_drifts_by_centimetres(office, prior, matcher):
+    scans, T_base_lidar, truth = office
+    config = configured(2, {"odometry.prior": prior, "matching.matcher": matcher})
+    steps = tracked(scans, T_base_lidar, config)
+    assert {step.state for step in steps} == {State.OK}
+    assert ate_m(trajectory(steps), truth) < (0.03 if matcher == "plicp" else 0.06)
+
+
+def test_six_seconds_in_town_drift_by_centimetres(town):
+    scans, T_base_lidar, truth = town
+    assert ate_m(trajectory(tracked(scans, T_base_lidar, configured(3))), truth) < 0.03
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_motion_distortion_is_what_deskewing_takes_out(office, town, dimension):
+    scans, T_base_lidar, truth = office if dimension == 2 else town
+    errors = [
+        ate_m(trajectory(tracked(scans, T_base_lidar, configured(dimension, {"preprocess.deskew": on}))), truth)
+        for on in (True, False)
+    ]
+    assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_same_scans_give_bit_equal_poses(office, town, dimension):
+    scans, T_base_lidar, _ = office if dimension == 2 else town
+    first, second = (tracked(scans[:60], T_base_lidar, configured(dimension)) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        assert np.array_equal(a.T_odom_lidar, b.T_odom_lidar)
+        assert np.array_equal(a.match.information, b.match.information)
+
+
+def test_nobody_writes_into_the_scan(office):
+    scans, T_base_lidar, _ = office
+    before = [scan.points.copy() for scan in scans[:20]]
+    tracked(scans[:20], T_base_lidar, configured(2))
+    assert all(np.array_equal(a, scan.points) for a, scan in zip(before, scans, strict=False))
+
+
+def test_a_scan_of_another_place_is_lost_and_the_next_good_one_is_found_again(office):
+    scans, T_base_lidar, truth = office
+    elsewhere = np.random.default_rng(0).uniform(-300.0, 300.0, (500, 2)).astype(np.float32)
+    far = elsewhere[np.linalg.norm(elsewhere, axis=1) > 30.0]
+    config = configured(2, {"preprocess.max_range_m": 500.0, "odometry.prior": "constant-velocity"})
+    broken = [
+        replace(scan, points=far, times_s=np.zeros(len(far), np.float32)) if 100 <= scan.index < 103 else scan
+        for scan in scans[:200]
+    ]
+    steps = tracked(broken, T_base_lidar, config)
+    assert [step.state for step in steps[100:103]] == [State.LOST] * 3
+    assert "found a partner" in steps[100].reason and "matching.min_inlier_share" in steps[100].reason
+    assert {step.state for step in steps[103:]} == {State.OK}
+    good = [step for step in steps if step.state is State.OK]
+    assert ate_m(trajectory(good), truth) < 0.05
+
+
+def test_a_gap_of_a_second_is_bridged(town):
+    scans, T_base_lidar, truth = town
+    kept = [scan for scan in scans if not 30 <= scan.index < 40]
+    steps = tracked(kept, T_base_lidar, configured(3))
+    assert ate_m(trajectory(steps), truth) < 0.05
+
+
+def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
+    rng = np.random.default_rng(0)
+    config = configured(2, {"odometry.prior": "constant-velocity"})
+    odometry = Odometry(config, np.eye(3))
+    for index in range(30):
+        x = rng.uniform(-8.0, 8.0, 600)
+        walls = np.column_stack([x, np.where(rng.random(600) < 0.5, 1.0, -1.0) + 0.005 * rng.normal(size=600)])
+        scan = Scan(
+            index, index * 10**8, index * 10**8, walls.astype(np.float32), np.empty(0, np.float32), 0, None
+        )
+        step = odometry.track(scan)
+    assert step.state is State.DEGENERATE
+    assert abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
+    assert "is undetermined" in step.reason
+
+
+def test_a_scan_with_nothing_in_range_names_the_limits(office):
+    scans, T_base_lidar, _ = office
+    with pytest.raises(InputError, match=r"scan 0 has none of its \d+ points .*preprocess\.max_range_m"):
+        tracked(scans[:1], T_base_lidar, configured(2, {"preprocess.max_range_m": 0.06}))
+
+
+def test_wheels_asked_for_but_absent_are_named(office):
+    scans, T_base_lidar, _ = office
+    bare = [replace(scan, T_odom_base=None) for scan in scans[:3]]
+    with pytest.raises(InputError, match=r"scan 1 has no wheel odometry"):
+        tracked(bare, T_base_lidar, configured(2, {"odometry.prior": "wheel"}))
+
+
+def test_closing_loops_takes_the_drift_out(office):
+    scans, T_base_lidar, truth = office
+    # the map forgets soon and the wheels are left out, so that odometry drifts
+    config = configured(2, {"odometry.prior": "constant-velocity", "local_map.max_insertions": 30})
+    slam = Slam(config, T_base_lidar)
+    steps = [slam.process(scan) for scan in scans]
+    result = slam.finish()
+    accepted = [closure for closure in result.closures if closure.verdict is Verdict.ACCEPTED]
+    assert accepted
+    assert len(result.trajectory) == len(result.odometry) == len(scans) == len(steps)
+    assert ate_m(result.trajectory, truth) <= ate_m(result.odometry, truth)
+    poses = result.state.poses
+    for closure in accepted:  # T_target_source maps the later frame into the earlier one
+        expected = lie.inverse(poses[closure.target]) @ poses[closure.source]
+        assert np.abs(lie.log(lie.inverse(expected) @ closure.match.T_target_source)).max() < 0.1
+
+
+def test_without_loops_the_world_is_the_odometry_frame(office):
+    scans, T_base_lidar, _ = office
+    slam = Slam(configured(2, {"loops.enabled": False}), T_base_lidar)
+    for scan in scans[:100]:
+        slam.process(scan)
+    result = slam.finish()
+    assert result.closures == ()
+    np.testing.assert_allclose(result.trajectory.poses, result.odometry.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+def test_intel_meets_the_published_relations(wheels):
+    log = open_log([shared_data("2d/intel.mcap")], Config().log)
+    relations = read_relations(shared_data("2d/intel.relations"))
+    slam = Slam(configured(2, {"odometry.prior": "auto" if wheels else "constant-velocity"}), log.T_base_lidar)
+    for scan in log.scans():
+        slam.process(scan)
+    result = slam.finish()
+    assert len(result.trajectory) == 13_631
+    before = relation_error(result.odometry, relations)
+    after = relation_error(result.trajectory, relations)
+    assert before.missing == after.missing == 0
+    assert before.translation_m.mean < (0.12 if wheels else 0.25)
+    assert after.translation_m.mean < 0.0229
+    assert np.degrees(after.rotation_rad.mean) < 0.453
+
+
+@pytest.mark.parametrize(("matcher", "limit_m"), [("plicp", 0.10), ("svd", 3.0)])
+def test_kitti_stays_within_its_error_of_the_gps(matcher, limit_m):
+    log = open_log([shared_data("3d/kitti_0001_first54.mcap")], Config().log)
+    steps = tracked(log.scans(), log.T_base_lidar, configured(3, {"matching.matcher": matcher}))
+    truth = log.ground_truth("/ground_truth")
+    assert ate_m(trajectory(steps), truth) < limit_m
+
+
+def test_the_configuration_survives_the_presets():
+    assert msgspec.to_builtins(configured(3)) == msgspec.to_builtins(Config())
+    assert configured(2).local_map.voxel_size_m == 0.1
