@@ -37,7 +37,9 @@ def write_closures(
             name: pa.array(values, pa.float64())
             for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()
         },
-        "information": pa.array([match.information.ravel().tolist() for match in matches], pa.list_(pa.float64(), k * k)),
+        "information": pa.array(
+            [match.information.ravel().tolist() for match in matches], pa.list_(pa.float64(), k * k)
+        ),
         "overlap": pa.array([closure.overlap for closure in closures], pa.float64()),
         "points": pa.array([match.points for match in matches], pa.int64()),
         "inliers": pa.array([match.inliers for match in matches], pa.int64()),
@@ -52,4 +54,3 @@ def write_closures(
         "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
     }
     pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")
-

@@ -25,6 +25,11 @@ class Recorder(Protocol):
         """What went wrong so far, a line each; nothing that goes wrong ends a run."""
         ...
 
+    @property
+    def web_address(self) -> str:
+        """The page that shows the recording as long as it is open; empty without a web viewer."""
+        ...
+
     def __enter__(self) -> Self: ...
 
     def __exit__(
@@ -76,7 +81,7 @@ class OpenRecorder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Viewing:
-    """The two things that the pipeline asks of a viewer: record a run, show a recording."""
+    """What the commands ask of a viewer: record a run, show a recording (in a browser if the flag is set)."""
 
     record: OpenRecorder
-    show: Callable[[Path], None]
+    show: Callable[[Path, bool], None]

@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.closure_table import write_closures
 from pipeline.config import Config
-from pipeline.data import Scan, Trajectory
+from pipeline.data import Trajectory
 from pipeline.errors import InputError, ScanchainError
-from pipeline.graph.g2o import write_g2o
 from pipeline.logs import Log, open_log
-from pipeline.maps import OccupancyGrid, build_point_map, draw_grid, fitting_resolution, write_map, write_ply
+from pipeline.progress import Progress
 from pipeline.provenance import Hashing, Provenance, describe_start
 from pipeline.recorder import OpenRecorder, Recorder, SinkName
+from pipeline.results import write_results
 from pipeline.run_directory import RUN_FILE, RunDirectory
 from pipeline.run_metrics import GroundTruth, Metrics, judge, measure, summary
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
 from pipeline.step_table import StepTable
-from pipeline.trajectory import read_tum, write_kitti, write_tum
+from pipeline.trajectory import read_tum, write_tum
 from pipeline.verdicts import final_verdicts
 
 
@@ -56,66 +52,160 @@ class Job:
     command: tuple[str, ...] = ()
 
 
-class Progress(Protocol):
-    """Whoever watches a run and may end it early."""
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the user ended the run early."""
-        ...
-
-    def say(self, line: str) -> None:
-        """Tell something that happens."""
-        ...
-
-    def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
-        """Pass the scans on, of which there should be ``count``, until they end or the user wants no more."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A run that came to its end: where it lies, its numbers, the same as text."""
+    """A run that came to its end; ``stopped`` says why it did not see the whole log, empty where it did."""
 
     path: Path
     metrics: Metrics
     summary: str
+    warnings: tuple[str, ...]
+    stopped: str
 
 
 class PartialRunError(ScanchainError):
-    """A run that failed or was stopped after some scans; what there is lies in a directory marked partial."""
+    """A run that failed after some scans; what there is lies in a directory marked partial."""
 
 
 def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
-    """Open the log, process it, write the run directory."""
+    """Open the log, process it, write the run directory.
+
+    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
+    """
     started = perf_counter()
     reference = None if job.ground_truth is None else read_tum(job.ground_truth)
-    config = load_settings(file=job.config_file, overrides=job.overrides).config
+    early = load_settings(file=job.config_file, overrides=job.overrides)
     directory = RunDirectory(job.out, force=job.force)
-    log = open_log(job.logs, config.log)
+    log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
+    progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable()
-    progress.say(f"{log.topic}, {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     with directory, Hashing(job.logs) as hashing:
         provenance.write(directory.path / RUN_FILE)
         (directory.path / "config.toml").write_text(dump(settings.config), encoding="utf-8")
-        recorder = record(
-            directory.path / "recording.rrd",
-            dimension=log.dimension,
-            name=job.out.name,
-            sinks=job.sinks,
-            config=settings.config.recording,
-        )
         try:
-            with recorder as recording:
-                result = _process(log, settings.config, recording, progress, steps)
-                grid = _write_results(directory.path, result, settings.config, recording)
-            judged = final_verdicts(result.closures, result.state)
-            write_closures(directory.path / "loops.parquet", judged, result.keyframes, log.dimension)
-            steps.write(directory.path / "steps.parquet", result.trajectory)
-            truth = _judge(job, log, result, reference)
-        except Exception as error:
-            raise _failed(error, directory, steps) from error
-        ...
-    raise NotImplementedError
+            recorded = _process(job, log, settings.config, directory.path, record, progress, steps)
+            truth, note = _judge(job, log, recorded.result, reference)
+            warnings = (*log.damage, *recorded.warnings, *note)
+            run_s = perf_counter() - started - recorded.held_s
+            judged = final_verdicts(recorded.result.closures, recorded.result.state)
+            metrics = measure(steps, recorded.result, judged, run_s=run_s, ground_truth=truth)
+            stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
+            text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
+            metrics.write(directory.path / "metrics.json")
+            (directory.path / "summary.txt").write_text(text, encoding="utf-8")
+            _complete(directory, provenance, hashing, stopped, run_s)
+        except (Exception, KeyboardInterrupt) as error:
+            raise _rescued(error, directory, steps, provenance) from error
+    return Finished(directory.path, metrics, text, warnings, stopped)
+
+
+@dataclass(frozen=True, slots=True)
+class _Recorded:
+    """The result of a log that went through, what the recording has to say, and how long the user looked at it."""
+
+    result: SlamResult
+    warnings: tuple[str, ...]
+    held_s: float
+
+
+def _process(
+    job: Job,
+    log: Log,
+    config: Config,
+    folder: Path,
+    record: OpenRecorder,
+    progress: Progress,
+    steps: StepTable,
+) -> _Recorded:
+    """Every scan through the chain and into the recording, then the results into files."""
+    slam = Slam(config, log.T_base_lidar)
+    recorder = record(
+        folder / "recording.rrd",
+        dimension=log.dimension,
+        name=job.out.resolve().name,
+        sinks=job.sinks,
+        config=config.recording,
+    )
+    with recorder as recording:
+        for step in map(slam.process, progress.track(log.scans(), log.scan_count)):
+            recording.log(step)
+            steps.append(step)
+        progress.say("optimising and writing")
+        result = slam.finish()
+        write_results(folder, result, config.maps, recording)
+        judged = final_verdicts(result.closures, result.state)
+        write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
+        steps.write(folder / "steps.parquet", result.trajectory)
+        held_s = _hold(recording, progress)
+    return _Recorded(result, tuple(recording.warnings), held_s)
+
+
+def _hold(recording: Recorder, progress: Progress) -> float:
+    """Let the user look at a web viewer, which lives as long as the recording; how long that was."""
+    if not recording.web_address:
+        return 0.0
+    began = perf_counter()
+    progress.say(f"viewer: {recording.web_address} until Ctrl-C")
+    recording.hold()
+    return perf_counter() - began
+
+
+def _judge(
+    job: Job, log: Log, result: SlamResult, reference: Trajectory | None
+) -> tuple[GroundTruth | None, tuple[str, ...]]:
+    """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
+    source = str(job.ground_truth) if reference is not None else log.config.ground_truth_topic
+    if reference is None:
+        reference = log.ground_truth()
+    if reference is None:
+        return None, ()
+    try:
+        return judge(result, reference, source), ()
+    except InputError as error:
+        return None, (f"no accuracy against {source}: {error}",)
+
+
+def _heading(log: Log, stopped: str) -> str:
+    paths = ", ".join(str(path) for path in log.paths)
+    return f"{paths} {log.topic}" + (f" (PARTIAL: {stopped})" if stopped else "")
+
+
+def _complete(
+    directory: RunDirectory, provenance: Provenance, hashing: Hashing, stopped: str, duration_s: float
+) -> None:
+    """Give a whole run its name; one that was stopped stays marked partial."""
+    if stopped:
+        directory.worth_keeping()
+        replaced = msgspec.structs.replace(provenance, stopped=stopped, duration_s=duration_s)
+        replaced.write(directory.path / RUN_FILE)
+        return
+    digests = zip(provenance.logs, hashing.digests(), strict=True)
+    logs = [msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
+    replaced = msgspec.structs.replace(provenance, complete=True, duration_s=duration_s, logs=logs)
+    replaced.write(directory.path / RUN_FILE)
+    directory.complete()
+
+
+def _rescued(
+    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
+) -> BaseException:
+    """The error to raise; what there is of a run that got somewhere is written and said where it lies."""
+    is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+    if not len(steps) and not is_bug:
+        return error
+    directory.worth_keeping()
+    reason = str(error) or type(error).__name__
+    msgspec.structs.replace(provenance, stopped=reason).write(directory.path / RUN_FILE)
+    if is_bug:
+        text = "".join(traceback.format_exception(error))
+        (directory.path / "traceback.txt").write_text(text, encoding="utf-8")
+    if len(steps):
+        write_tum(directory.path / "odometry.tum", steps.odometry)
+        steps.write(directory.path / "steps.parquet", steps.best_known)
+    where = f"{len(steps):,} scans until then are in {directory.path}"
+    if isinstance(error, InputError):
+        return InputError(f"{error}; {where}")
+    kind = f"{type(error).__name__}: " if is_bug else ""
+    return PartialRunError(f"{kind}{reason}; {where}")

@@ -73,6 +73,6 @@ def _check(destination: Path, force: bool) -> None:
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(
-            f"{destination}: holds something else than a run ({RUN_FILE} is missing), --force does not replace it; "
+            f"{destination}: is not a run ({RUN_FILE} is missing), so --force does not replace it; "
             "choose another --out"
         )

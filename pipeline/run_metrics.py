@@ -136,8 +136,8 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
         f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
         f"accepted; chi2 {m.chi2:.4g}",
-        f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, residual {1e3 * m.median_residual_m:.1f} mm, "
-        f"{m.median_iterations:.0f} iterations (medians)",
+        f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
+        f"residual {1e3 * m.median_residual_m:.1f} mm, {m.median_iterations:.0f} iterations (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time; "
         f"median ms a scan: " + ", ".join(f"{stage} {m.median_ms[stage]:.2f}" for stage in STAGES),
     ]
@@ -173,8 +173,9 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
     lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
+        share, rotation = 100.0 * accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
         lines.append(
-            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m ({100.0 * accuracy.ate_share_of_path:.3f} % of the path), "
-            f"max {accuracy.ate_max_m:.4f} m, rotation rmse {np.degrees(accuracy.ate_rotation_rmse_rad):.3f} deg"
+            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m ({share:.3f} % of the path), "
+            f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"
         )
     return lines

@@ -143,7 +143,7 @@ def pose_columns(poses: Matrix) -> dict[str, list[float]]:
 
 def _covariances(informations: Matrix) -> list[list[float] | None]:
     """Inverses (k · k) of (N, k, k), None where there is none."""
-    finite = np.isfinite(informations).all(axis=(1, 2))
+    finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
     sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
     scaled = vectors / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]

@@ -25,7 +25,7 @@ from viz.batching import Batcher
 from viz.blueprint import blueprint
 from viz.keyframe_graph import KeyframeGraph
 from viz.messages import Message, Times
-from viz.sinks import FileSink, LiveSink, Sink, open_stream
+from viz.sinks import Sink, file_sink, open_stream, viewer_sink
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 
@@ -70,11 +70,11 @@ class Recording:
         recording_id = uuid4()
         if "save" in self.wanted and self.path is not None:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.sinks.append(FileSink(self.path, stream, blueprint(self.dimension)))
+            self.sinks.append(file_sink(self.path, stream, blueprint(self.dimension)))
         address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
         if address:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.sinks.append(LiveSink(address, stream, blueprint(self.dimension)))
+            self.sinks.append(viewer_sink(address, stream, blueprint(self.dimension)))
         self._send(lambda: entities.constants(self.dimension))
         return self
 
@@ -122,8 +122,8 @@ class Recording:
         self._send(lambda: [*self.batcher.messages(), *self.graph.draw()])
         layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
         for sink in self.sinks:
-            self._guard(lambda sink=sink: sink.frame(layout))
-            self._guard(sink.close)
+            sink.send(layout)
+            sink.close()
         self.problems, self.sinks = self.warnings, []
         if self.server is not None:
             viewer.stop(self.server)

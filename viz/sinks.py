@@ -1,16 +1,18 @@
-"""Where a recording goes: a file, written at once, and a live viewer, served by a thread of its own.
+"""Where a recording goes: a file, a live viewer, or both; each is a stream served by a thread of its own.
 
-The two are two streams of one recording. rerun can tee one stream to both, but then a viewer that stops reading
-(a suspended laptop, a broken tunnel) blocks the writing of the file, and with it the run, without a limit.
+rerun can tee one stream to both, but it waits without a limit for a viewer that stops reading (a suspended laptop,
+a broken tunnel) and for a file on a full disk, and the run would wait with it. Here the run waits for a queue, and
+for that only so long.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import queue
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 from uuid import UUID
 
 import rerun as rr
@@ -19,126 +21,110 @@ import rerun.blueprint as rrb
 from pipeline.errors import InputError
 from viz.messages import Message
 
-_FLUSH_S = 5.0
-_QUEUE = 256  # batches that may wait for a slow viewer
+_QUEUED_BATCHES = 16
+_FILE_PATIENCE_S = 10.0
+_VIEWER_PATIENCE_S = 5.0
 
 
-class Sink(Protocol):
-    """A place that messages go to."""
+class Sink:
+    """Passes batches on to one stream.
 
-    warnings: list[str]
+    name : what warnings call it
+    connect : run first, in the thread
+    patience_s : how long it may take nothing before it is given up
+    is_lossless : whether the run waits for it when it falls behind; else what it is too slow for is dropped
+    """
 
-    def send(self, messages: list[Message]) -> None:
-        """Take messages; what goes wrong ends up in ``warnings``."""
-        ...
-
-    def frame(self, blueprint: rrb.Blueprint) -> None:
-        """Replace the blueprint by one that frames what was recorded."""
-        ...
-
-    def close(self) -> None:
-        """Send off what is left, within a limit of time."""
-        ...
-
-
-def open_stream(name: str, dimension: int, recording_id: UUID) -> rr.RecordingStream:
-    """A stream without log-time column, so that there are the two timelines and no third."""
-    stream = rr.RecordingStream(f"scanchain {dimension}D", recording_id=recording_id)
-    stream.set_log_time_enabled(False)
-    stream.send_recording_name(name)
-    return stream
-
-
-class FileSink:
-    """A .rrd file; it can be read up to the last batch even if the run is killed."""
-
-    def __init__(self, path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-        self.path = path
+    def __init__(
+        self,
+        name: str,
+        stream: rr.RecordingStream,
+        connect: Callable[[], None],
+        *,
+        patience_s: float,
+        is_lossless: bool,
+    ) -> None:
+        self.name = name
         self.stream = stream
-        self.warnings: list[str] = []
-        try:
-            stream.set_sinks(rr.FileSink(path), default_blueprint=blueprint)
-        except RuntimeError as error:
-            raise InputError(
-                f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
-            ) from error
-
-    def send(self, messages: list[Message]) -> None:
-        """Write a batch; a broken disk is told once, and then nothing more is written."""
-        if self.warnings:
-            return
-        try:
-            for message in messages:
-                message.send(self.stream)
-            self.stream.flush(timeout_sec=0.0)
-        except Exception as error:
-            self.warnings.append(f"{self.path}: the recording is incomplete: {error}")
-
-    def frame(self, blueprint: rrb.Blueprint) -> None:
-        """Write the blueprint at the end of the file; the last one holds."""
-        if not self.warnings:
-            self.stream.send_blueprint(blueprint, make_active=False, make_default=True)
-
-    def close(self) -> None:
-        """Finish the file."""
-        try:
-            self.stream.flush(timeout_sec=_FLUSH_S)
-        except Exception as error:
-            if not self.warnings:
-                self.warnings.append(f"{self.path}: the recording is incomplete: {error}")
-        self.stream.disconnect()
-
-
-class LiveSink:
-    """A viewer that listens on ``address``; batches that it is too slow for are dropped and counted."""
-
-    def __init__(self, address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-        self.address = address
-        self.stream = stream
-        self.blueprint = blueprint
+        self.connect = connect
+        self.patience_s = patience_s
+        self.is_lossless = is_lossless
         self.warnings: list[str] = []
         self.dropped = 0
-        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | None] = queue.Queue(_QUEUE)
-        self.thread = threading.Thread(target=self._serve, name="rerun viewer", daemon=True)
+        self.lock = threading.Lock()
+        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | None] = queue.Queue(_QUEUED_BATCHES)
+        self.thread = threading.Thread(target=self._serve, name=f"recording to {name}", daemon=True)
         self.thread.start()
 
-    def send(self, messages: list[Message]) -> None:
-        """Hand a batch to the thread."""
-        self._put(messages)
-
-    def frame(self, blueprint: rrb.Blueprint) -> None:
-        """Hand the blueprint to the thread."""
-        self._put(blueprint)
-
-    def close(self) -> None:
-        """Give the viewer a few seconds to take the rest, then go on without it."""
-        with contextlib.suppress(queue.Full):
-            self.waiting.put(None, timeout=_FLUSH_S)
-        self.thread.join(_FLUSH_S)
-        if self.thread.is_alive():
-            rr.unregister_shutdown()  # it would wait for the viewer when Python ends, without a limit
-            self.warnings.append(f"the viewer at {self.address} stopped reading; what it shows is incomplete")
-        elif self.dropped:
-            self.warnings.append(f"the viewer at {self.address} was too slow: it misses {self.dropped} batches")
-
-    def _put(self, item: list[Message] | rrb.Blueprint) -> None:
+    def send(self, item: list[Message] | rrb.Blueprint) -> None:
+        """Hand over a batch, or a blueprint to replace the one before; what goes wrong ends up in ``warnings``."""
         if self.warnings:
             return
         try:
-            self.waiting.put_nowait(item)
+            self.waiting.put(item, timeout=self.patience_s if self.is_lossless else 0.0)
         except queue.Full:
             self.dropped += 1
+            if self.is_lossless:
+                self._give_up("it takes no more data")
+
+    def close(self) -> None:
+        """Give it time to take the rest, then go on without it."""
+        if not self.warnings:
+            with contextlib.suppress(queue.Full):
+                self.waiting.put(None, timeout=self.patience_s)
+            self.thread.join(self.patience_s + 1.0)
+            if self.thread.is_alive():
+                self._give_up("it takes no more data")
+        if self.dropped and not self.warnings:
+            self.warnings.append(f"{self.name} was too slow: it lacks {self.dropped} batches")
 
     def _serve(self) -> None:
         try:
-            self.stream.set_sinks(rr.GrpcSink(self.address), default_blueprint=self.blueprint)
+            self.connect()
             while (item := self.waiting.get()) is not None:
                 if isinstance(item, list):
                     for message in item:
                         message.send(self.stream)
                 else:
                     self.stream.send_blueprint(item)
-                self.stream.flush(timeout_sec=_FLUSH_S)
+                self.stream.flush(timeout_sec=self.patience_s)
             self.stream.disconnect()
         except Exception as error:
-            self.warnings.append(f"the viewer at {self.address} is gone, the run goes on without it: {error}")
+            self._give_up(str(error))
+
+    def _give_up(self, why: str) -> None:
+        """Say so, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""
+        with self.lock:
+            if self.warnings:
+                return
+            self.warnings.append(f"{self.name} is incomplete, the run goes on without it: {why}")
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
+            rr.unregister_shutdown()
+
+
+def open_stream(name: str, dimension: int, recording_id: UUID) -> rr.RecordingStream:
+    """A stream that knows its recording's name and adds no timeline of its own."""
+    stream = rr.RecordingStream(f"scanchain {dimension}D", recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.send_recording_name(name)
+    return stream
+
+
+def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
+    """A .rrd file; it can be read up to the last batch even if the run is killed."""
+    try:
+        stream.set_sinks(rr.FileSink(path), default_blueprint=blueprint)
+    except RuntimeError as error:
+        raise InputError(
+            f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
+        ) from error
+    return Sink(f"{path}", stream, lambda: None, patience_s=_FILE_PATIENCE_S, is_lossless=True)
+
+
+def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
+    """A viewer that listens on ``address``."""
+
+    def connect() -> None:
+        stream.set_sinks(rr.GrpcSink(address), default_blueprint=blueprint)
+
+    return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -72,18 +73,13 @@ def start_web(port: int, web_port: int) -> subprocess.Popen[bytes]:
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """End a viewer that was started here, with the children of its launcher."""
+    """End a viewer that was started here, with the process that its launcher started; it has nothing to save."""
     if os.name == "posix":
-        try:
-            os.killpg(process.pid, signal.SIGTERM)
-        except ProcessLookupError:
-            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     else:
-        process.terminate()
-    try:
-        process.wait(timeout=2.0)
-    except subprocess.TimeoutExpired:
         process.kill()
+    process.wait(timeout=5.0)
 
 
 def _launch(*arguments: str) -> subprocess.Popen[bytes]:

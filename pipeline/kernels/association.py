@@ -31,7 +31,7 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
                     slot = find(voxels.keys, pack(ix + dx, iy + dy, iz + dz))
                     if slot < 0:
                         continue
-                    voxel = voxels.index[slot]
+                    voxel = voxels.row[slot]
                     ex = voxels.cells[voxel, 0] - x
                     ey = voxels.cells[voxel, 1] - y
                     ez = voxels.cells[voxel, 2] - z

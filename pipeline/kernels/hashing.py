@@ -21,7 +21,7 @@ def unpack(key: int):
 
 
 @njit(cache=True, inline="always")
-def find(keys, key: int) -> int:
+def find(keys, key: int):
     """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs.
 
     The multiplicative hash of Knuth (1973, § 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones.

@@ -20,7 +20,8 @@ def normal_equations(
     Off planes the mean of a voxel only stands for the surface to within the voxel's size, so there r² counts
     ``point_weight`` = σ²/(σ² + variance of a point in a voxel).
 
-    points : (N, d) metres, source frame; origin : (3,), map frame; partner : (N,) rows of the map's voxels, −1 for none
+    points : (N, d) metres, source frame; origin : (3,), map frame
+    partner : (N,) rows of the map's voxels, −1 for none
     scale_m : s; residuals far above it are all but ignored
     second_order : adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
         held fixed)

@@ -19,14 +19,14 @@ MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
 
 
 class Voxels(NamedTuple):
-    """The arrays of a voxel map: ``keys`` (S,), ``index`` (S,), ``moments`` (V, 10), ``cells`` (V, 8)."""
+    """The arrays of a voxel map: ``keys`` (S,), ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 8)."""
 
     keys: NDArray[np.int64]
-    index: NDArray[np.int32]
+    row: NDArray[np.int32]
     voxel_keys: NDArray[np.int64]
     moments: NDArray[np.float64]
     cells: NDArray[np.float64]
-    count: NDArray[np.int64]
+    used: NDArray[np.int64]
     size_m: float
 
 
@@ -70,17 +70,17 @@ def move(T, points, i: int):
 @njit(cache=True)
 def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: float):
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
-    for voxel in range(voxels.count[0]):
+    for voxel in range(voxels.used[0]):
         cell = voxels.cells[voxel]
         dx, dy, dz = cell[0] - x, cell[1] - y, cell[2] - z
         if cell[TICK] < oldest_tick or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
         key = voxels.voxel_keys[voxel]
         slot = ~find(kept.keys, key)
-        new = kept.count[0]
-        kept.count[0] = new + 1
+        new = kept.used[0]
+        kept.used[0] = new + 1
         kept.keys[slot] = key
-        kept.index[slot] = new
+        kept.row[slot] = new
         kept.voxel_keys[new] = key
         kept.moments[new] = voxels.moments[voxel]
         kept.cells[new] = cell
@@ -93,11 +93,11 @@ def _voxel_at(voxels, x: float, y: float, z: float) -> int:
     key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
     slot = find(voxels.keys, key)
     if slot >= 0:
-        return voxels.index[slot]
-    voxel = voxels.count[0]
-    voxels.count[0] = voxel + 1
+        return voxels.row[slot]
+    voxel = voxels.used[0]
+    voxels.used[0] = voxel + 1
     voxels.keys[~slot] = key
-    voxels.index[~slot] = voxel
+    voxels.row[~slot] = voxel
     voxels.voxel_keys[voxel] = key
     voxels.moments[voxel, :] = 0.0
     voxels.cells[voxel, :] = 0.0
@@ -154,7 +154,7 @@ def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
                 slot = find(voxels.keys, pack(ix + dx, iy + dy, iz + dz))
                 if slot < 0:
                     continue
-                m = voxels.moments[voxels.index[slot]]
+                m = voxels.moments[voxels.row[slot]]
                 n, x, y, z = m[0], dx * size, dy * size, dz * size
                 sums[0] += n
                 sums[1] += m[1] + n * x

@@ -67,20 +67,22 @@ class LoopCloser:
     ) -> Closure:
         overlap = _overlap(points, match.T_target_source, submap)
         moved_m = float(np.linalg.norm((lie.inverse(T_predicted) @ match.T_target_source)[:-1, -1]))
-        limits = self.config
+        problem = self._problem(match, overlap, moved_m)
+        verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
+        return Closure(target, source, match, overlap, verdict, problem or "verified by matching")
+
+    def _problem(self, match: Match, overlap: float, moved_m: float) -> str:
+        """Why the match is no closure, empty if it is one."""
+        limits, information = self.config, match.degeneracy_eigenvalue
         if not match.converged:
-            reason = match.reason
-        elif overlap < limits.min_overlap:
-            reason = f"overlap {overlap:.2f} < loops.min_overlap ({limits.min_overlap:g})"
-        elif match.degeneracy_eigenvalue < limits.min_information:
-            reason = f"information {match.degeneracy_eigenvalue:.1e} < loops.min_information ({limits.min_information:g})"
-        elif moved_m > limits.max_radius_m:
-            reason = (
-                f"moved {moved_m:.1f} m from the prediction, beyond loops.max_radius_m ({limits.max_radius_m:g})"
-            )
-        else:
-            return Closure(target, source, match, overlap, Verdict.ACCEPTED, "verified by matching")
-        return Closure(target, source, match, overlap, Verdict.REJECTED, reason)
+            return match.reason
+        if overlap < limits.min_overlap:
+            return f"overlap {overlap:.2f} < loops.min_overlap ({limits.min_overlap:g})"
+        if information < limits.min_information:
+            return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
+        if moved_m > limits.max_radius_m:
+            return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
+        return ""
 
 
 def _overlap(points: Points, T: Pose, submap: VoxelMap) -> float:

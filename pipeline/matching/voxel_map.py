@@ -26,7 +26,7 @@ class VoxelMap:
         self.voxels = _empty(1 << 12, config.voxel_size_m)
 
     def __len__(self) -> int:
-        return int(self.voxels.count[0])
+        return int(self.voxels.used[0])
 
     def insert(self, points: Points, T_map_lidar: Pose) -> None:
         """Add points (N, d) of the lidar frame; every so often forget what is far or old."""
@@ -55,10 +55,10 @@ def _empty(room: int, voxel_size_m: float) -> Voxels:
     cells[:, TICK] = -1.0
     return Voxels(
         keys=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int64),
-        index=np.zeros(_SLOTS_PER_VOXEL * capacity, np.int32),
+        row=np.zeros(_SLOTS_PER_VOXEL * capacity, np.int32),
         voxel_keys=np.zeros(capacity, np.int64),
         moments=np.zeros((capacity, 10)),
         cells=cells,
-        count=np.zeros(1, np.int64),
+        used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )

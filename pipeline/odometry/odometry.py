@@ -97,7 +97,7 @@ class Odometry:
         return tracked if T_stamp_middle is None else seen_from(tracked, T_stamp_middle)
 
     def _from_middle_to_stamp(self, scan: Scan, T_odom_middle: Pose) -> Pose | None:
-        """T_stamp_middle, None where they are one, by the velocity between the middles of the last scan and this one.
+        """T_stamp_middle by the velocity from the last scan's middle to this one's; None where they are one.
 
         Scans are matched as seen from their middle; the stamp lies between two middles, or just beyond.
         """

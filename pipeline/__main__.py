@@ -1,0 +1,92 @@
+"""The command line; the one place where the pipeline meets its viewer."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from pipeline.commands.config import config
+from pipeline.commands.evaluate import evaluate
+from pipeline.commands.info import info
+from pipeline.commands.run import run
+from pipeline.commands.sequence import sequence
+from pipeline.commands.simulate import simulate
+from pipeline.commands.view import view
+from pipeline.config import RecordingConfig
+from pipeline.errors import InputError, ScanchainError
+from pipeline.recorder import Recorder, SinkName, Viewing
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="scanchain", message="%(prog)s %(version)s")
+def scanchain() -> None:
+    r"""Lidar logs in, trajectory and map out.
+
+    \b
+    Examples:
+      scanchain simulate office office.mcap
+      scanchain run office.mcap --out runs/office
+      scanchain view runs/office
+
+    Exit codes: 0 done, 1 the run failed or was stopped, 2 bad input or arguments.
+    """
+
+
+for _command in (run, view, info, simulate, evaluate, config, sequence):
+    scanchain.add_command(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; every error is one line on stderr, the exit code is returned."""
+    viewing = Viewing(_record, _show)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return 2
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else "scanchain"
+        return _fail(f"{error.format_message().rstrip('.')}; see {path} --help", 2)
+    except click.ClickException as error:
+        return _fail(error.format_message(), 2)
+    except InputError as error:
+        return _fail(str(error), 2)
+    except ScanchainError as error:
+        return _fail(str(error), 1)
+    except (KeyboardInterrupt, click.Abort):
+        return _fail("interrupted", 1)
+    except BrokenPipeError:  # the reader of our output went away, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if os.environ.get("SCANCHAIN_DEBUG"):
+            raise
+        return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows where it happened", 1)
+
+
+def _fail(message: str, code: int) -> int:
+    click.echo(f"error: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _record(
+    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
+) -> Recorder:
+    from viz.recording import Recording
+
+    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
+
+
+def _show(path: Path, in_browser: bool) -> None:
+    from viz.show import show
+
+    show(path, in_browser=in_browser)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

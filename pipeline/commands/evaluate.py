@@ -1,0 +1,132 @@
+"""``scanchain evaluate``: a trajectory against the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pipeline.errors import InputError
+
+if TYPE_CHECKING:
+    from pipeline.data import Trajectory
+    from pipeline.evaluate import AbsoluteError, KittiError, RelationError, RelativeError
+
+    Result = AbsoluteError | RelativeError | KittiError | RelationError
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("estimate", metavar="EST.tum", type=_PATH)
+@click.argument("reference", metavar="[GT.tum]", required=False, type=_PATH)
+@click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
+@click.option(
+    "--align",
+    type=click.Choice(["rigid", "first", "none"]),
+    default="rigid",
+    show_default=True,
+    help="How the frames are brought together for the ATE.",
+)
+@click.option("--max-difference", type=float, metavar="SECONDS", help="Between stamps that pair. [default: 0.01]")
+@click.option("--kitti", is_flag=True, help="Both files are KITTI's, 12 numbers a line; poses pair line by line.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def evaluate(
+    estimate: Path,
+    reference: Path | None,
+    relations: Path | None,
+    align: str,
+    max_difference: float | None,
+    kitti: bool,
+    as_json: bool,
+) -> None:
+    r"""Print ATE, RPE, the KITTI metric and the error over relations, each with its definition.
+
+    Give the ground truth, or --relations, or both.
+
+    \b
+    Examples:
+      scanchain evaluate runs/log/trajectory.tum truth.tum
+      scanchain evaluate runs/intel/trajectory.tum --relations intel.relations
+      scanchain evaluate runs/log/trajectory.tum truth.tum --align first --json
+    """
+    from pipeline.evaluate import PAIRING_LIMIT_S, read_relations, relation_error
+    from pipeline.trajectory import read_kitti, read_tum
+
+    if reference is None and relations is None:
+        raise InputError("nothing to compare with; give GT.tum or --relations FILE")
+    read = read_kitti if kitti else read_tum
+    trajectory = read(estimate)
+    results = Results({}, {})
+    if reference is not None:
+        limit_s = PAIRING_LIMIT_S if max_difference is None else max_difference
+        results = _against(trajectory, read(reference), align, limit_s)
+    if relations is not None:
+        results.found["relations"] = relation_error(trajectory, read_relations(relations))
+    click.echo(_json(results) if as_json else _text(results))
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """What was computed, by name, and what could not be, with the reason."""
+
+    found: dict[str, Result]
+    missing: dict[str, str]
+
+
+def _against(trajectory: Trajectory, reference: Trajectory, align: str, limit_s: float) -> Results:
+    """Every metric that the trajectories allow."""
+    from pipeline.evaluate import (
+        Alignment,
+        absolute_error,
+        kitti_error,
+        lengths_for,
+        pair,
+        relative_error_over_distance,
+        relative_error_over_frames,
+    )
+
+    pairs = pair(trajectory, reference, limit_s=limit_s)
+    absolute = absolute_error(pairs, Alignment(align))
+    metrics: dict[str, Callable[[], Result]] = {
+        "rpe_1_pose": lambda: relative_error_over_frames(pairs),
+        "rpe_10_m": lambda: relative_error_over_distance(pairs, 10.0),
+        "kitti": lambda: kitti_error(pairs, lengths_for(absolute.path_length_m)),
+    }
+    results = Results({"ate": absolute}, {})
+    for name, metric in metrics.items():
+        try:
+            results.found[name] = metric()
+        except InputError as error:
+            results.missing[name] = str(error)
+    return results
+
+
+def _text(results: Results) -> str:
+    lines = [f"{result.summary}\n  {result.definition}" for result in results.found.values()]
+    return "\n".join([*lines, *(f"{name}: none: {reason}" for name, reason in results.missing.items())])
+
+
+def _json(results: Results) -> str:
+    """The figures without the arrays behind them."""
+    tree = {name: _figures(result) for name, result in results.found.items()}
+    return json.dumps(tree | dict.fromkeys(results.missing), indent=2)
+
+
+def _figures(record: object) -> object:
+    if is_dataclass(record) and not isinstance(record, type):
+        values = {field.name: _figures(getattr(record, field.name)) for field in fields(record)}
+        return {name: value for name, value in values.items() if value is not _LEFT_OUT}
+    if isinstance(record, tuple):
+        return [_figures(item) for item in record]
+    if isinstance(record, float):
+        return record if isfinite(record) else None
+    return record if isinstance(record, int | str) else _LEFT_OUT
+
+
+_LEFT_OUT = object()

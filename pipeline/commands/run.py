@@ -1,0 +1,131 @@
+"""``scanchain run``: the main job."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.errors import InputError, ScanchainError
+from pipeline.settings import Override
+
+if TYPE_CHECKING:
+    from pipeline.recorder import SinkName, Viewing
+    from pipeline.run import Job
+
+_SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
+
+
+@click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make.")
+@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file instead of the preset.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option(
+    "--rerun",
+    default="save",
+    show_default=True,
+    metavar="LIST",
+    help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
+)
+@click.option("--start", metavar="SECONDS", help="Leave out what comes before, counted from the log's first message.")
+@click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
+@click.option("--every", metavar="N", help="Take every N-th scan.")
+@click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
+@click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
+@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: a TUM file or a topic. [default: /ground_truth]")
+@click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
+@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+@click.pass_context
+def run(
+    ctx: click.Context,
+    logs: tuple[Path, ...],
+    out: Path,
+    config: Path | None,
+    rerun: str,
+    gt: str | None,
+    force: bool,
+    as_json: bool,
+    **shortcuts: str | bool | None,
+) -> None:
+    r"""Make a trajectory, a map and a recording of a log.
+
+    LOG is an MCAP file; several are read as one log. Any key of the configuration is a flag, see scanchain config
+    show.
+
+    \b
+    Examples:
+      scanchain run log.mcap --out runs/log
+      scanchain run log.mcap --out runs/log --rerun save,spawn
+      scanchain run part_0.mcap part_1.mcap --out runs/log --topic /lidar_front/points
+      scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
+      scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
+    """
+    from pipeline.commands.terminal import Terminal
+    from pipeline.run import Job
+    from pipeline.run import run as run_log
+
+    truth_file, truth_topic = _ground_truth(gt)
+    job = Job(
+        logs=logs,
+        out=out,
+        config_file=config,
+        overrides=(*_shortcuts(shortcuts), *truth_topic, *overrides(ctx)),
+        sinks=_sinks(rerun),
+        ground_truth=truth_file,
+        force=force,
+        command=tuple(sys.argv),
+    )
+    viewing: Viewing = ctx.obj
+    with Terminal("scans") as terminal:
+        finished = run_log(job, viewing.record, terminal)
+    for warning in finished.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
+    if finished.stopped:
+        raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}")
+    if not as_json:
+        click.echo(f"written        {out}")
+
+
+_KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}
+
+
+def _shortcuts(flags: dict[str, str | bool | None]) -> list[Override]:
+    """The short flags as the keys they stand for; a ``--section.key`` flag beats them."""
+    keys = _KEYS | {"matcher": "matching.matcher"}
+    result = [
+        Override(key, value, f"--{name}")
+        for name, key in keys.items()
+        if isinstance(value := flags.get(name), str)
+    ]
+    if flags.get("no_loops"):
+        result.append(Override("loops.enabled", "false", "--no-loops"))
+    return result
+
+
+def _sinks(text: str) -> frozenset[SinkName]:
+    """Where the recording goes, from ``save,spawn``."""
+    words = [word.strip() for word in text.split(",")]
+    if words == ["off"]:
+        return frozenset()
+    chosen = frozenset(sink for sink in _SINKS if sink in words)
+    unknown = [word for word in words if word not in _SINKS]
+    if unknown:
+        raise InputError(f"--rerun is {text!r}; take off, or one or several of {', '.join(_SINKS)} with commas")
+    if len(chosen - {"save"}) > 1:
+        raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
+    return chosen
+
+
+def _ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
+    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
+    if text is None:
+        return None, ()
+    path = Path(text)
+    if text.startswith("/") and not path.exists() and not path.suffix:
+        return None, (Override("log.ground_truth_topic", text, "--gt"),)
+    return path, ()

@@ -1,0 +1,66 @@
+"""``scanchain sequence``: the catalogue of logs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.group()
+def sequence() -> None:
+    r"""Logs that are known by name: simulated ones and published ones.
+
+    \b
+    Examples:
+      scanchain sequence list
+      scanchain sequence get demo-office --out logs
+    """
+
+
+@sequence.command("list")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def list_sequences(as_json: bool) -> None:
+    r"""List the catalogue.
+
+    \b
+    Examples:
+      scanchain sequence list
+      scanchain sequence list --json
+    """
+    from msgspec import to_builtins
+
+    from pipeline import catalogue
+
+    entries = {name: catalogue.load(name) for name in catalogue.names()}
+    if as_json:
+        click.echo(json.dumps({name: to_builtins(entry) for name, entry in entries.items()}, indent=2))
+        return
+    width = max(map(len, entries))
+    for name, entry in entries.items():
+        kind = type(entry.source).__name__.lower()
+        click.echo(f"{name:<{width}}  {entry.dimension}D  {kind:<9}  {entry.title}")
+
+
+@sequence.command("get")
+@click.argument("name", metavar="NAME")
+@click.option(
+    "--out", default=Path("logs"), show_default=True, metavar="DIR", type=click.Path(path_type=Path), help="Where to."
+)
+@click.option("--force", is_flag=True, help="Make it again even if it is there.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
+    r"""Make a log of the catalogue, unless it is there already, and print where it lies.
+
+    \b
+    Examples:
+      scanchain sequence get demo-office
+      scanchain sequence get demo-town --out logs --force
+    """
+    from pipeline import catalogue
+    from pipeline.commands.terminal import Terminal
+
+    with Terminal("scans") as terminal:
+        path = catalogue.prepare(name, out, force=force, progress=terminal.count)
+    click.echo(json.dumps({"name": name, "path": str(path)}) if as_json else path)

@@ -1,0 +1,57 @@
+"""``scanchain simulate``: a log with ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("world", metavar="WORLD")
+@click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
+@click.option("--seed", default=0, show_default=True, metavar="N", help="The same seed, the same bytes.")
+@click.option("--duration", type=float, metavar="SECONDS", help="How long to drive. [default: the world's]")
+@click.option("--sensor", metavar="NAME", help="lms-270, utm-30, hdl-64, os1-32, vlp-16, rosette.")
+@click.option("--drift", default=1.0, show_default=True, metavar="FACTOR", help="Errors of the wheel odometry.")
+@click.option("--noise", type=float, metavar="METRES", help="Standard deviation of a range.")
+@click.option("--dropout", type=float, metavar="SHARE", help="Share of returns that are lost.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+def simulate(
+    world: str,
+    destination: Path,
+    seed: int,
+    duration: float | None,
+    sensor: str | None,
+    drift: float,
+    noise: float | None,
+    dropout: float | None,
+    force: bool,
+) -> None:
+    r"""Write a synthetic log with exact ground truth, and the truth beside it as .tum.
+
+    WORLD is office (2D laser scanner) or town (3D lidar).
+
+    \b
+    Examples:
+      scanchain simulate office office.mcap
+      scanchain simulate town town.mcap --duration 20 --seed 3
+      scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
+    """
+    from pipeline.commands.terminal import Terminal
+    from pipeline.simulate import simulate as simulate_log
+
+    with Terminal("scans") as terminal:
+        truth = simulate_log(
+            world,
+            destination,
+            seed=seed,
+            duration_s=duration,
+            sensor=sensor,
+            drift=drift,
+            noise_m=noise,
+            dropout=dropout,
+            force=force,
+            progress=terminal.count,
+        )
+    click.echo(f"{destination}: {len(truth)} scans; ground truth in it and in {destination.with_suffix('.tum')}")
