@@ -1,1 +1,69 @@
-"""Lidar logs in, trajectory and map out."""
+"""Lidar logs in, trajectory and map out.
+
+The names below are the Python API; each is imported when it is first used, so that ``import pipeline`` is cheap.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.config import Config
+    from pipeline.data import Match, Scan, State, Step, Trajectory
+    from pipeline.errors import InputError, ScanchainError
+    from pipeline.graph.pose_graph import PoseGraph
+    from pipeline.logs import open_log
+    from pipeline.matching import VoxelMap, create_matcher, rigid_transform
+    from pipeline.odometry import Odometry
+    from pipeline.settings import load_settings
+    from pipeline.slam import Slam, SlamResult
+    from pipeline.trajectory import read_tum, write_tum
+
+_HOMES = {
+    "Config": "config",
+    "InputError": "errors",
+    "Match": "data",
+    "Odometry": "odometry",
+    "PoseGraph": "graph.pose_graph",
+    "Scan": "data",
+    "ScanchainError": "errors",
+    "Slam": "slam",
+    "SlamResult": "slam",
+    "State": "data",
+    "Step": "data",
+    "Trajectory": "data",
+    "VoxelMap": "matching",
+    "create_matcher": "matching",
+    "load_settings": "settings",
+    "open_log": "logs",
+    "read_tum": "trajectory",
+    "rigid_transform": "matching",
+    "write_tum": "trajectory",
+}
+
+__all__ = [
+    "Config",
+    "InputError",
+    "Match",
+    "Odometry",
+    "PoseGraph",
+    "Scan",
+    "ScanchainError",
+    "Slam",
+    "SlamResult",
+    "State",
+    "Step",
+    "Trajectory",
+    "VoxelMap",
+    "create_matcher",
+    "load_settings",
+    "open_log",
+    "read_tum",
+    "rigid_transform",
+    "write_tum",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
+    return getattr(import_module(f"pipeline.{_HOMES[name]}"), name)

@@ -24,7 +24,7 @@ from pipeline.recorder import Recorder, SinkName, Viewing
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="scanchain", message="%(prog)s %(version)s")
 def scanchain() -> None:
-    r"""Lidar logs in, trajectory and map out.
+    """Lidar logs in, trajectory and map out.
 
     \b
     Examples:

@@ -22,7 +22,7 @@ class KeyframeGraph:
     def __init__(self) -> None:
         self.positions: list[NDArray[np.float32]] = []
         self.closures: list[Closure] = []
-        self.weight: dict[tuple[int, int], float] = {}
+        self.graph: GraphState | None = None
         self.drawn = 0
         self.is_current = True
         self.times = Times.at(0, 0)
@@ -36,7 +36,8 @@ class KeyframeGraph:
             self.closures.extend(step.closures)
             self.is_current = False
         if step.graph is not None:
-            self._move(step.graph)
+            self.graph = step.graph
+            self.is_current = False
         if self.is_current:
             return []
         self.times = Times.at(step.scan.index, step.scan.stamp_ns)
@@ -44,8 +45,8 @@ class KeyframeGraph:
 
     def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[Message]:
         """The final graph with every closure tried; drawn at the last scan."""
-        self.closures = list(closures)
-        self._move(graph)
+        self.closures, self.graph = list(closures), graph
+        self.is_current = False
         return self.draw()
 
     def draw(self) -> list[Message]:
@@ -54,26 +55,17 @@ class KeyframeGraph:
             return []
         self.drawn, self.is_current = len(self.positions), True
         nodes = np.array(self.positions)
+        if self.graph is not None:
+            nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
         accepted = [closure for closure in self.closures if closure.verdict is Verdict.ACCEPTED]
         rejected = [closure for closure in self.closures if closure.verdict is Verdict.REJECTED]
-        colours = [self._colour(closure) for closure in accepted]
+        colours = _colours(accepted, self.graph)
         return [
             Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), self.times),
             self._strips(entities.ODOMETRY_EDGES, nodes[None]),
             self._strips(entities.ACCEPTED, _edges(nodes, accepted), colours),
             self._strips(entities.REJECTED, _edges(nodes, rejected)),
         ]
-
-    def _move(self, graph: GraphState) -> None:
-        self.positions[: len(graph.poses)] = list(shapes.positions(graph.poses))
-        for (i, j), is_loop, weight in zip(graph.edges, graph.is_loop, graph.weight, strict=True):
-            if is_loop:
-                self.weight[int(i), int(j)] = float(weight)
-        self.is_current = False
-
-    def _colour(self, closure: Closure) -> tuple[int, int, int]:
-        weight = self.weight.get((closure.target, closure.source), 1.0)
-        return entities.GREEN if weight >= _DOUBT else entities.ORANGE
 
     def _strips(
         self, entity: str, strips: NDArray[np.float32], colours: Sequence[tuple[int, int, int]] = ()
@@ -88,3 +80,13 @@ def _edges(nodes: NDArray[np.float32], closures: list[Closure]) -> NDArray[np.fl
     """Line strips (E, 2, 3) between the keyframes of closures."""
     pairs = np.array([(closure.target, closure.source) for closure in closures], np.int64).reshape(-1, 2)
     return nodes[pairs]
+
+
+def _colours(closures: list[Closure], graph: GraphState | None) -> list[tuple[int, int, int]]:
+    """Green, or amber where the optimiser left an edge less than half of its weight."""
+    if graph is None:
+        return [entities.GREEN] * len(closures)
+    pairs, weights = graph.edges[graph.is_loop].tolist(), graph.weight[graph.is_loop].tolist()
+    weight = {(i, j): w for (i, j), w in zip(pairs, weights, strict=True)}
+    doubted = [weight.get((closure.target, closure.source), 1.0) < _DOUBT for closure in closures]
+    return [entities.ORANGE if doubt else entities.GREEN for doubt in doubted]

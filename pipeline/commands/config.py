@@ -23,7 +23,7 @@ _LIDAR = click.option(
 
 @click.group()
 def config() -> None:
-    r"""Show the configuration: every key with unit and range.
+    """Show the configuration: every key with unit and range.
 
     \b
     Examples:
@@ -40,7 +40,7 @@ def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @_effective
 def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bool) -> None:
-    r"""Print every key with its value, unit, range and default.
+    """Print every key with its value, unit, range and default.
 
     \b
     Examples:
@@ -53,7 +53,13 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
     if as_json:
         keys = config_keys().values()
         rows = [
-            {"key": k.name, "value": _plain(values[k.name]), "unit": k.unit, "range": k.range, "default": _plain(k.default)}
+            {
+                "key": k.name,
+                "value": _plain(values[k.name]),
+                "unit": k.unit,
+                "range": k.range,
+                "default": _plain(k.default),
+            }
             for k in keys
         ]
         click.echo(json.dumps(rows, indent=2))
@@ -71,7 +77,7 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
 @config.command("dump", cls=OverrideCommand)
 @_effective
 def dump_settings(ctx: click.Context, config: Path | None, lidar: str | None) -> None:
-    r"""Print the effective configuration as TOML, to be edited and given back with --config.
+    """Print the effective configuration as TOML, to be edited and given back with --config.
 
     \b
     Examples:
@@ -87,7 +93,9 @@ def _settings(ctx: click.Context, file: Path | None, lidar: str | None) -> Setti
 
 
 def _text(value: Value) -> str:
-    return str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else f"{value:g}"
+    return (
+        str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else f"{value:g}"
+    )
 
 
 def _plain(value: Value) -> Value | None:

@@ -45,7 +45,7 @@ def evaluate(
     kitti: bool,
     as_json: bool,
 ) -> None:
-    r"""Print ATE, RPE, the KITTI metric and the error over relations, each with its definition.
+    """Print ATE, RPE, the KITTI metric and the error over relations, each with its definition.
 
     Give the ground truth, or --relations, or both.
 

@@ -3,23 +3,51 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from pipeline.logs.info import LogInfo
 
 
 @click.command()
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def info(logs: tuple[Path, ...], as_json: bool) -> None:
-    r"""Print what is in a log: topics, types, rates, and what a run would use.
+    """Print what is in a log: topics, types, rates, and what a run would use.
 
     \b
     Examples:
       scanchain info log.mcap
       scanchain info part_0.mcap part_1.mcap --json
     """
-    from pipeline.logs import describe
+    from pipeline.logs.info import describe
 
     description = describe(logs)
-    click.echo(json.dumps(asdict(description), indent=2) if as_json else description)
+    click.echo(json.dumps(asdict(description), indent=2) if as_json else _text(description))
+
+
+def _text(log: LogInfo) -> str:
+    start = datetime.fromtimestamp(log.start_ns * 1e-9, UTC).isoformat(sep=" ", timespec="milliseconds")
+    lines = [
+        f"files     {', '.join(log.files)} ({log.size_bytes / 1e6:.1f} MB)",
+        f"time      {log.duration_s:.1f} s from {start}",
+    ]
+    width = max((len(topic.topic) for topic in log.topics), default=0)
+    for topic in log.topics:
+        name = f"{topic.topic:<{width}}  {topic.type_name or 'no schema':<28}"
+        lines.append(f"topic     {name}  {topic.messages:>8,} messages  {topic.rate_hz:7.1f} Hz  {topic.encoding}")
+    if log.lidar:
+        x, y = (row[-1] for row in log.T_base_lidar[:2])
+        lines += [
+            f"lidar     {log.lidar}: {log.dimension}D, {log.scans:,} scans",
+            f"mounting  at x {x:.3f} m, y {y:.3f} m on the base",
+            f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
+        ]
+    lines += [f"note      {note}" for note in log.notes]
+    lines += [f"damage    {line}" for line in log.damage]
+    return "\n".join([*lines, *([f"problem   {log.problem}"] if log.problem else [])])

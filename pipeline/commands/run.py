@@ -14,14 +14,15 @@ from pipeline.settings import Override
 
 if TYPE_CHECKING:
     from pipeline.recorder import SinkName, Viewing
-    from pipeline.run import Job
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make.")
+@click.option(
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make."
+)
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file instead of the preset.")
 @click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
 @click.option(
@@ -31,7 +32,9 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@click.option("--start", metavar="SECONDS", help="Leave out what comes before, counted from the log's first message.")
+@click.option(
+    "--start", metavar="SECONDS", help="Leave out what comes before, counted from the log's first message."
+)
 @click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
 @click.option("--every", metavar="N", help="Take every N-th scan.")
 @click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
@@ -51,7 +54,7 @@ def run(
     as_json: bool,
     **shortcuts: str | bool | None,
 ) -> None:
-    r"""Make a trajectory, a map and a recording of a log.
+    """Make a trajectory, a map and a recording of a log.
 
     LOG is an MCAP file; several are read as one log. Any key of the configuration is a flag, see scanchain config
     show.

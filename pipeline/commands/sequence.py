@@ -10,7 +10,7 @@ import click
 
 @click.group()
 def sequence() -> None:
-    r"""Logs that are known by name: simulated ones and published ones.
+    """Logs that are known by name: simulated ones and published ones.
 
     \b
     Examples:
@@ -22,7 +22,7 @@ def sequence() -> None:
 @sequence.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_sequences(as_json: bool) -> None:
-    r"""List the catalogue.
+    """List the catalogue.
 
     \b
     Examples:
@@ -46,12 +46,17 @@ def list_sequences(as_json: bool) -> None:
 @sequence.command("get")
 @click.argument("name", metavar="NAME")
 @click.option(
-    "--out", default=Path("logs"), show_default=True, metavar="DIR", type=click.Path(path_type=Path), help="Where to."
+    "--out",
+    default=Path("logs"),
+    show_default=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Where to.",
 )
 @click.option("--force", is_flag=True, help="Make it again even if it is there.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
-    r"""Make a log of the catalogue, unless it is there already, and print where it lies.
+    """Make a log of the catalogue, unless it is there already, and print where it lies.
 
     \b
     Examples:

@@ -28,7 +28,7 @@ def simulate(
     dropout: float | None,
     force: bool,
 ) -> None:
-    r"""Write a synthetic log with exact ground truth, and the truth beside it as .tum.
+    """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
 
     WORLD is office (2D laser scanner) or town (3D lidar).
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.pass_context
 def view(ctx: click.Context, directory: Path, web: bool) -> None:
-    r"""Open the recording of a run in the rerun viewer.
+    """Open the recording of a run in the rerun viewer.
 
     DIR is a run directory, or a .rrd file.
 

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Set as AbstractSet
+from io import BytesIO
+from typing import NamedTuple
 
 import lz4.frame
 import zstandard
 
-from pipeline.logs.index import (
-    CHANNEL,
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD,
-    SCHEMA,
-    Block,
-    Channel,
-    FileIndex,
-    read_channel,
-    read_schema,
-)
+from pipeline.logs.records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD, SCHEMA, Block, Channel, FileIndex
 
 
 class DamagedBlockError(Exception):
     """A block whose contents cannot be trusted; the message says which and why."""
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """One message: its channel, when it was logged, and its bytes."""
 
     channel: Channel
@@ -35,58 +26,94 @@ class Message:
     data: memoryview
 
 
-def read_block(index: FileIndex, block: Block) -> list[Message]:
-    """All messages of a block, in the order of the file; channels met on the way join the index.
+class Contents(NamedTuple):
+    """The messages of a block in the order of the file; ``damage`` says what is missing behind them, if anything."""
 
-    Raises DamagedBlockError where the block does not unpack to what its header says.
+    messages: list[Message]
+    damage: str
+
+
+def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
+    """The messages of a block, of all channels or of those wanted; channels met on the way join the index.
+
+    Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
-    payload = memoryview(_unpack(index, block))
+    payload = memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
     messages: list[Message] = []
-    offset, end = 0, len(payload)
-    while offset + RECORD.size <= end:
-        opcode, length = RECORD.unpack_from(payload, offset)
-        offset += RECORD.size
-        if offset + length > end:
-            raise DamagedBlockError(f"{_name(index, block)}: a record reaches beyond the end of it")
-        if opcode == MESSAGE:
-            number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, offset)
-            channel = index.channels.get(number)
-            if channel is None:
-                raise DamagedBlockError(f"{_name(index, block)}: a message names channel {number}, which is unknown")
-            messages.append(
-                Message(channel, log_time_ns, payload[offset + MESSAGE_HEAD.size : offset + length])
-            )
-        elif opcode == SCHEMA:
-            number, name, encoding = read_schema(payload, offset)
-            index.schemas.setdefault(number, (name, encoding))
-        elif opcode == CHANNEL:
-            number, channel = read_channel(payload, offset, index.number, index.schemas)
-            index.channels.setdefault(number, channel)
-        offset += length
-    return messages
-
-
-def _unpack(index: FileIndex, block: Block) -> bytes:
-    stored = index.data[block.offset : block.offset + block.size]
+    offset, end, strangers = 0, len(payload), 0
     try:
-        if block.compression == "zstd":
-            payload = zstandard.ZstdDecompressor().decompress(stored, max_output_size=block.uncompressed_size)
+        while offset + RECORD.size <= end:
+            opcode, length = RECORD.unpack_from(payload, offset)
+            offset += RECORD.size
+            if offset + length > end:
+                break
+            if opcode == MESSAGE:
+                number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, offset)
+                if wanted is None or number in wanted:
+                    channel = index.channels.get(number)
+                    if channel is None:
+                        strangers += 1
+                    else:
+                        body = payload[offset + MESSAGE_HEAD.size : offset + length]
+                        messages.append(Message(channel, log_time_ns, body))
+            elif opcode == SCHEMA:
+                index.add_schema(payload, offset)
+            elif opcode == CHANNEL:
+                index.add_channel(payload, offset)
+            offset += length
+    except (struct.error, UnicodeDecodeError):
+        return Contents(messages, f"{_name(index, block)}: a record in it is malformed; what follows was left out")
+    if strangers:
+        return Contents(messages, f"{_name(index, block)}: {strangers} messages name a channel that nothing defines")
+    if offset != end and not block.is_cut:
+        return Contents(messages, f"{_name(index, block)}: its last record reaches beyond its end")
+    return Contents(messages, "")
+
+
+def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
+    stored = memoryview(index.data)[block.offset : block.offset + block.size]
+    size = block.uncompressed_size
+    try:
+        if not size:
+            payload = b""
+        elif block.compression == "zstd":
+            if zstandard.frame_content_size(stored) not in (-1, size):
+                raise DamagedBlockError(f"{_name(index, block)}: lies about the size it unpacks to")
+            payload = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
         elif block.compression == "lz4":
-            payload = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=block.uncompressed_size)
+            payload = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
         elif block.compression == "":
             payload = stored
         else:
-            raise DamagedBlockError(f"{_name(index, block)}: compression {block.compression!r} is not known")
-    except (zstandard.ZstdError, RuntimeError) as error:
-        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({error})") from error
-    if len(payload) != block.uncompressed_size:
-        raise DamagedBlockError(
-            f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {block.uncompressed_size}"
-        )
+            raise DamagedBlockError(
+                f"{_name(index, block)}: compression {block.compression!r} is not known (none, lz4 and zstd are)"
+            )
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError) as error:
+        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({_one_line(error)})") from error
+    if len(payload) != size:
+        raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
     if block.crc and zlib.crc32(payload) != block.crc:
         raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
     return payload
 
 
+def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
+    """As much as the beginning of a chunk unpacks to; nothing of it has been checked."""
+    stored = memoryview(index.data)[block.offset : block.offset + block.size]
+    try:
+        if block.compression == "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:
+                return reader.read(block.uncompressed_size)
+        if block.compression == "lz4":
+            return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=block.uncompressed_size)
+    except (zstandard.ZstdError, RuntimeError, EOFError):
+        return b""
+    return stored if block.compression == "" else b""
+
+
 def _name(index: FileIndex, block: Block) -> str:
-    return f"{index.path}: the chunk at byte {block.offset}"
+    return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

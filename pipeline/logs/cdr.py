@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ class MalformedMessageError(Exception):
 class CdrReader:
     """Reads one message from front to back."""
 
+    __slots__ = ("data", "offset", "order")
+
     def __init__(self, data: memoryview) -> None:
         if len(data) < 4:
             raise MalformedMessageError(f"{len(data)} bytes are too few for a CDR header")
@@ -24,13 +27,12 @@ class CdrReader:
 
     def numbers(self, code: str, count: int = 1) -> tuple[int, ...] | tuple[float, ...]:
         """``count`` numbers of one struct code."""
-        size = struct.calcsize(code)
-        self._align(size)
-        end = self.offset + size * count
-        self._need(end)
-        values = struct.unpack_from(f"{self.order}{count}{code}", self.data, self.offset)
-        self.offset = end
-        return values
+        layout, size = _layout(self.order, code, count)
+        begin = self.offset + (4 - self.offset) % size
+        self.offset = begin + layout.size
+        if self.offset > len(self.data):
+            self._complain(self.offset)
+        return layout.unpack_from(self.data, begin)
 
     def integer(self, code: str = "I") -> int:
         """One whole number."""
@@ -39,11 +41,12 @@ class CdrReader:
     def array(self, dtype: str) -> NDArray[np.generic]:
         """A sequence of numbers, as a view of the message."""
         count = self.integer()
-        kind = np.dtype(self.order + dtype)
+        kind = _dtype(self.order, dtype)
         if count:
-            self._align(kind.itemsize)
+            self.offset += (4 - self.offset) % kind.itemsize
         end = self.offset + kind.itemsize * count
-        self._need(end)
+        if end > len(self.data):
+            self._complain(end)
         values = np.frombuffer(self.data, kind, count, self.offset)
         self.offset = end
         return values
@@ -52,14 +55,15 @@ class CdrReader:
         """A string's or byte sequence's contents, a string's final zero included."""
         count = self.integer()
         end = self.offset + count
-        self._need(end)
+        if end > len(self.data):
+            self._complain(end)
         octets = self.data[self.offset : end]
         self.offset = end
         return octets
 
     def string(self) -> str:
         """A string without its final zero."""
-        return bytes(self.octets()).rstrip(b"\0").decode("utf-8", "replace")
+        return str(self.octets(), "utf-8", "replace").rstrip("\0")
 
     def header(self) -> tuple[int, str]:
         """The stamp in nanoseconds and the frame of a std_msgs/Header."""
@@ -67,9 +71,15 @@ class CdrReader:
         nanoseconds = self.integer("I")
         return seconds * 1_000_000_000 + nanoseconds, self.string()
 
-    def _align(self, size: int) -> None:
-        self.offset += -(self.offset - 4) % size
+    def _complain(self, end: int) -> None:
+        raise MalformedMessageError(f"it has {len(self.data)} bytes, but its fields reach to byte {end}")
 
-    def _need(self, end: int) -> None:
-        if end > len(self.data):
-            raise MalformedMessageError(f"{len(self.data)} bytes, but its fields reach to byte {end}")
+
+@cache
+def _layout(order: str, code: str, count: int) -> tuple[struct.Struct, int]:
+    return struct.Struct(f"{order}{count}{code}"), struct.calcsize(f"={code}")
+
+
+@cache
+def _dtype(order: str, code: str) -> np.dtype[np.generic]:
+    return np.dtype(order + code)

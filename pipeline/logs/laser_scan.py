@@ -2,61 +2,105 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import RawPoints
 from pipeline.logs.cdr import CdrReader
-from pipeline.logs.limits import RangeLimits
+from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
+
+_MOST_GEOMETRIES = 16
+_NEAREST_M = float(np.finfo(np.float32).tiny)
+_FARTHEST_M = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True, slots=True)
-class Returns:
-    """The valid returns of one scan message.
-
-    ``points`` (N, d) float32 metres, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` says for what.
-    """
+class LaserScanMessage(NamedTuple):
+    """A sensor_msgs/LaserScan as it is: radians, seconds, metres; intensities are passed over."""
 
     stamp_ns: int
     frame: str
-    points: RawPoints
+    first_rad: float
+    last_rad: float
+    step_rad: float
+    beam_s: float
+    scan_s: float
+    range_min_m: float
+    range_max_m: float
+    ranges_m: NDArray[np.float32]
+
+
+def read_laser_scan(data: memoryview) -> LaserScanMessage:
+    """Take a message apart; the ranges are a view of it."""
+    reader = CdrReader(data)
+    stamp_ns, frame = reader.header()
+    numbers = reader.numbers("f", 7)
+    return LaserScanMessage(stamp_ns, frame, *numbers, reader.array("f4"))  # pyright: ignore[reportArgumentType]
+
+
+class Geometry(NamedTuple):
+    """Directions (N, 2) of the beams and their times (N,) after the stamp, (0,) where they are simultaneous."""
+
+    directions: NDArray[np.float32]
     times_s: NDArray[np.float32]
-    dropped: int
-    why: str
 
 
 class LaserScanDecoder:
-    """Decodes the scans of one channel; directions are computed once for each geometry."""
-
-    dimension = 2
+    """Decodes scans; directions are computed once for each geometry and shared, also between threads."""
 
     def __init__(self, limits: RangeLimits) -> None:
         self.limits = limits
-        self.geometry: tuple[float, float, int] = (0.0, 0.0, -1)
-        self.directions = np.empty((0, 2), np.float32)
+        self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
 
     def decode(self, data: memoryview) -> Returns:
-        """Points of the beams that came back: finite, above range_min, below range_max.
+        """Points of the beams that came back: finite, at least range_min, below range_max.
 
-        Scanners write range_max, or more, for a beam without return, and zero for an invalid one; a range_max of
-        zero is taken as unknown. Negative angle increments are as good as positive ones.
+        Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
+        not positive are taken as unknown. Negative angle increments are as good as positive ones.
         """
-        reader = CdrReader(data)
-        stamp_ns, frame = reader.header()
-        first_rad, _, step_rad, beam_s, _, range_min_m, range_max_m = reader.numbers("f", 7)
-        ranges_m = reader.array("f4")
-        count = len(ranges_m)
-        if self.geometry != (first_rad, step_rad, count):
-            angles = first_rad + step_rad * np.arange(count)
-            self.directions = np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
-            self.geometry = (first_rad, step_rad, count)
-        low_m = max(range_min_m, self.limits.min_m)
-        high_m = min(range_max_m if range_max_m > 0.0 else np.inf, self.limits.max_m)
-        valid = np.flatnonzero((ranges_m > low_m) & (ranges_m < high_m))
-        points = self.directions[valid] * ranges_m[valid, None].astype(np.float32)
-        times_s = (valid * beam_s).astype(np.float32) if beam_s else np.empty(0, np.float32)
-        why = f"{count} beams, none between {low_m:g} and {high_m:g} m" if not len(valid) else ""
-        return Returns(stamp_ns, frame, points, times_s, count - len(valid), why)
+        message = read_laser_scan(data)
+        ranges_m = message.ranges_m
+        low_m, high_m = self._limits(message)
+        geometry = self._geometry(message)
+        valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
+        if len(valid) == len(ranges_m):
+            points = geometry.directions * ranges_m[:, None]
+            times_s = geometry.times_s
+        else:
+            points = geometry.directions[valid] * ranges_m[valid, None]
+            times_s = geometry.times_s[valid] if len(geometry.times_s) else NO_TIMES
+        points = points.astype(np.float32, copy=False)
+        why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
+        return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
+
+    def _limits(self, message: LaserScanMessage) -> tuple[float, float]:
+        low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
+        high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
+        return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)
+
+    def _geometry(self, message: LaserScanMessage) -> Geometry:
+        key = (message.first_rad, message.step_rad, message.beam_s, len(message.ranges_m))
+        geometry = self.geometries.get(key)
+        if geometry is None:
+            if len(self.geometries) >= _MOST_GEOMETRIES:
+                self.geometries = {}
+            geometry = self.geometries[key] = _geometry(*key)
+        return geometry
+
+
+def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:
+    angles_rad = first_rad + step_rad * np.arange(count)
+    directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
+    times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES
+    times_s.flags.writeable = False
+    return Geometry(directions, times_s)
+
+
+def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
+    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
+    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
+    far = len(ranges_m) - undefined - near
+    return (
+        f"of {len(ranges_m)} beams {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
+        f"{far} are at {high_m:.3g} m or beyond"
+    )

@@ -1,6 +1,13 @@
-"""How near and how far a return may be to be taken from the log."""
+"""How near and how far a return may be to be taken from the log, and what is left of a message then."""
+
+from __future__ import annotations
 
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import RawPoints
 
 
 class RangeLimits(NamedTuple):
@@ -8,3 +15,21 @@ class RangeLimits(NamedTuple):
 
     min_m: float
     max_m: float
+
+
+class Returns(NamedTuple):
+    """The valid returns of one scan message.
+
+    ``points`` (N, d) float32 metres, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
+    counts what was left out, ``why`` says for what where nothing is left.
+    """
+
+    stamp_ns: int
+    points: RawPoints
+    times_s: NDArray[np.float32]
+    dropped: int
+    why: str
+
+
+NO_TIMES = np.empty(0, np.float32)
+NO_TIMES.flags.writeable = False

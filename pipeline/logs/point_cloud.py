@@ -2,21 +2,67 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.laser_scan import Returns
-from pipeline.logs.limits import RangeLimits
+from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
 from pipeline.logs.point_times import NAMES, seconds_after
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+_MOST_LAYOUTS = 64
+_MOST_FIELDS = 1024
+_SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
+class PointField(NamedTuple):
+    """A sensor_msgs/PointField: where in a point a number lies, and of which type it is."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+class PointCloudMessage(NamedTuple):
+    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes that say how a point is laid out."""
+
+    stamp_ns: int
+    frame: str
+    height: int
+    width: int
+    fields: list[PointField]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: memoryview
+    described: bytes
+
+
+def read_point_cloud(data: memoryview) -> PointCloudMessage:
+    """Take a message apart; the points are a view of it."""
+    reader = CdrReader(data)
+    stamp_ns, frame = reader.header()
+    height, width = reader.integer(), reader.integer()
+    begin = reader.offset
+    count = reader.integer()
+    if count > _MOST_FIELDS:
+        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are believed")
+    fields = [
+        PointField(reader.string(), reader.integer(), reader.integer("B"), reader.integer()) for _ in range(count)
+    ]
+    is_bigendian = bool(reader.integer("B"))
+    point_step = reader.integer()
+    described = bytes(data[begin : reader.offset])
+    row_step = reader.integer()
+    return PointCloudMessage(
+        stamp_ns, frame, height, width, fields, is_bigendian, point_step, row_step, reader.octets(), described
+    )
+
+
+class Layout(NamedTuple):
     """Where a channel keeps its fields: a structured type, and the name of the time field, if any."""
 
     point: np.dtype[np.void]
@@ -24,111 +70,94 @@ class Layout:
 
 
 class PointCloudDecoder:
-    """Decodes the clouds of one channel; field offsets are worked out once for each layout."""
-
-    dimension = 3
+    """Decodes clouds; the place of the fields is worked out once for each layout."""
 
     def __init__(self, limits: RangeLimits) -> None:
         self.limits = limits
-        self.layouts: dict[tuple[bytes, bool, int], Layout] = {}
+        self.layouts: dict[bytes, Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
         """Points that came back: finite, not the origin, within the limits; their times with them.
 
-        Rows may be padded, bytes in either order, x y z of any number type, other fields are passed over.
+        Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
         """
-        reader = CdrReader(data)
-        stamp_ns, frame = reader.header()
-        height, width = reader.integer(), reader.integer()
-        begin = reader.offset
-        fields = [self._field(reader) for _ in range(reader.integer())]
-        described = bytes(data[begin : reader.offset])
-        big_endian = bool(reader.integer("B"))
-        point_step, row_step = reader.integer(), reader.integer()
-        body = reader.octets()
-        key = (described, big_endian, point_step)
-        layout = self.layouts.get(key)
+        message = read_point_cloud(data)
+        layout = self.layouts.get(message.described)
         if layout is None:
-            layout = self.layouts[key] = _layout(fields, big_endian, point_step)
-        cloud = _rows(body, layout.point, height, width, row_step)
-        return self._filter(cloud, layout, stamp_ns, frame)
+            if len(self.layouts) >= _MOST_LAYOUTS:
+                self.layouts = {}
+            layout = self.layouts[message.described] = _layout(message)
+        return self._filter(message, layout, _rows(message, layout.point))
 
-    def _filter(self, cloud: NDArray[np.void], layout: Layout, stamp_ns: int, frame: str) -> Returns:
+    def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
         points = np.empty((len(cloud), 3), np.float32)
-        for axis, name in enumerate("xyz"):
-            points[:, axis] = cloud[name]
-        square = np.einsum("ij,ij->i", points, points)
-        low, high = self.limits.min_m**2, self.limits.max_m**2
-        valid = (square > low) & (square < min(high, np.finfo(np.float32).max))
-        times_s = seconds_after(stamp_ns, cloud[layout.time]) if layout.time else np.empty(0, np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for axis, name in enumerate("xyz"):
+                points[:, axis] = cloud[name]
+            square = np.einsum("ij,ij->i", points, points)
+        high = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
+        valid = (square > self.limits.min_m**2) & (square <= high)
         kept = int(np.count_nonzero(valid))
+        raw_times = cloud[layout.time] if layout.time else NO_TIMES
         if kept < len(cloud):
             points = points[valid]
-            times_s = times_s[valid] if layout.time else times_s
-        why = "" if kept else _why_none(cloud, square)
-        return Returns(stamp_ns, frame, points, times_s, len(cloud) - kept, why)
-
-    @staticmethod
-    def _field(reader: CdrReader) -> tuple[str, int, int, int]:
-        """Name, offset, data type and count of a sensor_msgs/PointField."""
-        name = reader.string()
-        return name, reader.integer(), reader.integer("B"), reader.integer()
+            raw_times = raw_times[valid] if layout.time else NO_TIMES
+        times_s = seconds_after(message.stamp_ns, raw_times) if layout.time else NO_TIMES
+        why = "" if kept else _why_none(square)
+        return Returns(message.stamp_ns, points, times_s, len(cloud) - kept, why)
 
 
-def _layout(fields: list[tuple[str, int, int, int]], big_endian: bool, point_step: int) -> Layout:
+def _layout(message: PointCloudMessage) -> Layout:
     wanted: dict[str, tuple[str, int]] = {}
-    order = ">" if big_endian else "<"
-    for name, offset, kind, _ in fields:
-        if name not in ("x", "y", "z", *NAMES):
+    for field in message.fields:
+        if field.name not in ("x", "y", "z", *NAMES):
             continue
-        if kind not in _FORMATS:
-            raise MalformedMessageError(f"field {name} has data type {kind}; PointField knows 1 to 8")
-        number = np.dtype(order + _FORMATS[kind])
-        if offset + number.itemsize > point_step:
+        if field.datatype not in _FORMATS:
+            raise MalformedMessageError(f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8")
+        number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+        if field.offset + number.itemsize > message.point_step:
             raise MalformedMessageError(
-                f"field {name} reaches to byte {offset + number.itemsize} of a point, beyond point_step {point_step}"
+                f"field {field.name} reaches to byte {field.offset + number.itemsize} of a point, "
+                f"beyond point_step {message.point_step}"
             )
-        wanted[name] = (number.str, offset)
+        wanted[field.name] = (number.str, field.offset)
     missing = [name for name in "xyz" if name not in wanted]
     if missing:
-        names = ", ".join(field[0] for field in fields) or "none"
-        raise MalformedMessageError(f"the cloud has no field {' '.join(missing)} (it has {names})")
+        names = ", ".join(field.name for field in message.fields) or "none"
+        raise MalformedMessageError(f"the cloud has no field {' '.join(missing)} (it has: {names})")
     time = next((name for name in NAMES if name in wanted), "")
     chosen = ["x", "y", "z", time] if time else ["x", "y", "z"]
     point = np.dtype({
         "names": chosen,
         "formats": [wanted[name][0] for name in chosen],
         "offsets": [wanted[name][1] for name in chosen],
-        "itemsize": point_step,
+        "itemsize": message.point_step,
     })  # fmt: skip
     return Layout(point, time)
 
 
-def _rows(
-    body: memoryview, point: np.dtype[np.void], height: int, width: int, row_step: int
-) -> NDArray[np.void]:
+def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.void]:
     """All points of all rows, the padding behind each row left out."""
+    height, width, body = message.height, message.width, message.data
     row = width * point.itemsize
-    stride = row_step if height > 1 else row
+    stride = message.row_step if height > 1 else row
+    if stride < row:
+        raise MalformedMessageError(f"row_step {stride} is less than the {row} bytes of {width} points")
     needed = (height - 1) * stride + row if height and width else 0
-    if len(body) < needed or stride < row:
+    if len(body) < needed:
         raise MalformedMessageError(
             f"data has {len(body)} bytes, fewer than the {needed} of {height} × {width} points of {point.itemsize} bytes"
-            if stride >= row
-            else f"row_step {row_step} is less than the {row} bytes of {width} points"
         )
-    if height <= 1 or stride == row:
+    if not needed or stride == row:
         return np.frombuffer(body, point, height * width)
-    rows = [np.frombuffer(body, point, width, number * stride) for number in range(height)]
-    return np.concatenate(rows)
+    rows = np.ndarray((height, width), point, body, strides=(stride, point.itemsize))
+    return rows.reshape(-1)
 
 
-def _why_none(cloud: NDArray[np.void], square: NDArray[np.float32]) -> str:
-    if not len(cloud):
+def _why_none(square: NDArray[np.float32]) -> str:
+    if not len(square):
         return "the cloud is empty"
     undefined = int(np.count_nonzero(~np.isfinite(square)))
     zero = int(np.count_nonzero(square == 0.0))
-    outside = len(cloud) - undefined - zero
-    return f"of {len(cloud)} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"
-
-
+    outside = len(square) - undefined - zero
+    return f"of {len(square)} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"

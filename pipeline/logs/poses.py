@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from math import isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,10 +12,11 @@ from pipeline import lie
 from pipeline.data import Pose
 from pipeline.logs.cdr import CdrReader, MalformedMessageError
 
+_MOST_TRANSFORMS = 65536
 
-@dataclass(frozen=True, slots=True)
-class StampedPose:
-    """A pose (4, 4) of ``child`` in ``parent`` at an instant."""
+
+class StampedPose(NamedTuple):
+    """A pose of ``child`` in ``parent`` at an instant, (4, 4), or (3, 3) for a planar log."""
 
     stamp_ns: int
     parent: str
@@ -22,35 +24,39 @@ class StampedPose:
     T_parent_child: Pose
 
 
-def decode_odometry(data: memoryview) -> StampedPose:
-    """The pose of a nav_msgs/Odometry; twist and covariances are passed over."""
+def decode_odometry(data: memoryview, dimension: int = 3) -> StampedPose:
+    """The pose of a nav_msgs/Odometry, flattened for dimension 2; twist and covariances are passed over."""
     reader = CdrReader(data)
     stamp_ns, parent = reader.header()
     child = reader.string()
-    return StampedPose(stamp_ns, parent, child, _pose(reader))
+    return StampedPose(stamp_ns, parent, child, _pose(reader, dimension))
 
 
 def decode_transforms(data: memoryview) -> list[StampedPose]:
     """All transforms of a tf2_msgs/TFMessage."""
     reader = CdrReader(data)
     transforms = []
-    for _ in range(reader.integer()):
+    count = reader.integer()
+    if count > _MOST_TRANSFORMS:
+        raise MalformedMessageError(f"it claims {count} transforms; at most {_MOST_TRANSFORMS} are believed")
+    for _ in range(count):
         stamp_ns, parent = reader.header()
         child = reader.string()
-        transforms.append(StampedPose(stamp_ns, parent, child, _pose(reader)))
+        transforms.append(StampedPose(stamp_ns, parent, child, _pose(reader, 3)))
     return transforms
 
 
 def chain(transforms: list[StampedPose], target: str, source: str) -> Pose | None:
     """T_target_source (4, 4) through the tree of transforms, None where no path joins the two frames."""
-    if target.lstrip("/") == source.lstrip("/"):
+    target, source = target.lstrip("/"), source.lstrip("/")
+    if target == source:
         return np.eye(4)
     steps: dict[str, list[tuple[str, Pose]]] = {}
     for step in transforms:
         parent, child = step.parent.lstrip("/"), step.child.lstrip("/")
         steps.setdefault(child, []).append((parent, step.T_parent_child))
         steps.setdefault(parent, []).append((child, lie.inverse(step.T_parent_child)))
-    reached = {source.lstrip("/"): np.eye(4)}
+    reached = {source: np.eye(4)}
     queue = deque(reached)
     while queue:
         frame = queue.popleft()
@@ -58,20 +64,23 @@ def chain(transforms: list[StampedPose], target: str, source: str) -> Pose | Non
             if following not in reached:
                 reached[following] = T @ reached[frame]
                 queue.append(following)
-    return reached.get(target.lstrip("/"))
+    return reached.get(target)
 
 
-def _pose(reader: CdrReader) -> Pose:
-    values = np.array(reader.numbers("d", 7))
-    norm = np.linalg.norm(values[3:])
-    if not np.isfinite(values).all() or norm < 1e-6:
-        raise MalformedMessageError("a pose is not finite, or its quaternion is zero")
-    T = np.eye(4)
-    x, y, z, w = values[3:] / norm
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = values[:3]
-    return T
+def _pose(reader: CdrReader, dimension: int) -> Pose:
+    x_m, y_m, z_m, x, y, z, w = reader.numbers("d", 7)
+    square = x * x + y * y + z * z + w * w
+    if not (isfinite(x_m + y_m + z_m) and isfinite(square) and square > 1e-12):
+        raise MalformedMessageError("its pose is not finite, or the quaternion is zero")
+    if dimension == 2:
+        cosine, sine = w * w + x * x - y * y - z * z, 2.0 * (x * y + z * w)
+        norm = sqrt(cosine * cosine + sine * sine) or 1.0
+        cosine, sine = cosine / norm, sine / norm
+        return np.array([[cosine, -sine, x_m], [sine, cosine, y_m], [0.0, 0.0, 1.0]])
+    s = 2.0 / square
+    return np.array([
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w), x_m],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w), y_m],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y), z_m],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip

@@ -1,0 +1,52 @@
+"""Which channels a file has and how many messages of each, opening only the chunks that must be opened."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.logs.blocks import DamagedBlockError, Message, read_block
+from pipeline.logs.records import Block, FileIndex
+
+
+def complete(index: FileIndex) -> None:
+    """Learn the channels and counts that a file without a full summary keeps inside its chunks."""
+    needed = set(index.counts) | {entry.channel for block in index.blocks for entry in block.entries}
+    unknown = {number for number in needed if not index.knows(number)}
+    counts: Counter[int] = Counter()
+    for block in index.blocks:
+        for entry in block.entries:
+            counts[entry.channel] += entry.count
+        if block.entries and not unknown & {entry.channel for entry in block.entries}:
+            continue
+        if not block.entries and index.is_counted and not unknown:
+            continue
+        messages = messages_of(index, block)
+        if not block.entries:
+            counts.update(message.channel.key[1] for message in messages)
+        unknown = {number for number in unknown if not index.knows(number)}
+    if not index.is_counted:
+        index.counts = dict(counts)
+        index.is_counted = True
+
+
+def messages_of(index: FileIndex, block: Block) -> list[Message]:
+    """The messages of a block, none where it is damaged: the stream of scans will tell of that."""
+    try:
+        return read_block(index, block).messages
+    except DamagedBlockError:
+        return []
+
+
+def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64]:
+    """Log times of a channel's messages in a block, from the message index where there is one."""
+    for entry in block.entries:
+        if entry.channel == channel and entry.offset >= 0:
+            return np.frombuffer(index.data, "<u8", 2 * entry.count, entry.offset)[::2]
+    if block.entries and all(entry.channel != channel for entry in block.entries):
+        return np.empty(0, np.uint64)
+    messages = messages_of(index, block)
+    times = [message.log_time_ns for message in messages if message.channel.key[1] == channel]
+    return np.array(times, np.uint64)

@@ -1,0 +1,92 @@
+"""What is in a log, before anything is read of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.config import LogConfig
+from pipeline.errors import InputError
+from pipeline.logs.index import FileIndex, index_file
+from pipeline.logs.log import Log, open_log
+from pipeline.logs.topics import kind
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """A topic: its message type, how it is encoded, how many messages there are and how often they come."""
+
+    topic: str
+    type_name: str
+    encoding: str
+    messages: int
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class LogInfo:
+    """A log: its files and topics, what a run would take of it, and what is wrong with it.
+
+    ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
+    nanoseconds; ``T_base_lidar`` row by row.
+    """
+
+    files: tuple[str, ...]
+    size_bytes: int
+    start_ns: int
+    duration_s: float
+    topics: tuple[TopicInfo, ...]
+    lidar: str
+    dimension: int
+    scans: int
+    odometry: str
+    T_base_lidar: tuple[tuple[float, ...], ...]
+    notes: tuple[str, ...]
+    damage: tuple[str, ...]
+    problem: str
+
+
+def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
+    """What the files hold as one log. Raises InputError only for what is no MCAP file."""
+    indexes = [index_file(path, number) for number, path in enumerate(paths)]
+    blocks = [block for index in indexes for block in index.blocks]
+    start_ns = min((block.start_ns for block in blocks), default=0)
+    duration_s = (max((block.end_ns for block in blocks), default=0) - start_ns) * 1e-9
+    log, problem = _open(paths, config or LogConfig())
+    counted = indexes if log is None else log.indexes
+    damage = [line for index in counted for line in index.damage]
+    return LogInfo(
+        files=tuple(str(path) for path in paths),
+        size_bytes=sum(path.stat().st_size for path in paths),
+        start_ns=start_ns,
+        duration_s=duration_s,
+        topics=_topics(counted, duration_s),
+        lidar="" if log is None else log.topic,
+        dimension=0 if log is None else log.dimension,
+        scans=0 if log is None else log.scan_count,
+        odometry="" if log is None or log.odometry is None else log.odometry.topic,
+        T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
+        notes=() if log is None else tuple(log.notes),
+        damage=tuple(damage),
+        problem=problem,
+    )
+
+
+def _open(paths: Sequence[Path], config: LogConfig) -> tuple[Log | None, str]:
+    try:
+        return open_log(paths, config), ""
+    except InputError as error:
+        return None, str(error)
+
+
+def _topics(indexes: Sequence[FileIndex], duration_s: float) -> tuple[TopicInfo, ...]:
+    """Every topic, its messages added up over the files."""
+    topics: dict[str, TopicInfo] = {}
+    for index in indexes:
+        for number, channel in index.channels.items():
+            known = topics.get(channel.topic)
+            messages = index.counts.get(number, 0) + (known.messages if known else 0)
+            rate_hz = messages / duration_s if duration_s > 0.0 else 0.0
+            topics[channel.topic] = TopicInfo(channel.topic, kind(channel), channel.encoding, messages, rate_hz)
+    return tuple(topics[topic] for topic in sorted(topics))

@@ -1,0 +1,122 @@
+"""What is known about an MCAP file before any message is read: its channels, its blocks of messages, its damage."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
+STATISTICS, DATA_END = 0x0B, 0x0F
+RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+
+_LONGEST_STRING = 1 << 16  # bytes; a longer name is damage
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none."""
+
+    key: tuple[int, int]
+    topic: str
+    encoding: str
+    schema: int
+    type_name: str
+    schema_encoding: str
+
+
+class Entry(NamedTuple):
+    """How many messages of a channel a chunk holds; their (log time, offset) pairs lie at byte ``offset``."""
+
+    channel: int
+    offset: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A run of records: a chunk, or messages outside of any chunk.
+
+    Attributes
+    ----------
+    file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
+    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked
+    start_ns, end_ns : log time of the first and last message
+    entries : the channels in it; empty where the file does not say
+    """
+
+    file: int
+    offset: int
+    size: int
+    compression: str
+    uncompressed_size: int
+    crc: int
+    start_ns: int
+    end_ns: int
+    entries: tuple[Entry, ...] = ()
+    is_chunk: bool = True
+    is_cut: bool = False
+
+    @property
+    def may_be_empty(self) -> bool:
+        """Whether its times are those that writers give a chunk without any message."""
+        return self.start_ns == self.end_ns == 0 or self.start_ns > self.end_ns
+
+
+@dataclass(slots=True)
+class FileIndex:
+    """Everything that the walk found in one file.
+
+    Attributes
+    ----------
+    number : its place among the files of the log
+    counts : messages by channel id; ``is_counted`` once they are complete
+    """
+
+    path: Path
+    number: int
+    data: mmap.mmap
+    profile: str = ""
+    library: str = ""
+    blocks: list[Block] = field(default_factory=list)
+    schemas: dict[int, tuple[str, str]] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    is_counted: bool = False
+    has_summary: bool = False
+    damage: list[str] = field(default_factory=list)
+
+    def add_schema(self, body: memoryview | mmap.mmap, offset: int) -> None:
+        """Take in the schema record whose body starts at the offset."""
+        (number,) = struct.unpack_from("<H", body, offset)
+        name, offset = read_string(body, offset + 2)
+        encoding, _ = read_string(body, offset)
+        self.schemas[number] = (name, encoding)
+
+    def add_channel(self, body: memoryview | mmap.mmap, offset: int) -> None:
+        """Take in the channel record whose body starts at the offset; one that is fully known stays."""
+        number, schema = struct.unpack_from("<HH", body, offset)
+        if self.knows(number):
+            return
+        topic, offset = read_string(body, offset + 4)
+        encoding, _ = read_string(body, offset)
+        type_name, schema_encoding = self.schemas.get(schema, ("", ""))
+        self.channels[number] = Channel((self.number, number), topic, encoding, schema, type_name, schema_encoding)
+
+    def knows(self, number: int) -> bool:
+        """Whether the channel and its schema have been met."""
+        channel = self.channels.get(number)
+        return channel is not None and (channel.schema == 0 or channel.type_name != "")
+
+
+def read_string(data: memoryview | mmap.mmap, offset: int) -> tuple[str, int]:
+    """A string with its length before it, and the byte behind it."""
+    (length,) = struct.unpack_from("<I", data, offset)
+    end = offset + 4 + length
+    if end > len(data) or length > _LONGEST_STRING:
+        raise struct.error("string beyond the end")
+    return bytes(data[offset + 4 : end]).decode(), end
