@@ -29,6 +29,10 @@ from pipeline.loops import LoopCloser
 from pipeline.odometry import Odometry, Tracked
 
 
+_GROWTH = 0.05  # of the graph, between two optimisations that change little
+_SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimised in soon
+
+
 @dataclass(frozen=True, slots=True)
 class SlamResult:
     """What a log amounts to.
@@ -61,6 +65,7 @@ class Slam:
         self.T_world_odom = lie.identity(self.dimension)
         self.travelled_m = 0.0
         self.waiting_closures = 0
+        self.surprising = False
         self.optimised_at = 0
 
     def process(self, scan: Scan) -> Step:
@@ -149,6 +154,7 @@ class Slam:
             self.closures.append(closure)
             if closure.verdict is Verdict.ACCEPTED:
                 self.waiting_closures += 1
+                self.surprising |= self._moves_the_map(closure)
                 self.graph.add_edge(
                     closure.target,
                     closure.source,
@@ -158,16 +164,28 @@ class Slam:
                 )
         return closures
 
+    def _moves_the_map(self, closure: Closure) -> bool:
+        """Whether the closure is further from what the graph says than its own error explains."""
+        expected = lie.inverse(self.graph.poses[closure.target]) @ self.graph.poses[closure.source]
+        moved = lie.inverse(expected) @ closure.match.T_target_source
+        sigma_m = self.config.loops.edge_sigma_m
+        return float(np.linalg.norm(moved[:-1, -1])) > _SURPRISE * sigma_m
+
     def _optimise_when_due(self) -> GraphState | None:
-        """Optimise once closures wait and the graph has grown since the last time."""
+        """Optimise when closures wait: soon if one of them moves the map, else once the graph has grown enough.
+
+        The growth asked for is a share of the graph, so that all optimisations together cost little more than a
+        few of the last one.
+        """
         grown = len(self.keyframes) - self.optimised_at
-        if not self.waiting_closures or grown < self.config.loops.optimise_every:
-            return None
-        return self._optimise()
+        enough = self.config.loops.optimise_every
+        if not self.surprising:
+            enough = max(enough, _GROWTH * len(self.keyframes))
+        return self._optimise() if self.waiting_closures and grown >= enough else None
 
     def _optimise(self) -> GraphState:
         state = self.graph.optimise(self.config.graph, initialise="given").state
-        self.waiting_closures, self.optimised_at = 0, len(self.keyframes)
+        self.waiting_closures, self.surprising, self.optimised_at = 0, False, len(self.keyframes)
         self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
 

@@ -55,7 +55,9 @@ def test_an_empty_file(tmp_path):
     says(complaint(tmp_path / "a.mcap"), "empty")
 
 
-@pytest.mark.parametrize("content", [b"#ROSBAG V2.0\n" * 10, b"x", b"\x89MCAP", b"\x89MCAP0\r", b"SQLite format 3\0"])
+@pytest.mark.parametrize(
+    "content", [b"#ROSBAG V2.0\n" * 10, b"x", b"\x89MCAP", b"\x89MCAP0\r", b"SQLite format 3\0"]
+)
 def test_a_file_that_is_no_mcap(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
     says(complaint(tmp_path / "a.mcap"), "not an MCAP", "scanchain convert")
@@ -288,6 +290,9 @@ def test_bytes_changed_anywhere_give_scans_or_one_line_but_never_a_traceback(tmp
         recover(path)
 
 
+LIES = [2**63, 2**40, 2**31 - 1, 2**64 - 1, 0]
+
+
 @pytest.mark.parametrize("chunked", [True, False])
 def test_lengths_that_lie_never_ask_for_memory(tmp_path, chunked):
     whole = write(tmp_path / "whole.mcap", office(), chunked=chunked, compression="none", crcs=False).read_bytes()
@@ -295,17 +300,19 @@ def test_lengths_that_lie_never_ask_for_memory(tmp_path, chunked):
     rng = np.random.default_rng(11)
     for at in rng.integers(8, len(whole) - 8, 150):
         changed = bytearray(whole)
-        changed[at : at + 8] = struct.pack("<Q", int(rng.choice([2**63, 2**40, 2**31 - 1, 2**64 - 1, 0])))
+        changed[at : at + 8] = struct.pack("<Q", LIES[rng.integers(len(LIES))])
         path.write_bytes(changed)
         recover(path)
 
 
-def chunk_at(data):
-    """Byte of the first chunk's body in a file, and its length."""
-    offset = 8
-    while data[offset] != 0x06:
-        offset += 9 + struct.unpack_from("<Q", data, offset + 1)[0]
-    return offset + 9, struct.unpack_from("<Q", data, offset + 1)[0]
+def chunk_at(data, number=1):
+    """Byte of a chunk's body in a file, and its length; the first chunk holds only the mounting."""
+    chunks, offset = [], 8
+    while len(chunks) <= number:
+        length = struct.unpack_from("<Q", data, offset + 1)[0]
+        chunks += [(offset + 9, length)] if data[offset] == 0x06 else []
+        offset += 9 + length
+    return chunks[number]
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
@@ -320,6 +327,18 @@ def test_a_chunk_with_a_wrong_crc_is_left_out_and_told(tmp_path, compression):
     assert 20 < len(scans) < 40
     assert any("CRC" in line for line in damage)
     assert any(f"{len(scans)} scans" in line for line in damage)
+
+
+def test_a_mounting_in_a_damaged_chunk_is_told(tmp_path):
+    path = write(tmp_path / "a.mcap", office())
+    whole = bytearray(path.read_bytes())
+    begin, _ = chunk_at(whole, 0)
+    whole[begin + 24] ^= 1
+    path.write_bytes(whole)
+    log = open_log([path], LogConfig())
+    assert len(list(log.scans())) == 40
+    np.testing.assert_array_equal(log.T_base_lidar, np.eye(3))
+    assert any("CRC" in line for line in log.damage) and any("static transform" in note for note in log.notes)
 
 
 def test_a_chunk_that_lies_about_its_size_is_rejected_before_memory_is_asked_for(tmp_path):
@@ -358,7 +377,7 @@ def test_an_unknown_compression_is_named(tmp_path):
 def test_a_real_cloud_log_cut_off_gives_the_sweeps_before_the_cut(tmp_path):
     whole = shared_data("3d/kitti_0005_first60.mcap").read_bytes()
     path = tmp_path / "cut.mcap"
-    path.write_bytes(whole[: 10_000_000])
+    path.write_bytes(whole[:10_000_000])
     scans, damage = recover(path)
     assert 6 <= len(scans) <= 9
     assert any(f"{len(scans)} scans" in line for line in damage)

@@ -284,7 +284,9 @@ def test_poses_are_read_in_either_byte_order(tmp_path, order):
     rows = random_rows(XYZ)
     said = [
         transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1), order=order)),
-        odometry_said(STAMP_NS, odometry(STAMP_NS, 3.0, 4.0, 0.5, z=6.0, order=order, frame="o", child="base_link")),
+        odometry_said(
+            STAMP_NS, odometry(STAMP_NS, 3.0, 4.0, 0.5, z=6.0, order=order, frame="o", child="base_link")
+        ),
         cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
     ]
     log = open_log([write(tmp_path / "a.mcap", said)], LogConfig())

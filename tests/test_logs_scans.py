@@ -58,7 +58,9 @@ def test_messages_packed_by_hand_are_what_an_independent_decoder_reads(tmp_path)
     assert mount.transforms[0].child_frame_id == "laser" and mount.transforms[0].transform.translation.z == 0.5
     assert wheels.child_frame_id == "base_link" and wheels.pose.pose.orientation.w == 1.0
     assert scan.header.frame_id == "laser" and scan.ranges[1] == pytest.approx(1.05) and scan.range_max == 30.0
-    assert [field.name for field in cloud.fields] == ["x", "y", "z", "t"] and len(cloud.data) == cloud.row_step == 23
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "t"] and len(
+        cloud.data
+    ) == cloud.row_step == 23
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -355,7 +357,7 @@ def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
 
 def test_kitti_ground_truth_is_that_of_the_published_file():
     log = open_log([shared_data("3d/kitti_0001_first54.mcap")], LogConfig())
-    truth = log.ground_truth("/ground_truth")
+    truth = log.ground_truth()
     published = np.loadtxt(shared_data("3d/kitti_0001_first54.tum"))
     assert truth.poses.shape == (54, 4, 4)
     np.testing.assert_allclose(truth.stamps_ns * 1e-9, published[:, 0], atol=1e-5)
@@ -366,7 +368,20 @@ def test_kitti_ground_truth_is_that_of_the_published_file():
 def test_ground_truth_of_a_planar_log_is_planar_and_a_missing_topic_is_named(tmp_path):
     path = write(tmp_path / "a.mcap", [*office(3), *wheels((0.05, 0.05, 2.0), topic="/ground_truth")])
     log = open_log([path], LogConfig())
-    truth = log.ground_truth("/ground_truth")
+    truth = log.ground_truth()
     assert truth.poses.shape == (1, 3, 3) and truth.poses[0, 0, 2] == 2.0
     with pytest.raises(InputError, match=r"a\.mcap.*?/nowhere.*?/odom"):
-        log.ground_truth("/nowhere")
+        open_log([path], LogConfig(ground_truth_topic="/nowhere"))
+
+
+def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own(tmp_path):
+    said = [*office(3), *wheels(*[(0.1 * k, 0.1 * k, float(k)) for k in range(5)], topic="/ground_truth")]
+    path = write(tmp_path / "a.mcap", said)
+    alone = open_log([path], LogConfig()).ground_truth()
+    log, _ = read(path)
+    np.testing.assert_array_equal(log.ground_truth().poses, alone.poses)
+    np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
+
+
+def test_a_log_without_truth_has_none(tmp_path):
+    assert open_log([write(tmp_path / "a.mcap", office(3))], LogConfig()).ground_truth() is None

@@ -193,7 +193,7 @@ def test_intel_meets_the_published_relations(wheels):
 def test_kitti_stays_within_its_error_of_the_gps(matcher, limit_m):
     log = open_log([shared_data("3d/kitti_0001_first54.mcap")], Config().log)
     steps = tracked(log.scans(), log.T_base_lidar, configured(3, {"matching.matcher": matcher}))
-    truth = log.ground_truth("/ground_truth")
+    truth = log.ground_truth()
     assert ate_m(trajectory(steps), truth) < limit_m
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from io import BytesIO
 from typing import NamedTuple
@@ -27,7 +28,7 @@ class Message(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """The messages of a block in the order of the file; ``damage`` says what is missing behind them, if anything."""
+    """The messages of a block in the order of the file; ``damage`` says what is missing behind them."""
 
     messages: list[Message]
     damage: str
@@ -40,34 +41,35 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     """
     payload = memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
     messages: list[Message] = []
-    offset, end, strangers = 0, len(payload), 0
+    strangers = 0
     try:
-        while offset + RECORD.size <= end:
-            opcode, length = RECORD.unpack_from(payload, offset)
-            offset += RECORD.size
-            if offset + length > end:
-                break
-            if opcode == MESSAGE:
-                number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, offset)
-                if wanted is None or number in wanted:
-                    channel = index.channels.get(number)
-                    if channel is None:
-                        strangers += 1
-                    else:
-                        body = payload[offset + MESSAGE_HEAD.size : offset + length]
-                        messages.append(Message(channel, log_time_ns, body))
-            elif opcode == SCHEMA:
-                index.add_schema(payload, offset)
+        for opcode, begin, end in _records(payload):
+            if opcode == SCHEMA:
+                index.add_schema(payload, begin)
             elif opcode == CHANNEL:
-                index.add_channel(payload, offset)
-            offset += length
+                index.add_channel(payload, begin)
+            elif opcode == MESSAGE:
+                number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
+                channel = index.channels.get(number)
+                strangers += channel is None
+                if channel is not None and (wanted is None or number in wanted):
+                    messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
     except (struct.error, UnicodeDecodeError):
-        return Contents(messages, f"{_name(index, block)}: a record in it is malformed; what follows was left out")
-    if strangers:
-        return Contents(messages, f"{_name(index, block)}: {strangers} messages name a channel that nothing defines")
-    if offset != end and not block.is_cut:
-        return Contents(messages, f"{_name(index, block)}: its last record reaches beyond its end")
-    return Contents(messages, "")
+        damage = "a record in it is malformed; what follows was left out"
+        return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
+    damage = f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
+    return Contents(messages, damage if strangers else "")
+
+
+def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of each record. Raises struct.error where the last one reaches beyond the payload."""
+    offset = 0
+    while offset < len(payload):
+        opcode, length = RECORD.unpack_from(payload, offset)
+        begin, offset = offset + RECORD.size, offset + RECORD.size + length
+        if offset > len(payload):
+            raise struct.error("record beyond the end")
+        yield opcode, begin, offset
 
 
 def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:

@@ -13,6 +13,9 @@ class MalformedMessageError(Exception):
     """A message that is not what its schema says; the text says where it ends too early."""
 
 
+_FLOATS: dict[str, np.dtype[np.float32]] = {"<": np.dtype("<f4"), ">": np.dtype(">f4")}
+
+
 class CdrReader:
     """Reads one message from front to back."""
 
@@ -38,10 +41,10 @@ class CdrReader:
         """One whole number."""
         return int(self.numbers(code)[0])
 
-    def array(self, dtype: str) -> NDArray[np.generic]:
-        """A sequence of numbers, as a view of the message."""
+    def floats(self) -> NDArray[np.float32]:
+        """A sequence of float32, as a view of the message."""
         count = self.integer()
-        kind = _dtype(self.order, dtype)
+        kind = _FLOATS[self.order]
         if count:
             self.offset += (4 - self.offset) % kind.itemsize
         end = self.offset + kind.itemsize * count
@@ -78,8 +81,3 @@ class CdrReader:
 @cache
 def _layout(order: str, code: str, count: int) -> tuple[struct.Struct, int]:
     return struct.Struct(f"{order}{count}{code}"), struct.calcsize(f"={code}")
-
-
-@cache
-def _dtype(order: str, code: str) -> np.dtype[np.generic]:
-    return np.dtype(order + code)

@@ -18,7 +18,7 @@ def complete(index: FileIndex) -> None:
     counts: Counter[int] = Counter()
     for block in index.blocks:
         for entry in block.entries:
-            counts[entry.channel] += entry.count
+            counts[entry.channel] += entry.messages
         if block.entries and not unknown & {entry.channel for entry in block.entries}:
             continue
         if not block.entries and index.is_counted and not unknown:
@@ -33,10 +33,11 @@ def complete(index: FileIndex) -> None:
 
 
 def messages_of(index: FileIndex, block: Block) -> list[Message]:
-    """The messages of a block, none where it is damaged: the stream of scans will tell of that."""
+    """The messages of a block, none where it is damaged, which is noted in the index."""
     try:
         return read_block(index, block).messages
-    except DamagedBlockError:
+    except DamagedBlockError as error:
+        index.note_damage(f"{error}; it was left out")
         return []
 
 
@@ -44,7 +45,7 @@ def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64
     """Log times of a channel's messages in a block, from the message index where there is one."""
     for entry in block.entries:
         if entry.channel == channel and entry.offset >= 0:
-            return np.frombuffer(index.data, "<u8", 2 * entry.count, entry.offset)[::2]
+            return np.frombuffer(index.data, "<u8", 2 * entry.messages, entry.offset)[::2]
     if block.entries and all(entry.channel != channel for entry in block.entries):
         return np.empty(0, np.uint64)
     messages = messages_of(index, block)

@@ -68,7 +68,7 @@ def index_file(path: Path, number: int) -> FileIndex:
 
 
 class _Walk:
-    """Sorts records into an index; a chunk waits for the message index behind it, loose messages for each other."""
+    """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
 
     def __init__(self, index: FileIndex) -> None:
         self.index = index
@@ -83,7 +83,9 @@ class _Walk:
         try:
             self._sort(opcode, offset, offset + RECORD.size, length)
         except (struct.error, UnicodeDecodeError):
-            self.index.damage.append(f"{self.index.path}: the record at byte {offset} is malformed and was left out")
+            self.index.damage.append(
+                f"{self.index.path}: the record at byte {offset} is malformed and was left out"
+            )
 
     def cut(self, opcode: int, offset: int) -> None:
         """End the walk inside a record; what is there of a chunk is kept."""
@@ -210,6 +212,7 @@ def _map(path: Path) -> mmap.mmap:
         raise InputError(f"{path}: cannot be read ({reason}); check its permissions") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(
-            f"{path}: is not an MCAP file (starts with {data[:8]!r}); convert it with: scanchain convert {path} OUT.mcap"
+            f"{path}: is not an MCAP file (starts with {data[:8]!r}); "
+            f"convert it with: scanchain convert {path} OUT.mcap"
         )
     return data

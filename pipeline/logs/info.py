@@ -8,8 +8,9 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
-from pipeline.logs.index import FileIndex, index_file
-from pipeline.logs.log import Log, open_log
+from pipeline.logs.log import Log, index_files
+from pipeline.logs.records import FileIndex
+from pipeline.logs.selection import whole_span
 from pipeline.logs.topics import kind
 
 
@@ -49,33 +50,29 @@ class LogInfo:
 
 def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
-    indexes = [index_file(path, number) for number, path in enumerate(paths)]
-    blocks = [block for index in indexes for block in index.blocks]
-    start_ns = min((block.start_ns for block in blocks), default=0)
-    duration_s = (max((block.end_ns for block in blocks), default=0) - start_ns) * 1e-9
-    log, problem = _open(paths, config or LogConfig())
-    counted = indexes if log is None else log.indexes
-    damage = [line for index in counted for line in index.damage]
+    indexes = index_files(paths)
+    whole = whole_span(indexes)
+    log, problem = _open(indexes, config or LogConfig())
     return LogInfo(
         files=tuple(str(path) for path in paths),
         size_bytes=sum(path.stat().st_size for path in paths),
-        start_ns=start_ns,
-        duration_s=duration_s,
-        topics=_topics(counted, duration_s),
+        start_ns=whole.begin_ns,
+        duration_s=whole.duration_s,
+        topics=_topics(indexes, whole.duration_s),
         lidar="" if log is None else log.topic,
         dimension=0 if log is None else log.dimension,
         scans=0 if log is None else log.scan_count,
-        odometry="" if log is None or log.odometry is None else log.odometry.topic,
+        odometry="" if log is None else log.odometry_topic,
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         notes=() if log is None else tuple(log.notes),
-        damage=tuple(damage),
+        damage=tuple(line for index in indexes for line in index.damage),
         problem=problem,
     )
 
 
-def _open(paths: Sequence[Path], config: LogConfig) -> tuple[Log | None, str]:
+def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, str]:
     try:
-        return open_log(paths, config), ""
+        return Log(indexes, config), ""
     except InputError as error:
         return None, str(error)
 

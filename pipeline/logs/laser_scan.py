@@ -34,8 +34,11 @@ def read_laser_scan(data: memoryview) -> LaserScanMessage:
     """Take a message apart; the ranges are a view of it."""
     reader = CdrReader(data)
     stamp_ns, frame = reader.header()
-    numbers = reader.numbers("f", 7)
-    return LaserScanMessage(stamp_ns, frame, *numbers, reader.array("f4"))  # pyright: ignore[reportArgumentType]
+    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
+    ranges_m = reader.floats()
+    return LaserScanMessage(
+        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
+    )
 
 
 class Geometry(NamedTuple):

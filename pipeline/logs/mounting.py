@@ -1,23 +1,43 @@
-"""How the lidar sits on the robot."""
+"""How the lidar sits on the robot, from the latched static transforms."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from pipeline import lie
 from pipeline.data import Pose
-from pipeline.logs.poses import StampedPose, chain
+from pipeline.logs.cdr import CdrReader, MalformedMessageError
+from pipeline.logs.counting import messages_of
+from pipeline.logs.poses import StampedPose, chain, decode_odometry, decode_transforms
+from pipeline.logs.records import Channel, FileIndex
+from pipeline.logs.topics import TRANSFORMS, is_readable, kind, topics_of
 
-BASE_FRAMES = ("base_link", "base_footprint", "base")
+T = TypeVar("T")
+
+_BASE_FRAMES = ("base_link", "base_footprint", "base")
+_BLOCKS = 8  # of a topic, from the first on, that are searched
 
 
-def mounting(transforms: list[StampedPose], base: str, lidar: str, notes: list[str]) -> Pose:
-    """T_base_lidar (4, 4) from the static transforms; the identity, and a note, where they do not say."""
-    for candidate in (base, *BASE_FRAMES) if base else BASE_FRAMES:
-        T_base_lidar = chain(transforms, candidate, lidar)
+def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, notes: list[str]) -> Pose:
+    """T_base_lidar (4, 4); the identity where the log does not say, with a note where that is an assumption."""
+    transforms = _static_transforms(indexes)
+    if not transforms and wheels is None:
+        return np.eye(4)
+    lidar_frame = next(_first(indexes, lidar.topic, lambda data: CdrReader(data).header()[1]), "")
+    base_frame = ""
+    if wheels is not None:
+        base_frame = next(_first(indexes, wheels.topic, lambda data: decode_odometry(data).child), "")
+    for base in (base_frame, *_BASE_FRAMES) if base_frame else _BASE_FRAMES:
+        T_base_lidar = chain(transforms, base, lidar_frame)
         if T_base_lidar is not None:
             return T_base_lidar
-    notes.append(f"no static transform from {base or 'base_link'} to {lidar or 'the lidar'}: taken to be the same")
+    notes.append(
+        f"no static transform from {base_frame or _BASE_FRAMES[0]} to {lidar_frame or 'the lidar'}: "
+        "the lidar is taken to sit at the robot's origin"
+    )
     return np.eye(4)
 
 
@@ -35,3 +55,30 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     if is_upside_down(T_base_lidar):
         T_base_lidar = T_base_lidar @ np.diag([1.0, -1.0, -1.0, 1.0])
     return lie.flatten(T_base_lidar)
+
+
+def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
+    found: list[StampedPose] = []
+    for topic, channel in topics_of(indexes).items():
+        if topic.endswith("tf_static") and kind(channel) == TRANSFORMS and is_readable(channel):
+            for transforms in _first(indexes, topic, decode_transforms):
+                found += transforms
+    return found
+
+
+def _first(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
+    """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
+    channels = {channel.key for index in indexes for channel in index.channels.values() if channel.topic == topic}
+    blocks = [
+        block
+        for index in indexes
+        for block in index.blocks
+        if not block.entries or any((block.file, entry.channel) in channels for entry in block.entries)
+    ]
+    for block in sorted(blocks, key=lambda block: block.start_ns)[:_BLOCKS]:
+        for message in messages_of(indexes[block.file], block):
+            if message.channel.topic == topic:
+                try:
+                    yield decode(message.data)
+                except MalformedMessageError:
+                    continue

@@ -23,7 +23,7 @@ class PointField(NamedTuple):
     name: str
     offset: int
     datatype: int
-    count: int
+    repeats: int
 
 
 class PointCloudMessage(NamedTuple):
@@ -113,7 +113,9 @@ def _layout(message: PointCloudMessage) -> Layout:
         if field.name not in ("x", "y", "z", *NAMES):
             continue
         if field.datatype not in _FORMATS:
-            raise MalformedMessageError(f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8")
+            raise MalformedMessageError(
+                f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8"
+            )
         number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
         if field.offset + number.itemsize > message.point_step:
             raise MalformedMessageError(
@@ -146,7 +148,8 @@ def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.vo
     needed = (height - 1) * stride + row if height and width else 0
     if len(body) < needed:
         raise MalformedMessageError(
-            f"data has {len(body)} bytes, fewer than the {needed} of {height} × {width} points of {point.itemsize} bytes"
+            f"data has {len(body)} bytes, fewer than the {needed} of {height} × {width} points "
+            f"of {point.itemsize} bytes"
         )
     if not needed or stride == row:
         return np.frombuffer(body, point, height * width)
@@ -160,4 +163,5 @@ def _why_none(square: NDArray[np.float32]) -> str:
     undefined = int(np.count_nonzero(~np.isfinite(square)))
     zero = int(np.count_nonzero(square == 0.0))
     outside = len(square) - undefined - zero
-    return f"of {len(square)} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"
+    count = len(square)
+    return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"

@@ -1,4 +1,4 @@
-"""What is known about an MCAP file before any message is read: its channels, its blocks of messages, its damage."""
+"""What is known about an MCAP file before any message is read: channels, blocks of messages, damage."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Entry(NamedTuple):
 
     channel: int
     offset: int
-    count: int
+    messages: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +106,11 @@ class FileIndex:
         encoding, _ = read_string(body, offset)
         type_name, schema_encoding = self.schemas.get(schema, ("", ""))
         self.channels[number] = Channel((self.number, number), topic, encoding, schema, type_name, schema_encoding)
+
+    def note_damage(self, line: str) -> None:
+        """Note a line once, however often the damage is met."""
+        if line not in self.damage:
+            self.damage.append(line)
 
     def knows(self, number: int) -> bool:
         """Whether the channel and its schema have been met."""

@@ -3,90 +3,107 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Generic, TypeVar
+from itertools import pairwise
+from typing import NamedTuple
 
-from pipeline.logs.blocks import DamagedBlockError, Message, read_block
+from pipeline.logs.blocks import DamagedBlockError, read_block
 from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.index import Block, Channel, FileIndex
+from pipeline.logs.limits import Returns
+from pipeline.logs.poses import StampedPose
+from pipeline.logs.records import Block, Channel, FileIndex
+from pipeline.logs.selection import Span
 
-T = TypeVar("T")
+Decoders = Mapping[str, Callable[[memoryview], Returns | StampedPose]]
 
 _THREADS = 2
-_FOREVER = 1 << 64
+_MOST_BYTES_AHEAD = 512_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded(Generic[T]):
+class Decoded(NamedTuple):
     """A message as its decoder understood it, or the decoder's complaint."""
 
     channel: Channel
     log_time_ns: int
-    value: T | MalformedMessageError
+    value: Returns | StampedPose | MalformedMessageError
 
 
 def decoded_messages(
-    indexes: Sequence[FileIndex],
-    blocks: Sequence[Block],
-    decode: Callable[[Message], T | None],
-    *,
-    ahead: int,
-    damage: list[str],
-) -> Iterator[Decoded[T]]:
-    """Every message that ``decode`` returns something for, by log time; ties in the order of the files.
+    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, ahead: int, damage: list[str]
+) -> Iterator[Decoded]:
+    """Every message of a topic that has a decoder, by log time; ties in the order of the files.
 
-    At most ``ahead`` blocks wait decoded; a damaged one is left out and named in ``damage``.
+    At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
     """
+    wanted = [
+        {number for number, channel in index.channels.items() if channel.topic in decoders} for index in indexes
+    ]
 
-    def work(block: Block) -> list[Decoded[T]]:
-        return list(_decode(read_block(indexes[block.file], block), decode))
+    def decode(block: Block) -> tuple[list[Decoded], str]:
+        contents = read_block(indexes[block.file], block, wanted[block.file])
+        return [
+            Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message.data))
+            for message in contents.messages
+            if span.begin_ns <= message.log_time_ns <= span.end_ns
+        ], contents.damage
 
-    ordered = sorted(blocks, key=lambda block: (block.start_ns, block.file, block.offset))
-    waiting: list[tuple[int, int, Decoded[T]]] = []
-    count = 0
-    for position, messages in enumerate(_ahead(ordered, work, ahead, damage)):
-        for message in messages:
-            heappush(waiting, (message.log_time_ns, count, message))
-            count += 1
-        following = ordered[position + 1].start_ns if position + 1 < len(ordered) else _FOREVER
-        while waiting and waiting[0][0] < following:
-            yield heappop(waiting)[2]
+    blocks = [
+        block
+        for index in indexes
+        for block in index.blocks
+        if span.meets(block)
+        and (not block.entries or any(entry.channel in wanted[block.file] for entry in block.entries))
+    ]
+    blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
+    waiting: list[tuple[int, int, int, int, Decoded]] = []
+    results = _ahead(blocks, decode, ahead, damage)
+    for (block, following), messages in zip(pairwise([*blocks, None]), results, strict=True):
+        assert block is not None
+        for place, message in enumerate(messages):
+            heappush(waiting, (message.log_time_ns, block.file, block.offset, place, message))
+        while waiting and (following is None or waiting[0][0] < following.start_ns):
+            yield heappop(waiting)[-1]
 
 
-def _decode(messages: list[Message], decode: Callable[[Message], T | None]) -> Iterator[Decoded[T]]:
-    for message in messages:
-        try:
-            value = decode(message)
-        except MalformedMessageError as error:
-            value = error
-        if value is not None:
-            yield Decoded(message.channel, message.log_time_ns, value)
+def _decode(
+    decoder: Callable[[memoryview], Returns | StampedPose], data: memoryview
+) -> Returns | StampedPose | MalformedMessageError:
+    try:
+        return decoder(data)
+    except MalformedMessageError as error:
+        return error
 
 
 def _ahead(
-    blocks: Sequence[Block], work: Callable[[Block], list[T]], ahead: int, damage: list[str]
-) -> Iterator[list[T]]:
-    """Results in the order of the blocks, computed by threads that end when the iterator is closed."""
-    running: deque[Future[list[T]]] = deque()
+    blocks: Sequence[Block], decode: Callable[[Block], tuple[list[Decoded], str]], ahead: int, damage: list[str]
+) -> Iterator[list[Decoded]]:
+    """Contents in the order of the blocks, decoded by threads that end when the iterator is closed."""
+    running: deque[tuple[Block, Future[tuple[list[Decoded], str]]]] = deque()
+    size = 0
     pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="scanchain-read")
     try:
-        upcoming = iter(blocks)
-        for block in upcoming:
-            running.append(pool.submit(work, block))
-            if len(running) > ahead:
-                yield _result(running.popleft(), damage)
+        for block in blocks:
+            running.append((block, pool.submit(decode, block)))
+            size += block.uncompressed_size
+            while len(running) > ahead or (size > _MOST_BYTES_AHEAD and len(running) > 1):
+                done, future = running.popleft()
+                size -= done.uncompressed_size
+                yield _result(future, damage)
         while running:
-            yield _result(running.popleft(), damage)
+            yield _result(running.popleft()[1], damage)
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _result(future: Future[list[T]], damage: list[str]) -> list[T]:
+def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> list[Decoded]:
     try:
-        return future.result()
+        messages, incomplete = future.result()
     except DamagedBlockError as error:
-        damage.append(f"{error}; it was left out")
+        line = f"{error}; it was left out"
+        damage += [] if line in damage else [line]
         return []
+    if incomplete:
+        damage.append(incomplete)
+    return messages

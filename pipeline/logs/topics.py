@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pipeline.errors import InputError
-from pipeline.logs.index import Channel, FileIndex
+from pipeline.logs.records import Channel, FileIndex
 
 LASER_SCAN, POINT_CLOUD = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2"
 ODOMETRY, TRANSFORMS = "nav_msgs/Odometry", "tf2_msgs/TFMessage"
@@ -16,44 +16,41 @@ def kind(channel: Channel) -> str:
     return channel.type_name.replace("/msg/", "/").replace("::msg::dds_::", "/").rstrip("_")
 
 
-def readable(channel: Channel) -> bool:
+def is_readable(channel: Channel) -> bool:
     """Whether its messages are ROS 2's, in CDR."""
     return channel.encoding == "cdr" and channel.schema_encoding in ("ros2msg", "ros2idl")
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
-    """One channel of each topic, in the order of the files."""
+    """One channel of each topic, by name."""
     channels: dict[str, Channel] = {}
     for index in indexes:
         for channel in index.channels.values():
             channels.setdefault(channel.topic, channel)
-    return channels
+    return dict(sorted(channels.items()))
 
 
 def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
-    """The lidar's channel: the topic asked for, else the only one that fits."""
+    """The lidar's channel: the topic asked for, else the only one that fits. Raises InputError."""
     channels = topics_of(indexes)
     path = indexes[0].path
-    listed = ", ".join(f"{topic} ({channel.type_name or 'no schema'})" for topic, channel in sorted(channels.items()))
-    lidars = [c for c in channels.values() if kind(c) in (LASER_SCAN, POINT_CLOUD) and readable(c)]
+    if wanted and wanted not in channels:
+        raise InputError(f"{path}: has no topic {wanted}; choose --topic from: {_listed(channels.values())}")
+    if wanted and not _is_lidar(channels[wanted]):
+        raise InputError(
+            f"{path}: topic {_listed([channels[wanted]])} is no {LASER_SCAN} or {POINT_CLOUD} of ROS 2 in CDR; "
+            f"choose --topic from: {_listed(channels.values())}"
+        )
     if wanted:
-        if wanted not in channels:
-            raise InputError(f"{path}: has no topic {wanted}; choose --topic from: {listed or 'none at all'}")
-        if channels[wanted] not in lidars:
-            raise InputError(
-                f"{path}: topic {wanted} is {channels[wanted].type_name} in {channels[wanted].encoding}, not a "
-                f"{LASER_SCAN} or {POINT_CLOUD} of ROS 2; the log holds: {listed}"
-            )
         return channels[wanted]
+    lidars = [channel for channel in channels.values() if _is_lidar(channel)]
     if not lidars:
         raise InputError(
-            f"{path}: has no lidar topic ({LASER_SCAN} or {POINT_CLOUD} of ROS 2); it holds: {listed or 'no topics'}"
+            f"{path}: has no lidar topic ({LASER_SCAN} or {POINT_CLOUD} of ROS 2 in CDR); "
+            f"it holds: {_listed(channels.values())}"
         )
     if len(lidars) > 1:
-        raise InputError(
-            f"{path}: several lidar topics; choose one with --topic: "
-            + ", ".join(f"{c.topic} ({c.type_name})" for c in sorted(lidars, key=lambda c: c.topic))
-        )
+        raise InputError(f"{path}: has several lidar topics; choose one with --topic: {_listed(lidars)}")
     return lidars[0]
 
 
@@ -61,14 +58,45 @@ def find_odometry(
     indexes: Sequence[FileIndex], wanted: str, ground_truth: str, notes: list[str]
 ) -> Channel | None:
     """The wheel odometry's channel: the topic asked for, else the only one apart from the ground truth."""
-    channels = topics_of(indexes)
+    channels = [channel for channel in topics_of(indexes).values() if _is_odometry(channel)]
     if wanted:
-        if wanted not in channels or kind(channels[wanted]) != ODOMETRY:
-            raise InputError(f"{indexes[0].path}: log.odometry_topic {wanted} is no {ODOMETRY} topic of the log")
-        return channels[wanted]
-    found = [c for c in channels.values() if kind(c) == ODOMETRY and readable(c) and c.topic != ground_truth]
+        return _chosen(indexes, channels, wanted, "log.odometry_topic")
+    found = [channel for channel in channels if channel.topic != ground_truth]
     if len(found) > 1:
-        names = ", ".join(sorted(channel.topic for channel in found))
+        names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
         return None
     return found[0] if found else None
+
+
+def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -> Channel | None:
+    """The ground truth's channel; only a topic that is not the default one must be there."""
+    channels = [channel for channel in topics_of(indexes).values() if _is_odometry(channel)]
+    if wanted == default and all(channel.topic != wanted for channel in channels):
+        return None
+    return _chosen(indexes, channels, wanted, "log.ground_truth_topic")
+
+
+def _chosen(indexes: Sequence[FileIndex], channels: Sequence[Channel], wanted: str, key: str) -> Channel:
+    for channel in channels:
+        if channel.topic == wanted:
+            return channel
+    raise InputError(
+        f"{indexes[0].path}: {key} {wanted} is no {ODOMETRY} topic of the log; these are: {_listed(channels)}"
+    )
+
+
+def _is_lidar(channel: Channel) -> bool:
+    return is_readable(channel) and kind(channel) in (LASER_SCAN, POINT_CLOUD)
+
+
+def _is_odometry(channel: Channel) -> bool:
+    return is_readable(channel) and kind(channel) == ODOMETRY
+
+
+def _listed(channels: Iterable[Channel]) -> str:
+    names = []
+    for channel in channels:
+        unusual = "" if is_readable(channel) else f" in {channel.encoding or 'an unnamed encoding'}"
+        names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual})")
+    return ", ".join(names) or "none"
