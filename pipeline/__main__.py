@@ -42,7 +42,7 @@ for _command in (run, view, info, simulate, evaluate, config, sequence):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show)
+    viewing = Viewing(_record, _show, _draw)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -86,6 +86,12 @@ def _show(path: Path, in_browser: bool) -> None:
     from viz.show import show
 
     show(path, in_browser=in_browser)
+
+
+def _draw(directory: Path, picture: Path) -> None:
+    from viz.run_picture import draw_run
+
+    draw_run(directory, picture)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,11 @@ class OpenRecorder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Viewing:
-    """What the commands ask of a viewer: record a run, show a recording (in a browser if the flag is set)."""
+    """What the commands ask of a viewer.
+
+    ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG.
+    """
 
     record: OpenRecorder
     show: Callable[[Path, bool], None]
+    draw: Callable[[Path, Path], None]

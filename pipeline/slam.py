@@ -28,7 +28,6 @@ from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser
 from pipeline.odometry import Odometry, Tracked
 
-
 _GROWTH = 0.05  # of the graph, between two optimisations that change little
 _SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimised in soon
 

@@ -14,10 +14,10 @@ from pipeline.maps import (
     build_point_map,
     draw_grid,
     fitting_resolution,
-    grid_image,
+    read_map,
+    read_ply,
     write_map,
     write_ply,
-    write_png,
 )
 from pipeline.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
 from pipeline.trajectory import read_tum
@@ -143,12 +143,25 @@ def test_an_empty_grid_is_written_as_one_unknown_pixel(tmp_path):
     assert naive.served_map(tmp_path)[0].tolist() == [[-1]]
 
 
-def test_the_png_is_the_image(tmp_path):
-    images = pytest.importorskip("PIL.Image")
+def test_a_written_map_is_read_back(tmp_path):
     poses, scans = random_scans()
-    image = grid_image(draw_grid(zip(poses, scans, strict=True), CONFIG))
-    write_png(tmp_path / "map.png", image)
-    np.testing.assert_array_equal(np.array(images.open(tmp_path / "map.png")), image)
+    grid = draw_grid(zip(poses, scans, strict=True), CONFIG)
+    write_map(tmp_path, grid)
+    cells, resolution_m, origin_m = read_map(tmp_path)
+    probability = grid.probability()
+    assert resolution_m == RESOLUTION_M and origin_m == pytest.approx(tuple(grid.origin_m))
+    assert np.array_equal(cells == 100, probability > 0.65) and np.array_equal(cells == 0, probability < 0.35)
+
+
+@pytest.mark.parametrize("name", ["map.pgm", "map.yaml"])
+def test_a_map_that_is_missing_or_of_another_make_is_refused(tmp_path, name):
+    write_map(tmp_path, OccupancyGrid(CONFIG))
+    (tmp_path / name).write_bytes(b"P2 1 1 255 0")
+    with pytest.raises(InputError, match="run it again"):
+        read_map(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(InputError, match=name):
+        read_map(tmp_path)
 
 
 def test_a_grid_too_large_for_memory_is_refused_and_a_coarser_one_fits():
@@ -213,6 +226,15 @@ def test_a_ply_file_holds_the_points(tmp_path):
     rows = np.frombuffer(body, "<f4").reshape(-1, 3)
     np.testing.assert_allclose(rows[:, :2], points, atol=1e-6)
     assert (rows[:, 2] == 0.0).all()
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply"), rows)
+
+
+def test_a_ply_file_of_another_make_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    with pytest.raises(InputError, match="not a PLY file as scanchain writes it"):
+        read_ply(tmp_path / "a.ply")
+    with pytest.raises(InputError, match=r"b\.ply"):
+        read_ply(tmp_path / "b.ply")
 
 
 def test_small_gicp_reads_our_ply(tmp_path):

@@ -1,10 +1,7 @@
-import builtins
-
 import numpy as np
 import pytest
 
 from pipeline import lie
-from pipeline.errors import MissingExtraError
 from viz.plots import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
@@ -69,16 +66,3 @@ def test_a_3d_map_is_drawn_from_above(tmp_path):
 def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(tmp_path):
     draw_map(tmp_path / "a.png", title="t", optimised=np.empty((0, 3, 3)))
     assert (tmp_path / "a.png").stat().st_size > 0
-
-
-def test_a_missing_matplotlib_is_one_line_that_names_the_extra(tmp_path, monkeypatch):
-    original = builtins.__import__
-
-    def refuse(name, *arguments, **keywords):
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return original(name, *arguments, **keywords)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(MissingExtraError, match=r"scanchain\[plots\]"):
-        draw_map(tmp_path / "a.png", title="t", optimised=circle(10.0))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
-from pipeline.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +66,8 @@ def draw_map(
     axes.set_ylim(low[1], high[1])
     axes.set_title(title, loc="left", fontsize=11)
     if len(ways):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=5, frameon=False, fontsize=9)
-    figure.savefig(path, dpi=150, bbox_inches="tight", facecolor="white")
+        axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    figure.savefig(path, dpi=150, facecolor="white")
 
 
 def _frame(
@@ -91,12 +90,12 @@ def _frame(
 
 def _paper(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure, Axes]:
     """A sheet in the proportions of the map."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "plots") from error
+    from matplotlib.figure import Figure
+
     width, height = high - low
-    figure = Figure(figsize=(_WIDTH_INCHES, float(np.clip(_WIDTH_INCHES * height / width, 3.0, 12.0))))
+    figure = Figure(
+        figsize=(_WIDTH_INCHES, float(np.clip(_WIDTH_INCHES * height / width, 3.0, 12.0))), layout="constrained"
+    )
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")

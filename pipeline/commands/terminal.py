@@ -19,8 +19,8 @@ _REDRAW_S = 0.2
 class Terminal:
     """Shows how far a job is; a context manager.
 
-    On the first Ctrl-C (or SIGTERM) while scans are tracked no more of them come, and the run finishes with what it
-    has; at any other time, and on the second, it interrupts as usual.
+    On the first Ctrl-C (or SIGTERM) while scans are tracked no more of them come, and the run finishes with what
+    it has; at any other time, and on the second, it interrupts as usual.
     """
 
     def __init__(self, unit: str) -> None:

@@ -16,9 +16,12 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
+@click.option(
+    "--png", metavar="FILE", type=click.Path(path_type=Path), help="Draw trajectory and map to a picture."
+)
 @click.pass_context
-def view(ctx: click.Context, directory: Path, web: bool) -> None:
-    """Open the recording of a run in the rerun viewer.
+def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> None:
+    """Open the recording of a run in the rerun viewer, or draw its map without one.
 
     DIR is a run directory, or a .rrd file.
 
@@ -26,11 +29,16 @@ def view(ctx: click.Context, directory: Path, web: bool) -> None:
     Examples:
       scanchain view runs/log
       scanchain view runs/log --web
+      scanchain view runs/log --png log.png
     """
+    viewing: Viewing = ctx.obj
+    if png is not None:
+        viewing.draw(directory, png)
+        click.echo(png)
+        return
     path = directory / "recording.rrd" if directory.is_dir() else directory
     if not path.exists():
         raise InputError(f"{path}: no such file; scanchain run writes it unless --rerun leaves out save")
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
-    viewing: Viewing = ctx.obj
     viewing.show(path, web)

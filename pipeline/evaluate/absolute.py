@@ -23,7 +23,7 @@ class AbsoluteError:
     definition : what was computed, in words
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
-    rotation_rad : of the angle of R_refᵀ R_est
+    rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
     path_length_m : of the reference, over the paired poses
     T_reference_estimate : the alignment that was found
     errors_m, errors_rad : (N,) pose by pose, in the order of the pairs
@@ -57,13 +57,17 @@ class AbsoluteError:
 def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> AbsoluteError:
     """Align the estimate to the reference and compare pose by pose."""
     T = align(pairs.estimate, pairs.reference, alignment)
-    error = lie.inverse(pairs.reference) @ T @ pairs.estimate
-    errors_m = np.linalg.norm(error[:, :3, 3], axis=1)
-    errors_rad = lie.rotation_angle(error)
+    aligned = T @ pairs.estimate
+    errors_m = np.linalg.norm(pairs.reference[:, :3, 3] - aligned[:, :3, 3], axis=1)
+    rotations = "R_refᵀ R_est"
+    if alignment is Alignment.RIGID:
+        aligned = _turned(aligned, pairs.reference)
+        rotations += " turned by the best common rotation"
+    errors_rad = lie.rotation_angle(lie.inverse(pairs.reference) @ aligned)
     return AbsoluteError(
         definition=(
-            f"ATE: ‖t_ref − t_est‖ and the angle of R_refᵀ R_est after alignment '{alignment}' "
-            f"({alignment.description}) over {pairs.description}"
+            f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({alignment.description}) and the angle of "
+            f"{rotations}, over {pairs.description}"
         ),
         alignment=alignment,
         translation_m=Statistics.of(errors_m),
@@ -73,6 +77,17 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
         errors_m=errors_m,
         errors_rad=errors_rad,
     )
+
+
+def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
+    """The estimate (N, 4, 4) turned by the one rotation R that minimises Σ ‖R_ref − R R_est‖² (Umeyama 1991).
+
+    Positions alone leave the roll about a straight course to the noise; a rotation error must not inherit that.
+    """
+    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3]))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return T @ estimate
 
 
 def path_length(poses: Matrix) -> NDArray[np.float64]:

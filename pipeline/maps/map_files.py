@@ -1,16 +1,18 @@
-"""Occupancy grids as files that navigation stacks read: map.pgm with map.yaml, and PNG."""
+"""Occupancy grids as files that navigation stacks read: map.pgm with map.yaml."""
 
 from __future__ import annotations
 
-import struct
-import zlib
+import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import InputError
 from pipeline.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid
 
+_PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
+_YAML_NUMBERS = re.compile(r"resolution: (\S+)\norigin: \[(\S+), (\S+), 0\]")
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
 
 # Thresholds that sort exactly these three pixels, p = (255 − pixel) / 255, as nav2's own saver writes them: with
@@ -53,15 +55,26 @@ def write_map(folder: Path | str, grid: OccupancyGrid) -> None:
     (folder / "map.yaml").write_text(text, encoding="utf-8", newline="\n")
 
 
-def write_png(path: Path | str, image: NDArray[np.uint8]) -> None:
-    """Write a grey image (rows, columns) as PNG (ISO/IEC 15948), filter 0 on every row."""
-    rows, columns = image.shape
-    filtered = np.zeros((rows, columns + 1), np.uint8)
-    filtered[:, 1:] = image
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b""))
-    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, body) for name, body in chunks))
+def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, float]]:
+    """Cells (rows, columns) of a map that ``write_map`` wrote, the resolution in metres and the origin's x, y.
 
-
-def _chunk(name: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+    Cells are 0 free, 100 occupied, −1 unknown; row 0 has the lowest y. Raises InputError where a file is missing
+    or of another make.
+    """
+    folder = Path(folder)
+    try:
+        image = _PGM.fullmatch((folder / "map.pgm").read_bytes())
+        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: cannot be read ({error.strerror}); scanchain run writes it"
+        ) from error
+    if image is None or header is None:
+        raise InputError(f"{folder}: map.pgm or map.yaml is not as scanchain writes them; run it again")
+    columns, rows = int(image[1]), int(image[2])
+    pixels = np.frombuffer(image[3], np.uint8)
+    if len(pixels) != rows * columns:
+        raise InputError(f"{folder / 'map.pgm'}: has {len(pixels)} pixels instead of {rows} × {columns}")
+    cells = np.select([pixels == FREE, pixels == OCCUPIED], [0, 100], -1).astype(np.int8).reshape(rows, columns)
+    resolution_m, x_m, y_m = (float(number) for number in header.groups())
+    return np.ascontiguousarray(cells[::-1]), resolution_m, (x_m, y_m)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.data import Points
+from pipeline.errors import InputError
 
 _HEADER = """ply
 format binary_little_endian 1.0
@@ -26,3 +27,15 @@ def write_ply(path: Path | str, points: Points) -> None:
     with Path(path).open("wb") as file:
         file.write(_HEADER.format(count=len(points)).encode("ascii"))
         file.write(rows.tobytes())
+
+
+def read_ply(path: Path | str) -> Points:
+    """Points (N, 3) of a file that ``write_ply`` wrote. Raises InputError for one that is not."""
+    try:
+        header, found, body = Path(path).read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); scanchain run writes it") from error
+    count = len(body) // 12
+    if not found or (header + found).decode("latin-1") != _HEADER.format(count=count) or len(body) % 12:
+        raise InputError(f"{path}: is not a PLY file as scanchain writes it; run it again")
+    return np.frombuffer(body, "<f4").reshape(-1, 3).astype(np.float64)

@@ -1,0 +1,32 @@
+"""A run directory as one picture: its ways over its map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.maps import read_map, read_ply
+from pipeline.trajectory import read_tum
+from viz.plots import GridPicture, draw_map
+
+
+def draw_run(directory: Path, picture: Path) -> None:
+    """Draw trajectory, odometry and map of a run to a PNG: the occupancy grid of a 2D run, the cloud of a 3D one.
+
+    Raises InputError where the directory is no run's, or the picture's name does not end in .png.
+    """
+    if picture.suffix != ".png":
+        raise InputError(f"{picture}: is no .png; name a file that ends in .png")
+    if not (directory / "trajectory.tum").exists():
+        raise InputError(f"{directory}: holds no trajectory.tum; give the directory of a finished run")
+    points = read_ply(directory / "map.ply")
+    is_planar = not points[:, 2].any()
+    cells, resolution_m, origin_m = read_map(directory)
+    draw_map(
+        picture,
+        title=directory.resolve().name,
+        optimised=read_tum(directory / "trajectory.tum").poses,
+        odometry=read_tum(directory / "odometry.tum").poses,
+        points=None if is_planar else points,
+        grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
+    )
