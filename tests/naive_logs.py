@@ -47,7 +47,17 @@ class Cdr:
 
 
 def laser_scan(
-    stamp_ns, ranges, *, first=-1.0, step=0.01, beam_s=0.0, low=0.1, high=30.0, frame="laser", order="<", declared=None
+    stamp_ns,
+    ranges,
+    *,
+    first=-1.0,
+    step=0.01,
+    beam_s=0.0,
+    low=0.1,
+    high=30.0,
+    frame="laser",
+    order="<",
+    declared=None,
 ):
     cdr = Cdr(order).header(stamp_ns, frame)
     cdr.put("f", first, first + step * (len(ranges) - 1), step, beam_s, 0.1, low, high)
@@ -56,7 +66,17 @@ def laser_scan(
 
 
 def point_cloud(
-    stamp_ns, rows, *, frame="lidar", order="<", height=1, padding=0, fields=None, step=None, data=None, row_step=None
+    stamp_ns,
+    rows,
+    *,
+    frame="lidar",
+    order="<",
+    height=1,
+    padding=0,
+    fields=None,
+    step=None,
+    data=None,
+    row_step=None,
 ):
     """A cloud of a structured array; ``padding`` bytes behind each row; other arguments tell lies."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -165,7 +185,7 @@ def write(
 
 
 def office(count=40, *, topic="/scan", every_ns=SECOND // 10, beams=31, begin_ns=STAMP_NS):
-    """A mounting, then ``count`` pairs of odometry and scan with the same stamp; scan k sees ranges from 1 + k/100."""
+    """A mounting, then ``count`` pairs of odometry and scan of one stamp; scan k sees ranges from 1 + k/100."""
     said = [transforms_said(begin_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))]
     for k in range(count):
         stamp_ns = begin_ns + k * every_ns

@@ -88,6 +88,7 @@ def test_ate_equals_evo(pairs, alignment):
 def test_the_rotation_error_of_a_straight_course_does_not_depend_on_its_roll():
     reference = np.tile(np.eye(4), (50, 1, 1))
     reference[:, 0, 3] = np.linspace(0.0, 60.0, 50)
+    reference[:, 1, 3] = np.random.default_rng(1).normal(scale=0.01, size=50)
     estimate = lie.exp(np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1])) @ reference
     estimate[:, :3, 3] += np.random.default_rng(0).normal(scale=0.02, size=(50, 3))
     stamps_ns = np.arange(50, dtype=np.int64) * 10**8

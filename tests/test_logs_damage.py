@@ -1,4 +1,4 @@
-"""Bad input: one line that says what, where and what to do; damage: recovered, counted and told, never a traceback."""
+"""Bad input: one line that says what, where and what to do; damage: recovered, counted and told."""
 
 import re
 import struct

@@ -235,7 +235,7 @@ def test_the_nearest_reading_serves_up_to_half_a_second_and_none_beyond(tmp_path
 
 def test_a_scan_does_not_wait_for_ever_for_a_reading(tmp_path):
     said = [*wheels((0.0, 0.0, 4.0)), *(one_scan(0.01 * k, 0.01 * k) for k in range(1, 200))]
-    log, scans = read(write(tmp_path / "a.mcap", said))
+    _, scans = read(write(tmp_path / "a.mcap", said))
     assert len(scans) == 199
     assert all(scan.T_odom_base is not None for scan in scans[:50]) and scans[-1].T_odom_base is None
 

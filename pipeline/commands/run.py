@@ -115,7 +115,7 @@ def _sinks(text: str) -> frozenset[SinkName]:
     words = [word.strip() for word in text.split(",")]
     if words == ["off"]:
         return frozenset()
-    chosen = frozenset(sink for sink in _SINKS if sink in words)
+    chosen = frozenset(_SINKS) & set(words)
     unknown = [word for word in words if word not in _SINKS]
     if unknown:
         raise InputError(f"--rerun is {text!r}; take off, or one or several of {', '.join(_SINKS)} with commas")
