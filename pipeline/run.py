@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -73,6 +74,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
     started = perf_counter()
+    _check_distinct(job.logs)
     reference = None if job.ground_truth is None else read_tum(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     directory = RunDirectory(job.out, force=job.force)
@@ -99,6 +101,13 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
         except (Exception, KeyboardInterrupt) as error:
             raise _rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
+
+
+def _check_distinct(paths: tuple[Path, ...]) -> None:
+    """Refuse a file named twice: each of its scans would come twice."""
+    for path, count in Counter(path.resolve() for path in paths).items():
+        if count > 1:
+            raise InputError(f"{path}: is named {count} times; name each file of a log once")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,10 +210,11 @@ def _rescued(
     if is_bug:
         text = "".join(traceback.format_exception(error))
         (directory.path / "traceback.txt").write_text(text, encoding="utf-8")
-    if len(steps):
+    if len(steps) and not (directory.path / "metrics.json").exists():  # else the results are better
         write_tum(directory.path / "odometry.tum", steps.odometry)
         steps.write(directory.path / "steps.parquet", steps.best_known)
-    where = f"{len(steps):,} scans until then are in {directory.path}"
+    what = "traceback.txt and the " if is_bug else ""
+    where = f"{what}{len(steps):,} scans until then are in {directory.path}"
     if isinstance(error, InputError):
         return InputError(f"{error}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""

@@ -26,10 +26,11 @@ class RunDirectory:
     """
 
     def __init__(self, destination: Path, *, force: bool) -> None:
+        _check(destination, force)
         self.destination = destination.resolve()
+        self.force = force
         self.path = self.destination.with_name(f"{self.destination.name}.partial-{os.getpid()}")
         self.is_worth_keeping = False
-        _check(destination, force)
 
     def __enter__(self) -> Self:
         try:
@@ -54,7 +55,11 @@ class RunDirectory:
         self.is_worth_keeping = True
 
     def complete(self) -> None:
-        """Give the directory its name; one that had it before is removed only now."""
+        """Give the directory its name; one that had it before is removed only now.
+
+        Raises InputError where one that must not be replaced has come to be in the meantime.
+        """
+        _check(self.destination, self.force)
         old = self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}")
         if self.destination.exists():
             self.destination.rename(old)

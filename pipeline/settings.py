@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,7 +60,8 @@ def load_settings(
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
     flags = {override.key: override.flag for override in overrides}
-    _check_order(values, source, flags)
+    is_final = file is not None or dimension is not None  # else a preset may still change all but log.*
+    _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
     changed = "".join(f", {key} {values[key]}" for key in flags)
     return Settings(msgspec.convert(_tree(values), Config), source + changed)
 
@@ -74,15 +75,12 @@ def read_layer(file: Path) -> dict[str, Value]:
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: is not TOML: {' '.join(str(error).split())}") from None
+        reason = " ".join(str(error).split())
+        raise InputError(f"{file}: is not TOML: {reason}; scanchain config dump prints one that is") from None
     layer: dict[str, Value] = {}
-    for section, branch in tree.items():
-        if not isinstance(branch, Mapping):
-            find_key(section, str(file))
-            continue
-        for leaf, value in branch.items():
-            key = find_key(f"{section}.{leaf}", str(file))
-            layer[key.name] = key.check(value, str(file))
+    for name, value in _leaves(tree):
+        key = find_key(name, str(file))
+        layer[key.name] = key.check(value, str(file))
     return layer
 
 
@@ -106,6 +104,16 @@ def flatten(config: Config) -> dict[str, Value]:
     return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
 
 
+def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+    """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
+    sections = {key.partition(".")[0] for key in config_keys()}
+    for section, branch in tree.items():
+        if isinstance(branch, Mapping) and (branch or section in sections):
+            yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
+        else:
+            yield section, branch
+
+
 def _tree(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
     tree: dict[str, dict[str, Value]] = {}
     for key, value in values.items():
@@ -114,8 +122,10 @@ def _tree(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
     return tree
 
 
-def _check_order(values: Mapping[str, Value], source: str, flags: Mapping[str, str]) -> None:
-    for lower, upper in _ORDERED:
+def _check_order(
+    values: Mapping[str, Value], source: str, flags: Mapping[str, str], ordered: Sequence[tuple[str, str]]
+) -> None:
+    for lower, upper in ordered:
         low, high = values[lower], values[upper]
         if isinstance(low, float) and isinstance(high, float) and not low < high:
             where = flags.get(lower) or flags.get(upper) or source

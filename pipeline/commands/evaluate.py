@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +65,8 @@ def evaluate(
     results = Results({}, {})
     if reference is not None:
         limit_s = PAIRING_LIMIT_S if max_difference is None else max_difference
+        if not 0.0 <= limit_s < inf:
+            raise InputError(f"--max-difference is {limit_s:g} s; choose a number from 0 up")
         results = _against(trajectory, read(reference), align, limit_s)
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pipeline.errors import InputError
+
 
 @click.command()
 @click.argument("world", metavar="WORLD")
@@ -38,6 +40,8 @@ def simulate(
       scanchain simulate town town.mcap --duration 20 --seed 3
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
     """
+    if destination.suffix != ".mcap":
+        raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
     from pipeline.commands.terminal import Terminal
     from pipeline.simulate import simulate as simulate_log
 

@@ -26,13 +26,15 @@ from pipeline.logs.told_poses import ToldPoses
 from pipeline.logs.topics import LASER_SCAN, find_ground_truth, find_lidar, find_odometry, kind
 from pipeline.logs.wheels import WheelTrack
 
+_DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
 
 
-def open_log(paths: Sequence[Path], config: LogConfig) -> Log:
-    """The files as one log, topics chosen. Raises InputError for what cannot be read or chosen."""
-    return Log(index_files(paths), config)
+def open_log(paths: Path | str | Sequence[Path | str], config: LogConfig = _DEFAULTS) -> Log:
+    """One file, or several as one log, topics chosen. Raises InputError for what cannot be read or chosen."""
+    named = [paths] if isinstance(paths, Path | str) else paths
+    return Log(index_files([Path(path) for path in named]), config)
 
 
 def index_files(paths: Sequence[Path]) -> list[FileIndex]:
@@ -67,7 +69,7 @@ class Log:
         self.notes: list[str] = []
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
-        truth = find_ground_truth(indexes, config.ground_truth_topic, LogConfig().ground_truth_topic)
+        truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
