@@ -2,12 +2,14 @@
 
 import os
 import tomllib
+from itertools import islice
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from pipeline.config import Config
+from pipeline.logs import open_log
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -19,6 +21,11 @@ def shared_data(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{path} is absent: real recordings are not part of the project (set SCANCHAIN_DATA)")
     return path
+
+
+def kitti_scans(count):
+    """The first sweeps of KITTI 0001, which has ground truth."""
+    return list(islice(open_log(shared_data("3d/kitti_0001_first54.mcap")).scans(), count))
 
 
 def configured(dimension, changes=None):

@@ -4,11 +4,12 @@ import sys
 
 import numpy as np
 import pytest
-from scenes import shared_data
+from scenes import kitti_scans, shared_data
 
 from pipeline import baselines, lie
 from pipeline.baselines.baseline import finite
 from pipeline.errors import InputError, MissingExtraError
+from pipeline.trajectory import read_tum
 
 PACKAGES = {
     "kiss-icp": "kiss_icp",
@@ -22,11 +23,8 @@ NO_TIMES = np.empty(0, np.float32)
 
 @pytest.fixture(scope="module")
 def drive():
-    """Eight sweeps of a real drive with the motion between them."""
-    pytest.importorskip("mcap_ros2.decoder")
-    from tests.benchmarks.odometry3d import read
-
-    return read(shared_data("3d/kitti_0001_first54.mcap"), 8)
+    """Eight sweeps of a real drive."""
+    return kitti_scans(8)
 
 
 def create(name):
@@ -38,7 +36,7 @@ def create(name):
 
 def track(name, drive, times=NO_TIMES):
     baseline = create(name)
-    return np.array([baseline.track(c, times, int(s)) for c, s in zip(drive.clouds, drive.stamps_ns, strict=True)])
+    return np.array([baseline.track(scan.points, times, scan.stamp_ns) for scan in drive])
 
 
 def test_the_names_are_those_known_here():
@@ -50,7 +48,7 @@ def test_the_names_are_those_known_here():
 def test_a_baseline_tracks_a_real_drive(name, drive):
     limit_m = 0.4 if name == "open3d-p2p" else 0.1
     poses = track(name, drive)
-    truth = drive.ground_truth.poses[:8]
+    truth = read_tum(shared_data("3d/kitti_0001_first54.tum")).poses[:8]
     motion = lie.inverse(poses[:-1]) @ poses[1:]
     true_motion = lie.inverse(truth[:-1]) @ truth[1:]
     error = lie.inverse(true_motion) @ motion
@@ -94,12 +92,13 @@ def test_kiss_icp_answers_at_the_stamp_wherever_it_lies_in_the_sweep(drive):
     pytest.importorskip("kiss_icp")
     at_end, at_start = create("kiss-icp"), create("kiss-icp")
     previous = np.eye(4)
-    for cloud, stamp_ns in zip(drive.clouds[:5], drive.stamps_ns, strict=False):
+    for scan in drive[:5]:
+        cloud = scan.points
         azimuth = np.arctan2(cloud[:, 1], cloud[:, 0]).astype(np.float32)
         share = (np.float32(np.pi) - azimuth) / np.float32(2 * np.pi)
         share = (share - share.min()) / np.ptp(share)
-        end = at_end.track(cloud, np.float32(0.1) * (share - 1), int(stamp_ns))
-        start = at_start.track(cloud, np.float32(0.1) * share, int(stamp_ns))
+        end = at_end.track(cloud, np.float32(0.1) * (share - 1), scan.stamp_ns)
+        start = at_start.track(cloud, np.float32(0.1) * share, scan.stamp_ns)
         np.testing.assert_allclose(start, previous, atol=2e-3)
         previous = end
     assert np.linalg.norm(previous[:3, 3]) > 3.0

@@ -3,7 +3,7 @@
 import naive_maps as naive
 import numpy as np
 import pytest
-from scenes import shared_data
+from scenes import kitti_scans, shared_data
 
 from pipeline import lie
 from pipeline.config import MapsConfig
@@ -245,13 +245,9 @@ def test_small_gicp_reads_our_ply(tmp_path):
 
 
 def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():
-    decoding = pytest.importorskip("mcap_ros2.decoder")
-    from tests.benchmarks.odometry3d import read
-
-    assert decoding
-    recording = read(shared_data("3d/kitti_0001_first54.mcap"), 10)
+    sweeps = kitti_scans(10)
     truth = read_tum(shared_data("3d/kitti_0001_first54.tum"))
-    scans = list(zip(truth.poses, recording.clouds, strict=False))
+    scans = [(pose, sweep.points) for pose, sweep in zip(truth.poses, sweeps, strict=False)]
     grid = draw_grid(scans, MapsConfig())
     road = [cell(grid, *pose[:2, 3]) for pose in truth.poses[:10]]
     assert max(road) < 0.0

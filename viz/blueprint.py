@@ -10,8 +10,8 @@ from viz import entities
 from viz.shapes import Floats
 
 _PLAY_S = 30.0
+_ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
 _PLOTS = {
-    "time by stage": entities.TIME,
     "inliers": entities.INLIERS,
     "inlier share": entities.INLIER_SHARE,
     "residual": entities.RESIDUAL,
@@ -29,8 +29,10 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     whole = rrb.TimeAxis(
         view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
     )
+    ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
     plots = rrb.Tabs(
-        *(rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole) for name, entity in _PLOTS.items())
+        rrb.TimeSeriesView(origin=entities.TIME, name="time by stage", axis_x=whole, axis_y=ordinary_ms),
+        *(rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole) for name, entity in _PLOTS.items()),
     )
     texts = rrb.Tabs(
         rrb.TextDocumentView(origin=entities.LEGEND, name="legend"),
