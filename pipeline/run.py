@@ -36,7 +36,7 @@ class Job:
     ----------
     logs : the files of one log
     out : the run directory
-    config_file : instead of the preset; overrides : on top
+    config_file : on top of the preset; overrides : on top of both
     sinks : where the recording goes
     ground_truth : a TUM file; None where the log's own is good
     force : whether a run directory of that name is replaced

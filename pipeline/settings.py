@@ -1,4 +1,4 @@
-"""The effective configuration: defaults, then a preset or a file, then flags."""
+"""The effective configuration: defaults, then a preset, then a file, then flags."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ class Settings:
 def load_settings(
     dimension: int | None = None, *, file: Path | None = None, overrides: Sequence[Override] = ()
 ) -> Settings:
-    """Defaults < ``file``, or without one the preset for logs of this dimension < ``overrides``.
+    """Defaults < the preset for logs of this dimension, if it is known < ``file`` < ``overrides``.
 
     Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
     """
+    layer: dict[str, Value] = {}
+    source = "defaults"
+    if dimension is not None:
+        layer = read_layer(preset_path(PRESETS[dimension]))
+        source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
     if file is not None:
-        layer, source = read_layer(file), str(file)
-    elif dimension is not None:
-        name = PRESETS[dimension]
-        layer = read_layer(preset_path(name))
-        source = f"preset {name}, chosen because the log is {dimension}D"
-    else:
-        layer, source = {}, "defaults"
+        layer |= read_layer(file)
+        source += f", {file}"
     values = {key: spec.default for key, spec in config_keys().items()} | layer
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
     flags = {override.key: override.flag for override in overrides}
-    is_final = file is not None or dimension is not None  # else a preset may still change all but log.*
+    is_final = dimension is not None  # else a preset may still change all but log.*
     _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
     changed = "".join(f", {key} {values[key]}" for key in flags)
     return Settings(msgspec.convert(_tree(values), Config), source + changed)
@@ -71,7 +71,7 @@ def read_layer(file: Path) -> dict[str, Value]:
     try:
         tree = tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{file}: no such file; check --config, or leave it out to use a preset") from None
+        raise InputError(f"{file}: no such file; check --config") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -14,7 +14,7 @@ from pipeline.config_keys import Value, config_keys
 from pipeline.settings import Settings, dump, flatten, load_settings
 
 _FILE = click.option(
-    "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file instead of the preset."
+    "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset."
 )
 _LIDAR = click.option(
     "--lidar", type=click.Choice(["2d", "3d"]), help="The preset that a log of this kind would get."

@@ -23,7 +23,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make."
 )
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file instead of the preset.")
+@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
 @click.option(
     "--rerun",

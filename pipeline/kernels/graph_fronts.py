@@ -136,8 +136,7 @@ def lay_out_blocks(
     block_rows, block_columns (B,) : variables of every block, kept one after the other, row-major
     """
     count = fronts.pivots.size
-    total = fronts.rows[fronts.row_start[count] - 1] + 1
-    front_of = np.empty(total, np.int64)
+    front_of = np.empty(sizes.sum(), np.int64)
     for f in range(count):
         for q in range(fronts.row_start[f], fronts.row_start[f] + fronts.pivots[f]):
             front_of[fronts.rows[q]] = f

@@ -1,0 +1,694 @@
+"""The command line: what it prints where, its exit codes, and one line for everything that can go wrong."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+import tomllib
+
+import click
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from naive_logs import (
+    SECOND,
+    STAMP_NS,
+    cloud_said,
+    laser_scan,
+    odometry,
+    odometry_said,
+    point_cloud,
+    scan_said,
+    write,
+)
+from scenes import ROOT, configured
+
+from pipeline.__main__ import main, scanchain
+from pipeline.settings import flatten
+from pipeline.simulate import simulate
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """Six seconds in the simulated office, 60 scans, with the truth beside it."""
+    path = tmp_path_factory.mktemp("log") / "office.mcap"
+    simulate("office", path, duration_s=6.0)
+    return path
+
+
+@pytest.fixture
+def call(capfd):
+    """Run a command; its exit code, its output, and what it said on stderr, libraries included."""
+
+    def run(*words):
+        code = main([str(word) for word in words])
+        return code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refused(call, tmp_path):
+    """Run a command that must fail as bad input: the one line it says."""
+
+    def run(*words):
+        before = sorted(tmp_path.rglob("*"))
+        code, output, errors = call(*words)
+        assert code == 2 and output == ""
+        assert re.fullmatch(r"error: [^\n]+\n", errors), errors
+        assert "Traceback" not in errors and "Error:" not in errors
+        assert sorted(tmp_path.rglob("*")) == before, "something was left behind"
+        return errors
+
+    return run
+
+
+def says(text, *parts):
+    missing = [str(part) for part in parts if str(part) not in text]
+    assert not missing, f"{missing} not in: {text}"
+
+
+def commands(group=scanchain, words=()):
+    """Every command and group with the words that call it."""
+    yield words, group
+    if isinstance(group, click.Group):
+        for name, command in group.commands.items():
+            yield from commands(command, (*words, name))
+
+
+# help
+
+
+@pytest.mark.parametrize("words", [words for words, _ in commands()], ids=" ".join)
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_every_command_has_help_with_examples_of_itself(call, words, flag):
+    code, output, errors = call(*words, flag)
+    assert (code, errors) == (0, "")
+    says(output, "Usage: scanchain", "Examples:", f"\n    {' '.join(('scanchain', *words))} ")
+
+
+def test_every_option_of_every_command_says_what_it_is_for():
+    for words, command in commands():
+        for option in (parameter for parameter in command.params if isinstance(parameter, click.Option)):
+            assert option.help, f"{words} {option.opts}"
+
+
+@pytest.mark.parametrize("words", [words for words, group in commands() if isinstance(group, click.Group)])
+def test_a_group_without_a_command_shows_its_help_and_fails(call, words):
+    code, output, _ = call(*words)
+    assert code == 2 and "Examples:" in output
+
+
+def test_the_version_is_that_of_the_package(call):
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert call("--version") == (0, f"scanchain {version}\n", "")
+
+
+def test_the_examples_of_run_are_commands_that_parse():
+    text = next(command for words, command in commands() if words == ("run",)).help
+    examples = [line.split()[1:] for line in text.splitlines() if line.strip().startswith("scanchain ")]
+    assert len(examples) >= 4
+    for words in examples:
+        scanchain.commands["run"].make_context("run", words[1:], obj=None)
+
+
+# what a log can be wrong about
+
+
+def test_no_such_file(refused, tmp_path):
+    says(
+        refused("run", tmp_path / "absent.mcap", "--out", tmp_path / "a"),
+        tmp_path / "absent.mcap",
+        "check the path",
+    )
+
+
+def test_a_directory(refused, tmp_path):
+    says(refused("run", tmp_path, "--out", tmp_path / "a"), tmp_path, "name the .mcap files in it")
+
+
+def test_an_empty_file(refused, tmp_path):
+    (tmp_path / "x.mcap").touch()
+    says(refused("run", tmp_path / "x.mcap", "--out", tmp_path / "a"), tmp_path / "x.mcap", "copy it again")
+
+
+def test_not_an_mcap(refused, tmp_path):
+    (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n" * 9)
+    text = refused("run", tmp_path / "x.bag", "--out", tmp_path / "a")
+    says(text, tmp_path / "x.bag", "not an MCAP", "scanchain convert")
+
+
+def test_a_log_without_a_lidar_lists_what_it_holds(refused, tmp_path):
+    path = write(tmp_path / "x.mcap", [odometry_said(STAMP_NS, odometry(STAMP_NS, 0, 0), "/wheels")])
+    text = refused("run", path, "--out", tmp_path / "a")
+    says(text, path, "no lidar topic", "/wheels (nav_msgs/msg/Odometry)")
+
+
+def test_a_topic_that_is_not_there_or_no_lidar_lists_those_to_choose_from(refused, tmp_path, office):
+    for topic in ("/nope", "/odom"):
+        text = refused("run", office, "--out", tmp_path / "a", "--topic", topic)
+        says(text, office, topic, "choose --topic from", "/scan (sensor_msgs/msg/LaserScan)")
+
+
+def test_several_lidars_ask_for_a_choice(refused, tmp_path):
+    scans = [scan_said(STAMP_NS, laser_scan(STAMP_NS, [1.0] * 9), topic) for topic in ("/front", "/rear")]
+    path = write(tmp_path / "x.mcap", scans)
+    says(refused("run", path, "--out", tmp_path / "a"), path, "--topic", "/front", "/rear")
+
+
+XYZ = [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1)]
+POINTS = np.zeros(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+NOWHERE = np.full(60, np.nan, "<f4").view(POINTS.dtype)
+
+
+@pytest.mark.parametrize(
+    ("lie", "words"),
+    [
+        ({"fields": XYZ[:2]}, ["has no field z", "it has: x, y"]),
+        ({"fields": XYZ[1:]}, ["has no field x", "it has: y, z"]),
+        ({"fields": []}, ["has no field x y z"]),
+        ({"data": bytes(235)}, ["data has 235 bytes", "fewer than the 240 of 1 × 20 points of 12 bytes"]),
+        ({"fields": [*XYZ[:2], ("z", 9, 7, 1)]}, ["field z reaches to byte 13", "beyond point_step 12"]),
+    ],
+)
+def test_a_malformed_cloud_is_told_by_its_number_and_what_is_wrong(refused, tmp_path, lie, words):
+    path = write(tmp_path / "x.mcap", [cloud_said(STAMP_NS, point_cloud(STAMP_NS, POINTS, **lie))])
+    text = refused("run", path, "--out", tmp_path / "a")
+    says(text, f"{path}: scan 0 of /points is malformed", *words, "--start or --end")
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (cloud_said(STAMP_NS, point_cloud(STAMP_NS, NOWHERE)), "of 20 points 20 are NaN or infinite"),
+        (cloud_said(STAMP_NS, point_cloud(STAMP_NS, POINTS)), "20 are (0, 0, 0)"),
+        (cloud_said(STAMP_NS, point_cloud(STAMP_NS, POINTS[:0])), "the cloud is empty"),
+        (scan_said(STAMP_NS, laser_scan(STAMP_NS, [np.inf] * 9)), "of 9 beams 9 are NaN or infinite"),
+    ],
+)
+def test_a_scan_without_a_valid_point_says_why_there_is_none(refused, tmp_path, said, why):
+    path = write(tmp_path / "x.mcap", [said])
+    text = refused("run", path, "--out", tmp_path / "a")
+    says(text, f"{path}: scan 0 of {said.topic} has no valid point", why, "--start or --end")
+
+
+def test_a_span_without_a_scan_names_the_length_of_the_log(refused, tmp_path, office):
+    text = refused("run", office, "--out", tmp_path / "a", "--start", "100")
+    says(text, office, "--start 100", "--end", "6.0 s long")
+
+
+# what arguments can be wrong about
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--matching.max_distanc_m", "1"], ["--matching.max_distanc_m", "did you mean matching.max_distance_m?"]),
+        (["--matching.max_distance_m", "-1"], ["--matching.max_distance_m is -1", "a number > 0, in m"]),
+        (["--matching.max_distance_m=-1"], ["--matching.max_distance_m is -1", "a number > 0, in m"]),
+        (["--matching.max_distance_m"], ["--matching.max_distance_m needs a value", "--help"]),
+        (["--every", "0"], ["--every", "log.every is 0", "whole number >= 1"]),
+        (["--start", "soon"], ["--start", "'soon'", "a number >= 0, in s"]),
+        (["--start", "3", "--end", "2"], ["log.start_s is 3", "below log.end_s (2)"]),
+        (["--matcher", "gicp"], ["--matcher", "'gicp'", "one of plicp, svd"]),
+        (["--rerun", "off,save"], ["--rerun is 'off,save'", "save, spawn, connect, web"]),
+        (["--rerun", "spawn,web"], ["only one of spawn, connect, web"]),
+        (["--rerun", ""], ["--rerun is ''", "off"]),
+        (["--gt", "absent.tum"], ["absent.tum", "check the path"]),
+        (["--gt", "/nope"], ["log.ground_truth_topic /nope", "/odom"]),
+        (["--log.odometry_topic", "/nope"], ["log.odometry_topic /nope", "/odom"]),
+        (["--config", "absent.toml"], ["absent.toml", "--config"]),
+        (["--colour"], ["No such option '--colour'", "scanchain run --help"]),
+    ],
+)
+def test_a_wrong_flag_names_itself_its_value_and_what_is_allowed(refused, tmp_path, office, flags, words):
+    says(refused("run", office, "--out", tmp_path / "a", *flags), *words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[matching]\nmax_distanc_m = 1", ["matching.max_distanc_m", "did you mean matching.max_distance_m?"]),
+        ("[matching]\nmax_distance_m = -1", ["matching.max_distance_m is -1", "a number > 0, in m"]),
+        ("[matching\n", ["is not TOML", "line 1"]),
+    ],
+)
+def test_a_wrong_config_file_is_named_with_the_key(refused, tmp_path, office, text, words):
+    (tmp_path / "mine.toml").write_text(text)
+    says(refused("run", office, "--out", tmp_path / "a", "--config", tmp_path / "mine.toml"), "mine.toml", *words)
+
+
+def test_missing_arguments_point_to_the_help(refused, office):
+    says(refused("run", office), "'--out'", "scanchain run --help")
+    says(refused("run"), "'LOG...'", "scanchain run --help")
+    says(refused("rum"), "'rum'", "scanchain --help")
+
+
+def test_an_existing_out_is_refused_before_anything_is_read(refused, tmp_path):
+    (tmp_path / "a").mkdir()
+    text = refused("run", tmp_path / "absent.mcap", "--out", tmp_path / "a")
+    says(text, tmp_path / "a", "exists", "--force")
+    (tmp_path / "file").touch()
+    says(refused("run", tmp_path / "absent.mcap", "--out", tmp_path / "file"), "is a file", "--out")
+
+
+def test_a_file_named_twice_is_refused(refused, tmp_path, office):
+    says(refused("run", office, office, "--out", tmp_path / "a"), office, "2 times", "once")
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["simulate", "mars", "x.mcap"], ["'mars'", "office, town"]),
+        (["simulate", "office", "x.mcap", "--sensor", "sonar"], ["'sonar'", "lms-270"]),
+        (["simulate", "office", "x.mcap", "--duration", "nan"], ["duration_s nan", "36000"]),
+        (["simulate", "office", "x.mcap", "--duration", "long"], ["--duration", "simulate --help"]),
+        (["simulate", "office", "x.tum"], ["x.tum", "x.mcap"]),
+        (["sequence", "get", "mars"], ["'mars'", "demo-office"]),
+        (["sequence", "get", "intel", "--out", "logs"], ["intel.mcap", "download", "scanchain convert"]),
+        (["info", "absent.mcap"], ["absent.mcap", "check the path"]),
+        (["evaluate", "absent.tum"], ["GT.tum", "--relations"]),
+        (["evaluate", "absent.tum", "absent.tum"], ["absent.tum", "check the path"]),
+        (["config", "show", "--loops.enable", "off"], ["--loops.enable", "loops.enabled"]),
+        (["config", "dump", "--lidar", "4d"], ["--lidar", "'4d'", "config dump --help"]),
+        (["view", "absent"], ["absent", "scanchain run"]),
+    ],
+)
+def test_the_other_commands_refuse_in_one_line_too(refused, monkeypatch, tmp_path, words, parts):
+    monkeypatch.chdir(tmp_path)
+    says(refused(*words), *parts)
+
+
+@pytest.mark.parametrize("limit", ["nan", "-1", "inf"])
+def test_a_time_difference_that_is_none_is_refused(refused, office, limit):
+    truth = office.with_suffix(".tum")
+    says(refused("evaluate", truth, truth, "--max-difference", limit), f"--max-difference is {limit}", "0 up")
+
+
+def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, office):
+    def broken(paths):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr("pipeline.logs.info.describe", broken)
+    monkeypatch.delenv("SCANCHAIN_DEBUG", raising=False)
+    code, output, errors = call("info", office)
+    assert (code, output) == (1, "")
+    assert errors == "error: RuntimeError: two lines; SCANCHAIN_DEBUG=1 shows where it happened\n"
+    monkeypatch.setenv("SCANCHAIN_DEBUG", "1")
+    with pytest.raises(RuntimeError):
+        call("info", office)
+
+
+def test_ctrl_c_is_one_line_with_exit_code_1(call, monkeypatch, office):
+    def interrupted(paths):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.logs.info.describe", interrupted)
+    code, output, errors = call("info", office)
+    assert (code, output, errors.strip()) == (1, "", "error: interrupted")
+
+
+# run
+
+
+def test_a_run_is_quiet_but_for_its_summary_when_piped(call, tmp_path, office):
+    code, output, errors = call("run", office, "--out", tmp_path / "a")
+    assert (code, errors) == (0, "")
+    assert output == (tmp_path / "a" / "summary.txt").read_text() + f"written        {tmp_path / 'a'}\n"
+    says(output, office, "/scan", "preset lidar2d, chosen because the log is 2D", "60 over 5.9 s: 60 ok")
+
+
+def test_json_prints_the_metrics_and_nothing_else(call, tmp_path, office):
+    code, output, errors = call("run", office, "--out", tmp_path / "a", "--json", "--rerun", "off")
+    assert (code, errors) == (0, "")
+    assert json.loads(output) == json.loads((tmp_path / "a" / "metrics.json").read_text())
+    assert json.loads(output)["scans"] == 60
+
+
+def test_rerun_off_leaves_out_the_recording_alone(call, tmp_path, office):
+    call("run", office, "--out", tmp_path / "with")
+    call("run", office, "--out", tmp_path / "without", "--rerun", "off")
+    files = [{path.name for path in (tmp_path / name).iterdir()} for name in ("with", "without")]
+    assert files[0] - files[1] == {"recording.rrd"} and files[1] < files[0]
+
+
+def metrics(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def config(folder):
+    return flatten_toml((folder / "config.toml").read_text())
+
+
+def flatten_toml(text):
+    return {f"{a}.{b}": value for a, branch in tomllib.loads(text).items() for b, value in branch.items()}
+
+
+def stamps(folder):
+    return [line.split()[0] for line in (folder / "trajectory.tum").read_text().splitlines()]
+
+
+def test_start_end_and_every_choose_scans(call, tmp_path, office):
+    out = ["--rerun", "off", "--out"]
+    assert call("run", office, *out, tmp_path / "whole")[0] == 0
+    assert call("run", office, *out, tmp_path / "a", "--start", "1", "--end", "3", "--every", "2")[0] == 0
+    whole, chosen = stamps(tmp_path / "whole"), stamps(tmp_path / "a")
+    # a scan is logged at its end: the one that begins 0.9 s after the log's begin is the first
+    assert chosen == whole[9:30:2]
+    values = config(tmp_path / "a")
+    assert (values["log.start_s"], values["log.end_s"], values["log.every"]) == (1.0, 3.0, 2)
+
+
+def test_the_short_flags_stand_for_keys_and_the_keys_beat_them(call, tmp_path, office):
+    out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
+    assert call("run", office, *out, "--matcher", "svd", "--no-loops", "--topic", "/scan")[0] == 0
+    expected = {"matching.matcher": "svd", "loops.enabled": False, "log.topic": "/scan"}
+    assert config(tmp_path / "a") == flatten(configured(2)) | expected
+    words = ["--matching.matcher", "plicp", "--loops.enabled=true", "--local_map.voxel_size_m", "0.15"]
+    assert call("run", office, *words, *out, "--matcher", "svd", "--no-loops")[0] == 0
+    assert config(tmp_path / "a") == flatten(configured(2)) | {"local_map.voxel_size_m": 0.15}
+
+
+def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):
+    mine = tmp_path / "mine.toml"
+    mine.write_text("[maps]\nvoxel_size_m = 0.4\n")
+    _, output, _ = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--config", mine, "--every", "2")
+    source = f"preset lidar2d, chosen because the log is 2D, {mine}, log.every 2"
+    says(output, f"configuration  {source}")
+    assert config(tmp_path / "a") == flatten(configured(2)) | {"maps.voxel_size_m": 0.4, "log.every": 2}
+    assert json.loads((tmp_path / "a" / "run.json").read_text())["configuration"] == source
+
+
+@pytest.mark.parametrize("matcher", ["plicp", "svd"])
+def test_both_matchers_stay_on_the_way_in_the_office(call, tmp_path, office, matcher):
+    call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--matcher", matcher)
+    found = metrics(tmp_path / "a")
+    assert found["ok"] == 60 and found["ground_truth"]["optimised"]["ate_rmse_m"] < 0.02
+
+
+def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_path, office):
+    truth = np.loadtxt(office.with_suffix(".tum"))
+    stretched = truth * np.array([1.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    lines = [f"{a:.9f} " + " ".join(map(repr, rest)) for a, *rest in stretched.tolist()]
+    (tmp_path / "other.tum").write_text("\n".join(lines))
+    sources = {"log": [], "/ground_truth": ["--gt", "/ground_truth"], "/odom": ["--gt", "/odom"]}
+    sources["other"] = ["--gt", tmp_path / "other.tum"]
+    sources["same"] = ["--gt", office.with_suffix(".tum")]
+    ate_m, named = {}, {}
+    for name, flags in sources.items():
+        out = tmp_path / name.strip("/")
+        call("run", office, "--out", out, "--rerun", "off", "--force", *flags)
+        found = metrics(out)["ground_truth"]
+        ate_m[name], named[name] = found["optimised"]["ate_rmse_m"], found["source"]
+    assert ate_m["log"] == ate_m["/ground_truth"] == pytest.approx(ate_m["same"], abs=1e-7)
+    assert ate_m["other"] > 0.3
+    assert named == {
+        "log": "/ground_truth",
+        "/ground_truth": "/ground_truth",
+        "/odom": "/odom",
+        "same": str(office.with_suffix(".tum")),
+        "other": str(tmp_path / "other.tum"),
+    }
+
+
+def test_a_truth_of_another_time_is_a_warning_and_the_run_stands(call, tmp_path, office):
+    (tmp_path / "old.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
+    code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "old.tum")
+    assert code == 0 and errors.count("\n") == 1
+    assert errors.startswith(f"warning: no accuracy against {tmp_path / 'old.tum'}: ")
+    says((tmp_path / "a" / "summary.txt").read_text(), "no accuracy against")
+    assert metrics(tmp_path / "a")["ground_truth"] is None
+
+
+def test_a_log_in_two_files_gives_what_the_one_file_gives(call, tmp_path, office):
+    halves = [tmp_path / "0.mcap", tmp_path / "1.mcap"]
+    split(office, halves)
+    out = ["--rerun", "off", "--out"]
+    call("run", office, *out, tmp_path / "whole")
+    code, output, errors = call("run", *halves, *out, tmp_path / "a")
+    assert (code, errors) == (0, "")
+    says(output, f"{halves[0]}, {halves[1]} /scan")
+    for name in ("trajectory.tum", "odometry.tum", "graph.g2o", "map.ply"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    logs = json.loads((tmp_path / "a" / "run.json").read_text())["logs"]
+    assert [log["path"] for log in logs] == list(map(str, halves))
+
+
+def split(path, halves):
+    """Write the messages of a log into two, each with its own schemas and channels."""
+    with path.open("rb") as stream:
+        messages = list(make_reader(stream).iter_messages())
+    middle = len(messages) // 2
+    for half, part in zip(halves, (messages[:middle], messages[middle:]), strict=True):
+        with half.open("wb") as stream:
+            writer, channels = Writer(stream), {}
+            writer.start(profile="ros2")
+            for schema, channel, message in part:
+                if channel.topic not in channels:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+                number = channels[channel.topic]
+                writer.add_message(number, message.log_time, message.data, message.publish_time)
+            writer.finish()
+
+
+def test_a_log_cut_off_is_read_up_to_the_damage_and_the_damage_is_told(call, tmp_path, office):
+    path = tmp_path / "cut.mcap"
+    whole = office.read_bytes()
+    path.write_bytes(whole[: len(whole) * 9 // 10])
+    code, output, errors = call("run", path, "--out", tmp_path / "a")
+    count = len(stamps(tmp_path / "a"))
+    assert code == 0 and 30 < count < 60
+    assert all(line.startswith("warning: ") for line in errors.splitlines())
+    says(errors, path, "cut off", f"{count} scans of /scan were recovered")
+    says((tmp_path / "a" / "summary.txt").read_text(), "cut off", f"{count} scans of /scan were recovered")
+    assert "cut off" in output and json.loads((tmp_path / "a" / "run.json").read_text())["complete"]
+
+
+def test_a_log_cut_off_before_its_first_scan_is_refused(refused, tmp_path, office):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(office.read_bytes()[:200])
+    says(refused("run", path, "--out", tmp_path / "a"), path)
+
+
+def test_a_robot_that_stands_still_gives_a_run_with_one_keyframe(call, tmp_path):
+    ranges = [np.linspace(1.0, 3.0, 200)] * 5
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k * SECOND, r)) for k, r in enumerate(ranges)]
+    path = write(tmp_path / "still.mcap", said)
+    for number in range(20):  # more than once: what is read beyond an array depends on what lies there
+        out = tmp_path / str(number)
+        code, _, errors = call("run", path, "--out", out, "--rerun", "off")
+        assert (code, errors) == (0, "")
+        assert metrics(out)["keyframes"] == 1 and metrics(out)["travelled_m"] < 0.01
+
+
+# the other commands
+
+
+def test_info_tells_topics_rates_and_what_a_run_would_use(call, office):
+    code, output, errors = call("info", office)
+    assert (code, errors) == (0, "")
+    says(output, office, "/odom", "/tf_static", "lidar     /scan: 2D, 60 scans", "wheels    /odom")
+    assert re.search(r"topic     /scan +sensor_msgs/LaserScan +60 messages +1[01]\.\d Hz  cdr", output)
+
+
+def test_info_as_json_counts_what_the_mcap_package_counts(call, office):
+    code, output, errors = call("info", office, "--json")
+    assert (code, errors) == (0, "")
+    said = json.loads(output)
+    with office.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    counts = {
+        channel.topic: summary.statistics.channel_message_counts[number]
+        for number, channel in summary.channels.items()
+    }
+    assert {topic["topic"]: topic["messages"] for topic in said["topics"]} == counts
+    assert (said["lidar"], said["dimension"], said["scans"]) == ("/scan", 2, 60)
+    assert (said["odometry"], said["problem"], said["damage"]) == ("/odom", "", [])
+
+
+def test_info_of_a_log_without_a_lidar_says_so_and_still_lists_it(call, tmp_path):
+    path = write(tmp_path / "x.mcap", [odometry_said(STAMP_NS, odometry(STAMP_NS, 0, 0))])
+    code, output, _ = call("info", path)
+    assert code == 0
+    says(output, "topic     /odom", f"problem   {path}: has no lidar topic")
+
+
+def test_info_of_a_damaged_log_tells_the_damage(call, tmp_path, office):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(office.read_bytes()[:-2000])
+    says(call("info", path)[1], "damage ", "cut off")
+    assert json.loads(call("info", path, "--json")[1])["damage"]
+
+
+def quarter(path, scale=1.0, count=40):
+    """Poses on a quarter of a circle of 20 m, tangential, a second apart."""
+    lines = []
+    for k in range(count):
+        a = 0.5 * math.pi * k / (count - 1)
+        x, y = 20.0 * scale * math.sin(a), 20.0 * scale * (1.0 - math.cos(a))
+        lines.append(f"{100 + k}.0 {x!r} {y!r} 0 0 0 {math.sin(0.5 * a)!r} {math.cos(0.5 * a)!r}\n")
+    path.write_text("".join(lines))
+    return path
+
+
+def test_evaluate_prints_every_metric_with_its_definition(call, tmp_path):
+    estimate, truth = quarter(tmp_path / "est.tum", 1.1), quarter(tmp_path / "gt.tum")
+    code, output, errors = call("evaluate", estimate, truth)
+    assert (code, errors) == (0, "")
+    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE rmse", "over 10 m along the reference", "KITTI: translation")
+    tree = json.loads(call("evaluate", estimate, truth, "--align", "first", "--json")[1])
+    assert set(tree) == {"ate", "rpe_1_pose", "rpe_10_m", "kitti"}
+    assert tree["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)
+    assert tree["ate"]["translation_m"]["maximum"] == pytest.approx(0.1 * 20.0 * 2**0.5, rel=1e-6)
+    assert tree["kitti"]["translation_share"] == pytest.approx(0.1, rel=0.05)
+
+
+def test_evaluate_of_a_trajectory_with_itself_is_zero(call, tmp_path):
+    truth = quarter(tmp_path / "gt.tum")
+    tree = json.loads(call("evaluate", truth, truth, "--json")[1])
+    assert tree["ate"]["translation_m"]["rmse"] < 1e-9 and tree["rpe_10_m"]["translation_m"]["rmse"] < 1e-9
+
+
+def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tmp_path):
+    short = quarter(tmp_path / "gt.tum", 0.1)
+    code, output, _ = call("evaluate", short, short)
+    assert code == 0
+    says(output, "ATE rmse", "rpe_10_m: none: ", "kitti: none: ")
+    assert json.loads(call("evaluate", short, short, "--json")[1])["kitti"] is None
+
+
+def test_evaluate_measures_relations_alone_and_beside_the_truth(call, tmp_path):
+    truth = quarter(tmp_path / "gt.tum")
+    step = 0.5 * math.pi / 39
+    x, y = 20.0 * math.sin(step) + 0.05, 20.0 * (1.0 - math.cos(step))  # wrong by 5 cm
+    (tmp_path / "set.relations").write_text(f"103.0 104.0 {x} {y} 0 0 0 {step}\n")
+    code, output, _ = call("evaluate", truth, "--relations", tmp_path / "set.relations")
+    assert code == 0 and "ATE" not in output
+    says(output, "relations", "Kümmerle", "1 relations, 0 missing")
+    tree = json.loads(call("evaluate", truth, truth, "--relations", tmp_path / "set.relations", "--json")[1])
+    assert tree["relations"]["translation_m"]["mean"] == pytest.approx(0.05, abs=1e-9)
+    assert tree["relations"]["rotation_rad"]["mean"] < 1e-9 and "ate" in tree
+
+
+def test_evaluate_agrees_with_the_metrics_of_the_run(call, tmp_path, office):
+    call("run", office, "--out", tmp_path / "a", "--rerun", "off")
+    truth = office.with_suffix(".tum")
+    for name, key in (("trajectory.tum", "optimised"), ("odometry.tum", "odometry")):
+        tree = json.loads(call("evaluate", tmp_path / "a" / name, truth, "--json")[1])
+        said = metrics(tmp_path / "a")["ground_truth"][key]
+        assert tree["ate"]["translation_m"]["rmse"] == pytest.approx(said["ate_rmse_m"], abs=1e-6)
+
+
+def test_config_show_lists_every_key_with_unit_and_range_and_marks_changes(call):
+    code, output, errors = call("config", "show", "--lidar", "2d", "--log.every", "7")
+    assert (code, errors) == (0, "")
+    says(output, "# preset lidar2d", "log.every 7")
+    lines = {line[2:].split()[0]: line for line in output.splitlines()[1:]}
+    defaults = flatten(configured(3))
+    values = flatten(configured(2, {"log.every": 7}))
+    assert list(lines) == list(values)
+    assert {key for key, line in lines.items() if line.startswith("*")} == {
+        key for key in values if values[key] != defaults[key]
+    }
+    assert lines["matching.max_distance_m"].split() == [
+        "*",
+        "matching.max_distance_m",
+        "0.5",
+        "m",
+        "number",
+        ">",
+        "0",
+    ]
+
+
+def test_config_show_as_json_has_value_unit_range_and_default(call, tmp_path):
+    (tmp_path / "mine.toml").write_text("[matching]\nmax_distance_m = 0.3\n")
+    rows = json.loads(call("config", "show", "--json", "--config", tmp_path / "mine.toml")[1])
+    row = next(row for row in rows if row["key"] == "matching.max_distance_m")
+    assert row == {
+        "key": "matching.max_distance_m", "value": 0.3, "unit": "m", "range": "number > 0", "default": 2.0,
+    }  # fmt: skip
+    assert next(row for row in rows if row["key"] == "log.end_s")["value"] is None
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_config_dump_prints_can_be_given_back(call, tmp_path, dimension):
+    _, output, _ = call("config", "dump", "--lidar", f"{dimension}d", "--matching.matcher", "svd")
+    expected = configured(dimension, {"matching.matcher": "svd"})
+    assert flatten_toml(output) == flatten(expected)
+    (tmp_path / "mine.toml").write_text(output)
+    assert call("config", "dump", "--config", tmp_path / "mine.toml")[1] == output
+
+
+def test_sequence_list_knows_every_folder_of_the_catalogue(call):
+    folders = sorted(path.parent.name for path in (ROOT / "sequences").glob("*/sequence.toml"))
+    code, output, errors = call("sequence", "list")
+    assert (code, errors) == (0, "")
+    assert [line.split()[0] for line in output.splitlines()] == folders
+    tree = json.loads(call("sequence", "list", "--json")[1])
+    assert list(tree) == folders and tree["demo-office"]["source"]["world"] == "office"
+
+
+def test_sequence_get_does_not_make_again_what_is_there(call, tmp_path):
+    (tmp_path / "demo-office.mcap").write_bytes(b"there")
+    code, output, errors = call("sequence", "get", "demo-office", "--out", tmp_path, "--json")
+    assert (code, errors) == (0, "")
+    assert json.loads(output) == {"name": "demo-office", "path": str(tmp_path / "demo-office.mcap")}
+    assert (tmp_path / "demo-office.mcap").read_bytes() == b"there"
+
+
+def test_simulate_writes_a_log_and_its_truth_once(call, refused, tmp_path):
+    words = ["simulate", "office", tmp_path / "x.mcap", "--duration", "1", "--seed", "5"]
+    code, output, errors = call(*words)
+    assert (code, errors) == (0, "")
+    says(output, tmp_path / "x.mcap", "10 scans", tmp_path / "x.tum")
+    assert len(np.loadtxt(tmp_path / "x.tum")) == 10
+    first = (tmp_path / "x.mcap").read_bytes()
+    says(refused(*words), tmp_path / "x", "exists", "--force")
+    assert call(*words, "--force")[0] == 0
+    assert (tmp_path / "x.mcap").read_bytes() == first
+
+
+def test_simulate_takes_sensor_noise_and_dropout(call, tmp_path):
+    words = ["--duration", "0.2", "--sensor", "vlp-16", "--dropout", "0.9"]
+    assert call("simulate", "town", tmp_path / "x.mcap", *words)[0] == 0
+    said = json.loads(call("info", tmp_path / "x.mcap", "--json")[1])
+    assert (said["dimension"], said["scans"]) == (3, 2)
+    assert (tmp_path / "x.mcap").stat().st_size < 200_000
+
+
+# as a program
+
+
+def program(*words):
+    return subprocess.run(
+        [sys.executable, "-m", "pipeline", *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+
+
+def test_it_runs_as_a_module_with_its_exit_codes(tmp_path):
+    good = program("config", "show", "--json")
+    assert (good.returncode, good.stderr) == (0, "") and json.loads(good.stdout)
+    bad = program("info", tmp_path / "absent.mcap")
+    assert (bad.returncode, bad.stdout) == (2, "")
+    assert re.fullmatch(r"error: .*absent\.mcap: no such file; check the path\n", bad.stderr)
+
+
+def test_a_reader_that_goes_away_is_no_error_to_talk_about():
+    command = f"{sys.executable} -m pipeline config show --json | head -c 1"
+    answer = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (answer.stdout, answer.stderr) == ("[", "")
+
+
+def test_help_does_not_load_the_heavy_packages():
+    script = """
+import sys
+from pipeline.__main__ import main
+main(["run", "--help"])
+print([name for name in ("numba", "scipy", "pyarrow", "rerun") if name in sys.modules], file=sys.stderr)
+"""
+    answer = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert answer.stderr == "[]\n"

@@ -1,0 +1,467 @@
+"""From a log to a complete run directory, every file read back by somebody else's reader."""
+
+import contextlib
+import hashlib
+import io
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from naive_graph import error
+from naive_maps import served_map
+from rerun.chunk import RrdReader
+from scenes import ROOT, configured, shared_data
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from test_recording import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
+
+from pipeline.__main__ import main
+from pipeline.settings import flatten
+from viz import entities
+
+FILES = {
+    "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
+    "recording.rrd", "steps.parquet", "loops.parquet", "metrics.json", "summary.txt", "config.toml", "run.json",
+}  # fmt: skip
+NOT_TIMED = (
+    "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
+    "loops.parquet", "config.toml",
+)  # fmt: skip
+TIMED_COLUMNS = ["read_s", "preprocess_s", "match_s", "map_s", "loops_s"]
+# the wheels are left out and loops may be short, so that a minute has closures of every verdict
+OFFICE = ("--odometry.prior", "constant-velocity", "--loops.min_travel_m", "5")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A log, the flags it was run with, and the run directory."""
+
+    log: Path
+    flags: tuple[str, ...]
+    folder: Path
+    dimension: int
+
+    @property
+    def metrics(self):
+        return json.loads((self.folder / "metrics.json").read_text())
+
+    @property
+    def steps(self):
+        return {name: np.array(rows) for name, rows in self.table("steps").to_pydict().items()}
+
+    @property
+    def truth(self):
+        return np.loadtxt(self.log.with_suffix(".tum"))
+
+    def table(self, name):
+        return pq.read_table(self.folder / f"{name}.parquet")
+
+    def tum(self, name="trajectory"):
+        return np.loadtxt(self.folder / f"{name}.tum")
+
+
+def succeed(*words):
+    """Run a command; its output."""
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        code = main([str(word) for word in words])
+    assert (code, errors.getvalue()) == (0, "")
+    return output.getvalue()
+
+
+def driven(folder, world, dimension, simulation, flags=()):
+    log = folder / f"{world}.mcap"
+    succeed("simulate", world, log, *simulation)
+    succeed("run", log, "--out", folder / "run", *flags)
+    return Drive(log, tuple(flags), folder / "run", dimension)
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    return driven(tmp_path_factory.mktemp("office"), "office", 2, ["--duration", "60"], OFFICE)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    return driven(tmp_path_factory.mktemp("town"), "town", 3, ["--duration", "3", "--sensor", "vlp-16"])
+
+
+@pytest.fixture(params=["office", "town"])
+def drive(request):
+    return request.getfixturevalue(request.param)
+
+
+def matrices(rows):
+    """Poses (N, 4, 4) of rows x y z qx qy qz qw."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
+    poses[:, :3, 3] = rows[:, :3]
+    return poses
+
+
+def ate_m(estimate, truth):
+    """Root mean square distance after the best rigid alignment, by scipy, of positions that pair row by row."""
+    a, b = (rows[:, 1:4] - rows[:, 1:4].mean(axis=0) for rows in (truth, estimate))
+    return Rotation.align_vectors(a, b)[1] / np.sqrt(len(a))
+
+
+def length_m(rows):
+    return np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1).sum()
+
+
+# the directory
+
+
+def test_a_run_directory_holds_every_file_and_no_other(drive):
+    assert {path.name for path in drive.folder.iterdir()} == FILES
+    assert [path.name for path in drive.folder.parent.iterdir() if "partial" in path.name] == []
+
+
+@pytest.mark.parametrize("name", ["trajectory", "odometry"])
+def test_trajectories_have_a_unit_quaternion_at_the_exact_stamp_of_every_scan(drive, name):
+    stamps = [line.split()[0] for line in (drive.folder / f"{name}.tum").read_text().splitlines()]
+    assert stamps == [line.split()[0] for line in drive.log.with_suffix(".tum").read_text().splitlines()]
+    assert all(re.fullmatch(r"\d+\.\d{9}", stamp) for stamp in stamps)
+    rows = drive.tum(name)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-8)
+    if drive.dimension == 2:
+        assert not rows[:, [3, 4, 5]].any()
+
+
+def test_the_kitti_file_holds_the_same_poses(drive):
+    rows = np.loadtxt(drive.folder / "trajectory.kitti.txt").reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, matrices(drive.tum()[:, 1:])[:, :3], atol=1e-7)
+
+
+def test_steps_have_a_row_a_scan_that_agrees_with_the_trajectories(drive):
+    steps = drive.steps
+    assert steps["index"].tolist() == list(range(len(drive.truth)))
+    for name, prefix in (("trajectory", ""), ("odometry", "odom_")):
+        columns = [steps[prefix + axis] for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        np.testing.assert_allclose(np.column_stack(columns), drive.tum(name)[:, 1:], atol=1e-9)
+    stamps = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in steps["stamp_ns"].tolist()]
+    assert stamps == [line.split()[0] for line in (drive.folder / "trajectory.tum").read_text().splitlines()]
+    assert set(steps["state"]) == {"ok"} and (steps["inliers"] <= steps["points"]).all()
+    for name in TIMED_COLUMNS:
+        assert (steps[name] >= 0.0).all(), name
+    assert (steps["match_s"] > 0.0).all()
+
+
+def test_covariances_are_symmetric_positive_and_of_a_likely_size(drive):
+    k = 3 if drive.dimension == 2 else 6
+    covariances = np.array(drive.table("steps")["covariance"].to_pylist()[1:]).reshape(-1, k, k)
+    np.testing.assert_allclose(covariances, np.swapaxes(covariances, 1, 2), rtol=1e-6, atol=1e-15)
+    assert (np.linalg.eigvalsh(covariances)[:, 0] > 0.0).all()
+    sigma_m = np.sqrt(np.trace(covariances[:, : drive.dimension, : drive.dimension], axis1=1, axis2=2))
+    assert 1e-4 < np.median(sigma_m) < 0.1
+    directions = np.array(drive.table("steps")["degeneracy_direction"].to_pylist())
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-6)
+
+
+def test_the_graph_holds_the_keyframes_and_what_ties_them(drive):
+    vertices, edges = read_g2o(drive.folder / "graph.g2o")
+    steps, metrics = drive.steps, drive.metrics
+    scans = np.flatnonzero(steps["keyframe"] >= 0)
+    assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(vertices)
+    expected = matrices(drive.tum()[scans, 1:])
+    np.testing.assert_allclose(np.array(list(vertices.values())), expected, atol=1e-7)
+    pairs = [(i, j) for i, j, _, _ in edges]
+    chain = [(i, i + 1) for i in range(len(scans) - 1)]
+    loops = drive.table("loops").to_pylist()
+    tied = [(row["target"], row["source"]) for row in loops if "contradicts" in row["reason"]]
+    tied += [(row["target"], row["source"]) for row in loops if row["verdict"] == "accepted"]
+    assert sorted(pairs) == sorted(chain + tied)
+    assert len(tied) == metrics["closures_verified"]
+    for _, _, _, information in edges:
+        assert np.linalg.eigvalsh(information)[0] > 0.0
+
+
+def test_chi2_is_the_sum_over_the_edges_of_the_graph(drive):
+    vertices, edges = read_g2o(drive.folder / "graph.g2o")
+    flat = [0, 1, 3] if drive.dimension == 2 else [0, 1, 2, 3]
+    chi2 = 0.0
+    for i, j, Z, information in edges:
+        e = error(*(T[np.ix_(flat, flat)] for T in (vertices[i], vertices[j], Z)))
+        chi2 += e @ information @ e
+    assert chi2 == pytest.approx(drive.metrics["chi2"], rel=1e-6, abs=1e-6)
+
+
+def read_g2o(path):
+    """Vertices {id: T (4, 4)} and edges (i, j, Z (4, 4), Ω (k, k)) by the format's definition."""
+    vertices, edges = {}, []
+    for line in path.read_text().splitlines():
+        tag, *words = line.split()
+        numbers = np.array(words, float)
+        if tag.startswith("VERTEX"):
+            vertices[int(words[0])] = g2o_pose(numbers[1:])
+            continue
+        assert tag in ("EDGE_SE2", "EDGE_SE3:QUAT"), line
+        k, width = (3, 3) if tag == "EDGE_SE2" else (6, 7)
+        information = np.zeros((k, k))
+        information[np.triu_indices(k)] = numbers[2 + width :]
+        information += np.triu(information, 1).T
+        edges.append((int(words[0]), int(words[1]), g2o_pose(numbers[2 : 2 + width]), information))
+    return vertices, edges
+
+
+def g2o_pose(numbers):
+    if len(numbers) == 7:
+        return matrices(numbers[None])[0]
+    x, y, yaw = numbers
+    return matrices(np.array([[x, y, 0.0, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]]))[0]
+
+
+def test_loop_closures_are_told_with_verdict_and_reason_and_the_accepted_ones_are_true(office):
+    rows, metrics = office.table("loops").to_pylist(), office.metrics
+    verdicts = [row["verdict"] for row in rows]
+    assert (len(rows), verdicts.count("accepted")) == (metrics["closures_tried"], metrics["closures_accepted"])
+    assert set(verdicts) == {"accepted", "rejected"} and all(row["reason"] for row in rows)
+    truth = matrices(office.truth[:, 1:])
+    scans = np.flatnonzero(office.steps["keyframe"] >= 0)
+    for row in rows:
+        assert (row["target_scan"], row["source_scan"]) == (scans[row["target"]], scans[row["source"]])
+        if row["verdict"] == "accepted":
+            measured = matrices(np.array([[row[axis] for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]]))[0]
+            off = np.linalg.inv(truth[row["target_scan"]]) @ truth[row["source_scan"]] @ np.linalg.inv(measured)
+            assert np.linalg.norm(off[:3, 3]) < 0.1 and Rotation.from_matrix(off[:3, :3]).magnitude() < 0.02
+            assert row["weight"] >= 0.1
+        else:
+            assert row["weight"] < 0.1
+
+
+def test_a_run_without_closures_has_an_empty_table_of_the_same_columns(office, town):
+    assert town.table("loops").num_rows == town.metrics["closures_tried"] == 0
+    assert town.table("loops").schema.names == office.table("loops").schema.names
+
+
+def read_ply(path):
+    """Points (N, 3) of a binary PLY by its own header."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert [line for line in lines if line.startswith("property")] == [f"property float {axis}" for axis in "xyz"]
+    (count,) = [int(line.split()[2]) for line in lines if line.startswith("element vertex")]
+    points = np.frombuffer(body, "<f4").reshape(-1, 3)
+    assert len(points) == count > 0 and np.isfinite(points).all()
+    return points
+
+
+def test_the_cloud_and_the_grid_of_a_2d_log_show_the_same_walls(office):
+    points = read_ply(office.folder / "map.ply")
+    cells, origin, resolution_m = served_map(office.folder)
+    assert not points[:, 2].any() and resolution_m == 0.05
+    rows, columns = np.nonzero(cells == 100)
+    walls = np.column_stack([columns, rows]) * resolution_m + np.array(origin[:2]) + 0.5 * resolution_m
+    distance_m, _ = cKDTree(walls).query(points[:, :2])
+    assert np.percentile(distance_m, 90) < 0.1
+    assert {-1, 0, 100} == set(np.unique(cells))
+
+
+def test_the_way_leads_over_free_cells(drive):
+    cells, origin, resolution_m = served_map(drive.folder)
+    columns, rows = np.floor((drive.tum()[:, 1:3] - origin[:2]) / resolution_m).astype(int).T
+    values = cells[rows, columns]
+    assert (values != 100).all()
+    if drive.dimension == 2:
+        assert (values == 0).mean() > 0.95
+
+
+def test_the_cloud_of_a_3d_log_lies_round_the_way_and_is_thinned_out(town):
+    points = read_ply(town.folder / "map.ply")
+    distance_m, _ = cKDTree(town.tum()[:, 1:4]).query(points)
+    assert 1.0 < distance_m.min() < 5.0 and distance_m.max() < 101.0
+    assert np.ptp(points[:, 2]) > 2.0
+    voxels = np.unique(np.floor(points.astype(float) / 0.2).astype(int), axis=0)
+    assert len(voxels) > 0.95 * len(points)
+
+
+def test_the_metrics_agree_with_the_files(drive):
+    metrics, steps = drive.metrics, drive.steps
+    assert metrics["dimension"] == drive.dimension
+    assert metrics["scans"] == len(steps["index"]) == len(drive.truth)
+    states = {state: int((steps["state"] == state).sum()) for state in ("ok", "degenerate", "lost")}
+    assert states == {state: metrics[state] for state in states}
+    span_s = (steps["log_time_ns"][-1] - steps["log_time_ns"][0]) * 1e-9
+    assert metrics["log_span_s"] == pytest.approx(span_s)
+    assert metrics["times_real_time"] == pytest.approx(span_s / metrics["run_s"])
+    assert metrics["scans_per_s"] == pytest.approx(metrics["scans"] / metrics["run_s"])
+    assert metrics["travelled_m"] == pytest.approx(length_m(drive.tum()), abs=1e-5)
+    assert (metrics["scan_points"], metrics["dropped_points"]) == (
+        steps["scan_points"].sum(),
+        steps["dropped"].sum(),
+    )
+    assert metrics["median_iterations"] == np.median(steps["iterations"])
+    assert metrics["median_residual_m"] == pytest.approx(np.median(steps["residual_m"]))
+    assert metrics["median_inlier_share"] == pytest.approx(np.median(steps["inliers"] / steps["points"]))
+    for name in TIMED_COLUMNS:
+        stage = name.removesuffix("_s")
+        assert metrics["median_ms"][stage] == pytest.approx(1e3 * np.median(steps[name]))
+        assert metrics["p95_ms"][stage] == pytest.approx(1e3 * np.percentile(steps[name], 95))
+
+
+def test_the_error_told_is_the_one_scipy_finds(drive):
+    told = drive.metrics["ground_truth"]
+    assert told["path_length_m"] == pytest.approx(length_m(drive.truth), abs=1e-5)
+    for key, name in (("optimised", "trajectory"), ("odometry", "odometry")):
+        assert told[key]["ate_rmse_m"] == pytest.approx(ate_m(drive.tum(name), drive.truth), abs=1e-6)
+        assert told[key]["pairs"] == len(drive.truth)
+        share = told[key]["ate_rmse_m"] / told["path_length_m"]
+        assert told[key]["ate_share_of_path"] == pytest.approx(share)
+
+
+def test_the_error_is_below_5_cm_and_3_per_mille_of_the_path(drive):
+    found_m = ate_m(drive.tum(), drive.truth)
+    assert found_m < 0.05 and found_m < 0.003 * length_m(drive.truth)
+
+
+def test_the_summary_says_what_the_metrics_say(drive):
+    text, metrics = (drive.folder / "summary.txt").read_text(), drive.metrics
+    assert text.splitlines()[0].startswith(str(drive.log))
+    for part in (
+        f"{metrics['scans']:,} over {metrics['log_span_s']:.1f} s",
+        f"{metrics['closures_tried']} loop closures tried, {metrics['closures_verified']} verified",
+        f"ATE            rmse {metrics['ground_truth']['optimised']['ate_rmse_m']:.4f} m",
+    ):
+        assert part in text
+
+
+def test_the_run_file_says_what_was_read_and_with_what(drive):
+    said = json.loads((drive.folder / "run.json").read_text())
+    assert said["complete"] and said["stopped"] == ""
+    (log,) = said["logs"]
+    assert (log["path"], log["size_bytes"]) == (str(drive.log), drive.log.stat().st_size)
+    assert log["sha256"] == hashlib.sha256(drive.log.read_bytes()).hexdigest()
+    assert said["versions"]["scanchain"] and said["versions"]["rerun-sdk"].startswith("0.41")
+    assert f"preset lidar{drive.dimension}d" in said["configuration"]
+
+
+def test_the_configuration_written_is_the_preset_with_the_flags(drive):
+    tree = tomllib.loads((drive.folder / "config.toml").read_text())
+    flat = {f"{a}.{b}": value for a, branch in tree.items() for b, value in branch.items()}
+    changes = {"odometry.prior": "constant-velocity", "loops.min_travel_m": 5.0} if drive.dimension == 2 else {}
+    assert flat == flatten(configured(drive.dimension)) | changes
+
+
+# the recording
+
+
+def test_the_recording_has_every_entity_and_every_scan_on_both_timelines(drive):
+    path, count = drive.folder / "recording.rrd", drive.metrics["scans"]
+    rows, timelines = rows_of(path)
+    constant = static_entities(path)
+    for entity in EVERY_SCAN:
+        assert rows[entity] - (entity in constant) == count, entity
+    grown = {entities.ODOM, entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.STATE}
+    if drive.metrics["closures_tried"]:
+        grown |= {entities.EVENTS, entities.ACCEPTED, entities.REJECTED}
+    for entity in (*EVERY_SCAN, *grown):
+        assert timelines[entity] == {"scan", "sensor_time"}, entity
+    for entity in (*FOR_EVER, entities.MAP, *([entities.GRID] if drive.dimension == 2 else [])):
+        assert timelines[entity] == set(), entity
+    assert RrdReader(str(path)).blueprints()
+
+
+def test_the_recorded_poses_are_those_of_the_trajectories(drive):
+    path = drive.folder / "recording.rrd"
+    (strip,) = optimised_strips(path)
+    np.testing.assert_allclose(strip, drive.tum()[:, 1:4], atol=1e-4)
+    steps = drive.steps
+    assert sorted(column(path, entities.INLIERS, "scan")) == steps["index"].tolist()
+    inliers = dict(zip(column(path, entities.INLIERS, "scan"), column(path, entities.INLIERS, "Scalars:scalars"),
+                       strict=True))  # fmt: skip
+    assert [inliers[i][0] for i in range(len(steps["index"]))] == steps["inliers"].tolist()
+
+
+def optimised_strips(path):
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path.lstrip("/") == entities.OPTIMISED and "LineStrips3D:strips" in batch.schema.names:
+            yield np.array(batch.column("LineStrips3D:strips").to_pylist()[0][0])
+
+
+def test_a_3d_scan_takes_at_most_150_kilobytes_of_recording(town):
+    assert (town.folder / "recording.rrd").stat().st_size / town.metrics["scans"] < 150_000
+
+
+# again
+
+
+def assert_same(a, b):
+    for name in NOT_TIMED:
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+    tables = [pq.read_table(folder / "steps.parquet").drop_columns(TIMED_COLUMNS) for folder in (a, b)]
+    assert tables[0].equals(tables[1])
+
+
+def test_the_same_run_in_another_process_is_bit_equal(drive, tmp_path):
+    words = ["run", drive.log, "--out", tmp_path / "again", *drive.flags]
+    subprocess.run(
+        [sys.executable, "-m", "pipeline", *words], cwd=ROOT, check=True, capture_output=True, timeout=60
+    )
+    assert_same(drive.folder, tmp_path / "again")
+
+
+def test_the_configuration_written_repeats_the_run(drive, tmp_path):
+    words = ["--config", drive.folder / "config.toml", "--rerun", "off"]
+    succeed("run", drive.log, "--out", tmp_path / "again", *words)
+    assert_same(drive.folder, tmp_path / "again")
+
+
+def test_the_office_needs_no_flag(tmp_path):
+    drive = driven(tmp_path, "office", 2, ["--duration", "20", "--seed", "3"])
+    found_m = ate_m(drive.tum(), drive.truth)
+    assert found_m < 0.05 and found_m < 0.003 * length_m(drive.truth)
+
+
+# real logs
+
+
+@pytest.fixture(scope="module")
+def intel(tmp_path_factory):
+    log = shared_data("2d/intel.mcap")
+    folder = tmp_path_factory.mktemp("intel") / "run"
+    succeed("run", log, "--out", folder)
+    return Drive(log, (), folder, 2)
+
+
+def test_intel_gives_all_13631_scans_in_the_order_they_were_taken(intel):
+    assert {path.name for path in intel.folder.iterdir()} == FILES
+    assert intel.metrics["scans"] == len(intel.tum()) == len(intel.tum("odometry")) == 13_631
+    steps = intel.steps
+    assert (np.diff(steps["log_time_ns"]) >= 0).all() and (np.diff(steps["stamp_ns"]) < 0).sum() == 631
+    rows, _ = rows_of(intel.folder / "recording.rrd")
+    assert rows[entities.OPTIMISED_LIDAR] == 13_631
+
+
+@pytest.mark.parametrize(("name", "limit_m"), [("odometry", 0.12), ("trajectory", 0.06)])
+def test_intel_keeps_the_relations_set_by_hand(intel, name, limit_m):
+    relations = shared_data("2d/intel.relations")
+    words = ["evaluate", intel.folder / f"{name}.tum", "--relations", relations, "--json"]
+    found = json.loads(succeed(*words))["relations"]
+    assert (found["translation_m"]["count"], found["missing"]) == (2984, 0)
+    assert found["translation_m"]["mean"] < limit_m
+
+
+def test_a_real_drive_without_a_time_per_point_runs_without_any_flag(tmp_path):
+    succeed("run", shared_data("3d/kitti_0005_first60.mcap"), "--out", tmp_path / "a")
+    assert {path.name for path in (tmp_path / "a").iterdir()} == FILES
+    metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    assert (metrics["scans"], metrics["ok"], metrics["dimension"]) == (60, 60, 3)
+    assert metrics["ground_truth"] is None
+    assert (tmp_path / "a" / "recording.rrd").stat().st_size / 60 < 150_000
+
+
+def test_a_real_drive_stays_within_10_cm_of_its_gps(tmp_path):
+    log = shared_data("3d/kitti_0001_first54.mcap")
+    succeed("run", log, "--out", tmp_path / "a", "--rerun", "off")
+    estimate = np.loadtxt(tmp_path / "a" / "trajectory.tum")
+    assert ate_m(estimate, np.loadtxt(log.with_suffix(".tum"))) <= 0.10
+    tree = json.loads(succeed("evaluate", tmp_path / "a" / "trajectory.tum", log.with_suffix(".tum"), "--json"))
+    assert tree["ate"]["translation_m"]["rmse"] <= 0.10 and tree["ate"]["translation_m"]["count"] == 54
