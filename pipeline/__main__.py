@@ -18,7 +18,7 @@ from pipeline.commands.simulate import simulate
 from pipeline.commands.view import view
 from pipeline.config import RecordingConfig
 from pipeline.errors import InputError, ScanchainError
-from pipeline.recorder import Recorder, SinkName, Viewing
+from pipeline.runs.recorder import Recorder, SinkName, Viewing
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

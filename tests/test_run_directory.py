@@ -19,9 +19,9 @@ from scenes import ROOT
 
 from pipeline.__main__ import _record
 from pipeline.errors import InputError
-from pipeline.progress import Unwatched
-from pipeline.run import Job, PartialRunError, run
-from pipeline.run_directory import RunDirectory
+from pipeline.runs.directory import RunDirectory
+from pipeline.runs.progress import Unwatched
+from pipeline.runs.run import Job, PartialRunError, run
 from pipeline.simulate import simulate
 
 

@@ -13,7 +13,7 @@ from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
 
 if TYPE_CHECKING:
-    from pipeline.recorder import SinkName, Viewing
+    from pipeline.runs.recorder import SinkName, Viewing
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
@@ -68,8 +68,8 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     from pipeline.commands.terminal import Terminal
-    from pipeline.run import Job
-    from pipeline.run import run as run_log
+    from pipeline.runs.run import Job
+    from pipeline.runs.run import run as run_log
 
     truth_file, truth_topic = _ground_truth(gt)
     job = Job(

@@ -10,7 +10,7 @@ import click
 from pipeline.errors import InputError
 
 if TYPE_CHECKING:
-    from pipeline.recorder import Viewing
+    from pipeline.runs.recorder import Viewing
 
 
 @click.command()

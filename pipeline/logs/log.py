@@ -163,7 +163,9 @@ class Log:
     def _checked(self, message: Decoded, number: int) -> Returns:
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(message.value, Returns):
-            raise InputError(f"{where} is malformed: {message.value}; leave it out with --start or --end, or choose another --topic")
+            raise InputError(
+                f"{where} is malformed: {message.value}; leave it out with --start or --end, or choose another --topic"
+            )
         if not len(message.value.points):
             raise InputError(
                 f"{where} has no valid point ({message.value.why}); leave it out with --start or --end, or widen "

@@ -13,9 +13,9 @@ from pipeline.data import State, Trajectory, Verdict
 from pipeline.errors import InputError
 from pipeline.evaluate import Alignment, absolute_error, kitti_error, lengths_for, pair
 from pipeline.evaluate.absolute import path_length
+from pipeline.runs.step_table import STAGES, StepTable
+from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
-from pipeline.step_table import STAGES, StepTable
-from pipeline.verdicts import JudgedClosure
 
 
 class Accuracy(Struct, frozen=True):

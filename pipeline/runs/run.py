@@ -10,22 +10,22 @@ from time import perf_counter
 
 import msgspec
 
-from pipeline.closure_table import write_closures
 from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError, ScanchainError
 from pipeline.logs import Log, open_log
-from pipeline.progress import Progress
-from pipeline.provenance import Hashing, Provenance, describe_start
-from pipeline.recorder import OpenRecorder, Recorder, SinkName
-from pipeline.results import write_results
-from pipeline.run_directory import RUN_FILE, RunDirectory
-from pipeline.run_metrics import GroundTruth, Metrics, judge, measure, summary
+from pipeline.runs.closure_table import write_closures
+from pipeline.runs.directory import RUN_FILE, RunDirectory
+from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
+from pipeline.runs.progress import Progress
+from pipeline.runs.provenance import Hashing, Provenance, describe_start
+from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
+from pipeline.runs.results import write_results
+from pipeline.runs.step_table import StepTable
+from pipeline.runs.verdicts import final_verdicts
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
-from pipeline.step_table import StepTable
 from pipeline.trajectory import read_tum, write_tum
-from pipeline.verdicts import final_verdicts
 
 
 @dataclass(frozen=True, slots=True)

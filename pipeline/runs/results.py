@@ -13,7 +13,7 @@ from pipeline.config import MapsConfig
 from pipeline.data import Points, Pose
 from pipeline.graph.g2o import write_g2o
 from pipeline.maps import OccupancyGrid, build_point_map, draw_grid, fitting_resolution, write_map, write_ply
-from pipeline.recorder import Recorder
+from pipeline.runs.recorder import Recorder
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_kitti, write_tum
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.data import Keyframe
-from pipeline.step_table import pose_columns
-from pipeline.verdicts import JudgedClosure
+from pipeline.runs.step_table import pose_columns
+from pipeline.runs.verdicts import JudgedClosure
 
 
 def write_closures(

@@ -1,0 +1,1 @@
+"""The main job: from a log to a run directory."""
