@@ -164,7 +164,8 @@ class Log:
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(message.value, Returns):
             raise InputError(
-                f"{where} is malformed: {message.value}; leave it out with --start or --end, or choose another --topic"
+                f"{where} is malformed: {message.value}; "
+                "leave it out with --start or --end, or choose another --topic"
             )
         if not len(message.value.points):
             raise InputError(
