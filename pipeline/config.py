@@ -119,7 +119,7 @@ class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """The maps that are written at the end."""
 
     voxel_size_m: Positive = 0.2
-    grid_resolution_m: Positive = 0.05
+    grid_resolution_m: Positive = 0.2
     grid_max_range_m: Positive = 80.0
     slice_min_z_m: float = -0.5
     slice_max_z_m: float = 0.5

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix, Pose
+from pipeline.kernels import pose_log
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
@@ -141,10 +142,9 @@ def interpolate(T_a: Pose, T_b: Pose, share: float) -> Pose:
 
 def to_quaternion(R: Matrix) -> NDArray[np.float64]:
     """Unit quaternions xyzw of rotation matrices (..., 3, 3); w ≥ 0."""
-    from scipy.spatial.transform import Rotation
-
-    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
-    return flat.reshape(*R.shape[:-2], 4)
+    result = np.empty((*R.shape[:-2], 4))
+    pose_log.quaternions(_stack(R), result.reshape(-1, 4))
+    return result
 
 
 def from_quaternion(quat_xyzw: NDArray[np.float64]) -> Matrix:
@@ -212,22 +212,17 @@ def _so3_coefficients(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 def _log_so3(R: Matrix) -> NDArray[np.float64]:
     """Rotation vectors (..., 3) by way of the quaternion, which is well conditioned from 0 to π."""
-    quat = to_quaternion(R)
-    v, w = quat[..., :3], quat[..., 3]
-    norm = np.linalg.norm(v, axis=-1)
-    small = norm < _SMALL
-    scale = np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
-    return scale[..., None] * v
+    result = np.empty((*R.shape[:-2], 3))
+    pose_log.rotation_vectors(_stack(R), result.reshape(-1, 3))
+    return result
 
 
 def _log_se3(T: Pose) -> NDArray[np.float64]:
-    phi = _log_so3(T[..., :3, :3])
-    theta = np.linalg.norm(phi, axis=-1)[..., None]
-    small = theta < 1e-3
-    safe = np.where(small, 1.0, theta)
-    half = 0.5 * safe
-    e = np.where(small, 1.0 / 12.0 + theta**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2)
-    t = T[..., :3, 3]
-    cross = np.cross(phi, t)
-    rho = t - 0.5 * cross + e * np.cross(phi, cross)
-    return np.concatenate([rho, phi], axis=-1)
+    result = np.empty((*T.shape[:-2], 6))
+    pose_log.twists(_stack(T), result.reshape(-1, 6))
+    return result
+
+
+def _stack(matrices: Matrix) -> Matrix:
+    """(..., r, c) as a contiguous (N, r, c)."""
+    return np.ascontiguousarray(matrices, dtype=np.float64).reshape(-1, *matrices.shape[-2:])

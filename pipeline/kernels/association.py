@@ -7,7 +7,7 @@ from pipeline.kernels.hashing import find, pack
 from pipeline.kernels.voxels import move
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
     """Fill ``partner`` (N,) with the row of the nearest voxel mean, −1 where none is near enough.
 

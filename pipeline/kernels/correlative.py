@@ -8,7 +8,7 @@ from numba import njit
 from pipeline.kernels.hashing import find, pack
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def best_of_grid(voxels, points, T, shifts: int, turns: int, turn_rad: float):
     """The pose around T, (2·shifts + 1)² shifts by (2·turns + 1) turns, with the most points in seen voxels.
 

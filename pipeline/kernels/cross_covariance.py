@@ -5,7 +5,7 @@ from numba import njit
 from pipeline.kernels.voxels import move
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def weighted_pairs(voxels, points, T, partner, scale_m: float, source, target, weight):
     """Write every pair's moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))², one row a pair.
 

@@ -7,7 +7,7 @@ from pipeline.kernels.hashing import EMPTY, find, pack
 from pipeline.kernels.twist import perturb
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, chosen):
     """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
 
@@ -42,7 +42,7 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def gather(points, chosen, out):
     """Copy the chosen rows of points (N, d) to ``out`` (M, d)."""
     for k in range(out.shape[0]):
@@ -50,7 +50,7 @@ def gather(points, chosen, out):
             out[k, axis] = points[chosen[k], axis]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def deskew(points, shares, twist):
     """Move each point, in place, to where the lidar saw it at the scan's stamp.
 

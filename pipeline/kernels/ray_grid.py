@@ -6,7 +6,7 @@ from numba import njit
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
     """Fill ``starts`` and ``ends`` (N, 2) with the part of each beam that lies in a horizontal slice.
 
@@ -46,7 +46,7 @@ def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bounds(points, out):
     """Widen ``out`` (4,), min x, min y, max x, max y, to hold the points (N, 2)."""
     for i in range(points.shape[0]):
@@ -55,7 +55,7 @@ def bounds(points, out):
         out[2], out[3] = max(out[2], x), max(out[3], y)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, miss, low, high, log_odds, drawn):
     """Add the evidence of several scans: the cells that beams cross are free, the cells they end in occupied.
 

@@ -74,7 +74,7 @@ class Estimate(NamedTuple):
     sums: NDArray[np.float64]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def align(voxels, points, T, prior, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
 
@@ -120,7 +120,7 @@ def align(voxels, points, T, prior, terms):
     return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _linearise(problem, scale_m: float, estimate):
     """Fill the estimate's normal equations and sums at its pose, the prediction's pull included."""
     terms = problem.terms
@@ -144,7 +144,7 @@ def _linearise(problem, scale_m: float, estimate):
     estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
     """Take one step x (k,) with the present pairs; False where the equations determine none.
 

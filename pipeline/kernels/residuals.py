@@ -5,7 +5,7 @@ from numba import njit
 from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def normal_equations(
     voxels, points, T, origin, partner, scale_m: float, point_weight: float, second_order: bool, H, b
 ):
@@ -131,7 +131,7 @@ def _add_plane(H, b, w, px, py, pz, nx, ny, nz, r):
     b[5] += r * cz
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
     """Three residuals, J = P [I, −p×], with P = I on a point shape and P = I − vvᵀ across a line."""
     H[0, 0] += w
@@ -159,7 +159,7 @@ def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
         _add_plane(H, b, -w, px, py, pz, vx, vy, vz, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
     """Second derivative of eᵀ exp(ξ) p at ξ = 0, of which the first-order rows know nothing.
 

@@ -30,7 +30,7 @@ class Voxels(NamedTuple):
     size_m: float
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def insert(voxels, points, T, tick: float, alone: float):
     """Add points (N, d), moved by T into the map's frame, and fit the voxels they fall into anew.
 
@@ -67,7 +67,7 @@ def move(T, points, i: int):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: float):
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
     for voxel in range(voxels.used[0]):
@@ -124,7 +124,7 @@ def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
     m[9] += z * z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     """Mean of the voxel's own points; shape and direction from them, or from the neighbours' too if few."""
     ix, iy, iz = unpack(voxels.voxel_keys[voxel])
@@ -143,7 +143,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
         _fit_3d(m, cell)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
     """Moments of the 3ᵈ voxels around one, relative to its centre, written to ``sums`` (10,)."""
     sums[:] = 0.0
@@ -168,7 +168,7 @@ def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
                 sums[9] += m[9] + 2.0 * z * m[3] + n * z * z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit_2d(m, cell):
     """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
     cell[SHAPE] = POINT
@@ -182,7 +182,7 @@ def _fit_2d(m, cell):
         cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit_3d(m, cell):
     """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
 

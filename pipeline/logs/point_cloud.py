@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernels.point_cloud import keep_valid
 from pipeline.logs.cdr import CdrReader, MalformedMessageError
 from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
 from pipeline.logs.point_times import NAMES, seconds_after
@@ -91,20 +92,24 @@ class PointCloudDecoder:
 
     def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
         points = np.empty((len(cloud), 3), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for axis, name in enumerate("xyz"):
-                points[:, axis] = cloud[name]
-            square = np.einsum("ij,ij->i", points, points)
-        high = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
-        valid = (square > self.limits.min_m**2) & (square <= high)
-        kept = int(np.count_nonzero(valid))
-        raw_times = cloud[layout.time] if layout.time else NO_TIMES
-        if kept < len(cloud):
-            points = points[valid]
-            raw_times = raw_times[valid] if layout.time else NO_TIMES
-        times_s = seconds_after(message.stamp_ns, raw_times) if layout.time else NO_TIMES
-        why = "" if kept else _why_none(square)
-        return Returns(message.stamp_ns, points, times_s, len(cloud) - kept, why)
+        kept = np.empty(len(cloud), np.int32)
+        x, y, z = (_as_float32(cloud[name]) for name in "xyz")
+        high_square = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
+        count = keep_valid(x, y, z, self.limits.min_m**2, high_square, points, kept)
+        times_s = NO_TIMES
+        if layout.time:
+            times = cloud[layout.time]
+            times_s = seconds_after(message.stamp_ns, times if count == len(cloud) else times[kept[:count]])
+        why = "" if count else _why_none(x, y, z)
+        return Returns(message.stamp_ns, points[:count], times_s, len(cloud) - count, why)
+
+
+def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """The field itself where it is native float32 already, else a copy; infinite where float32 ends."""
+    if values.dtype == np.float32 and values.dtype.isnative and values.flags.aligned:
+        return values.view(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
 
 
 def _layout(message: PointCloudMessage) -> Layout:
@@ -157,11 +162,11 @@ def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.vo
     return rows.reshape(-1)
 
 
-def _why_none(square: NDArray[np.float32]) -> str:
-    if not len(square):
+def _why_none(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> str:
+    count = len(x)
+    if not count:
         return "the cloud is empty"
-    undefined = int(np.count_nonzero(~np.isfinite(square)))
-    zero = int(np.count_nonzero(square == 0.0))
-    outside = len(square) - undefined - zero
-    count = len(square)
+    undefined = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
+    zero = int(np.count_nonzero((x == 0.0) & (y == 0.0) & (z == 0.0)))
+    outside = count - undefined - zero
     return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"

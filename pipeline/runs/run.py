@@ -15,6 +15,7 @@ from pipeline.data import Trajectory
 from pipeline.errors import InputError, ScanchainError
 from pipeline.logs import Log, open_log
 from pipeline.runs.closure_table import write_closures
+from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from pipeline.runs.progress import Progress
@@ -83,7 +84,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable()
-    with directory, Hashing(job.logs) as hashing:
+    with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress):
         provenance.write(directory.path / RUN_FILE)
         (directory.path / "config.toml").write_text(dump(settings.config), encoding="utf-8")
         try:

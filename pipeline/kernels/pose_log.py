@@ -1,0 +1,77 @@
+"""Logarithms of rotations and poses in space, many at a time."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+_SMALL = 1e-8  # of half the angle's sine, below which the series is exact
+
+
+@njit(cache=True)
+def quaternions(R, out):
+    """Write unit quaternions xyzw, w ≥ 0, of rotations (N, 3, 3) to ``out`` (N, 4).
+
+    The largest of the four components is found first, so that no difference of near numbers is divided by
+    (Shepperd 1978).
+    """
+    for n in range(R.shape[0]):
+        _quaternion(R[n], out[n])
+
+
+@njit(cache=True)
+def rotation_vectors(R, out):
+    """Write the rotation vectors, angles in [0, π], of rotations (N, 3, 3) to ``out`` (N, 3)."""
+    quat = np.empty(4)
+    for n in range(R.shape[0]):
+        _quaternion(R[n], quat)
+        norm = math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2])
+        scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, quat[3]) / norm
+        for axis in range(3):
+            out[n, axis] = scale * quat[axis]
+
+
+@njit(cache=True)
+def twists(T, out):
+    """Write the twists (ρ, φ) of poses (N, 4, 4) to ``out`` (N, 6): φ = log R, ρ = V(φ)⁻¹ t.
+
+    V(φ)⁻¹ t = t − ½ φ × t + e φ × (φ × t), e = (1 − θ/2 cot θ/2) / θ²    (Barfoot 2017, eq. 7.86)
+    """
+    rotation_vectors(T[:, :3, :3], out[:, 3:])
+    for n in range(T.shape[0]):
+        x, y, z = out[n, 3], out[n, 4], out[n, 5]
+        u, v, w = T[n, 0, 3], T[n, 1, 3], T[n, 2, 3]
+        theta2 = x * x + y * y + z * z
+        if theta2 < 1e-6:
+            e = 1.0 / 12.0 + theta2 / 720.0
+        else:
+            half = 0.5 * math.sqrt(theta2)
+            e = (1.0 - half / math.tan(half)) / theta2
+        cu, cv, cw = y * w - z * v, z * u - x * w, x * v - y * u
+        out[n, 0] = u - 0.5 * cu + e * (y * cw - z * cv)
+        out[n, 1] = v - 0.5 * cv + e * (z * cu - x * cw)
+        out[n, 2] = w - 0.5 * cw + e * (x * cv - y * cu)
+
+
+@njit(cache=True)
+def _quaternion(R, out):
+    """Write the quaternion xyzw of R (3, 3) to ``out`` (4,), normalised, w ≥ 0."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
+        out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        out[3] = 1.0 + trace
+    else:
+        i = 0
+        if R[1, 1] > R[0, 0]:
+            i = 1
+        if R[2, 2] > R[i, i]:
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = 1.0 - trace + 2.0 * R[i, i]
+        out[j] = R[j, i] + R[i, j]
+        out[k] = R[k, i] + R[i, k]
+        out[3] = R[k, j] - R[j, k]
+    norm = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+    scale = -1.0 / norm if out[3] < 0.0 else 1.0 / norm
+    for axis in range(4):
+        out[axis] *= scale
