@@ -58,7 +58,7 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     max_iterations: Count = 50
     reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1
     max_distance_m: Positive = 2.0
-    kernel_scale_m: Positive = 0.3
+    kernel_scale_m: Positive = 0.2
     wide_reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 2
     wide_max_distance_m: Positive = 3.0
     wide_kernel_scale_m: Positive = 2.0

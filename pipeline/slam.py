@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -117,6 +117,8 @@ class Slam:
             self.travelled_m += float(np.linalg.norm(step[:-1, -1]))
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
+        if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
+            self.keyframes[0] = replace(self.keyframes[0], points=self.odometry.first_points)
         if self.keyframes and (tracked.state is State.LOST or not self._moved_enough(tracked.T_odom_lidar)):
             return -1
         keyframe = Keyframe(

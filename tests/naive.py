@@ -34,6 +34,30 @@ def shape(points, neighbours, alone):
     return "point", None
 
 
+def plane_fit(points, neighbours, alone, many=30):
+    """Thickness, directions across and along, 1/n and the variances of the slopes, of a voxel's plane in space."""
+    members = points if len(points) >= alone else np.concatenate([points, *neighbours])
+    centred = members - members.mean(0)
+    values, vectors = np.linalg.eigh(centred.T @ centred / len(members))
+    n = min(len(members), many)
+    return values[0], vectors[:, 1], vectors[:, 2], 1 / n, 1 / (n * values[1]), 1 / (n * values[2])
+
+
+def trust(p, lidar, mean, kind, direction, fit, size, variance):
+    """Sensor variance over the variance of the residual of a point p of the map's frame."""
+    d = len(p)
+    if kind != "plane":
+        return variance / (variance + size**2 / 12)
+    if d == 2:
+        return 1.0
+    thickness, across, along, of_mean, of_across, of_along = fit
+    e = p - mean
+    uncertainty = of_mean + of_across * (across @ e) ** 2 + of_along * (along @ e) ** 2
+    ray = (p - lidar) / np.linalg.norm(p - lidar)
+    grazing = (direction @ ray) ** 2 / ((direction @ ray) ** 2 + 0.05**2)
+    return grazing * variance / (max(thickness, variance) * (1 + uncertainty))
+
+
 def nearest_mean(point, means, size, reach, max_distance):
     """Key of the nearest voxel mean among the (2·reach)ᵈ voxels around a point, None if none is near."""
     d = len(point)
@@ -46,27 +70,27 @@ def nearest_mean(point, means, size, reach, max_distance):
     return chosen
 
 
-def residual(p, mean, kind, direction, point_weight):
+def residual(p, mean, kind, direction, trusted):
     """Residual vector whose squared length the cost counts."""
     e = p - mean
     if kind == "plane":
-        return np.array([direction @ e])
+        e = np.array([direction @ e])
     if kind == "line":
         e = e - direction * (direction @ e)
-    return np.sqrt(point_weight) * e
+    return np.sqrt(trusted) * e
 
 
-def cost(points, pairs, T, scale, point_weight):
+def cost(points, pairs, T, scale, trusted):
     """Σ ½ s²r²/(s²+r²) over pairs (index, mean, kind, direction)."""
     total = 0.0
     moved = lie.transform(T, points)
     for i, mean, kind, direction in pairs:
-        r2 = float((residual(moved[i], mean, kind, direction, point_weight) ** 2).sum())
+        r2 = float((residual(moved[i], mean, kind, direction, trusted[i]) ** 2).sum())
         total += 0.5 * scale**2 * r2 / (scale**2 + r2)
     return total
 
 
-def gauss_newton_hessian(points, pairs, T, origin, scale, point_weight):
+def gauss_newton_hessian(points, pairs, T, origin, scale, trusted):
     """Σ w JᵀJ with J by central differences of the residual under a left twist about the origin."""
     k = 3 if points.shape[1] == 2 else 6
     shift = lie.identity(points.shape[1])
@@ -77,7 +101,7 @@ def gauss_newton_hessian(points, pairs, T, origin, scale, point_weight):
     moved = [lie.transform(step, points) for step in steps]
     here = lie.transform(T, points)
     for i, mean, kind, direction in pairs:
-        args = (mean, kind, direction, point_weight)
+        args = (mean, kind, direction, trusted[i])
         J = np.stack(
             [(residual(moved[a][i], *args) - residual(moved[a + k][i], *args)) / (2 * h) for a in range(k)], axis=1
         )

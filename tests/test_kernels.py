@@ -7,6 +7,7 @@ from pipeline.config import LocalMapConfig
 from pipeline.kernels import descent, downsample, eigen, hashing
 from pipeline.kernels.association import associate
 from pipeline.kernels.residuals import normal_equations
+from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
 from pipeline.kernels.voxels import DIRECTION, SHAPE
 from pipeline.matching import VoxelMap
@@ -31,6 +32,10 @@ def map_of(points, size=0.5, alone=8):
 
 def keys_of(voxel_map):
     return [hashing.unpack(key) for key in voxel_map.voxels.voxel_keys[: len(voxel_map)]]
+
+
+def adjacent(a, b):
+    return max(abs(i - j) for i, j in zip(a, b, strict=True)) <= 1
 
 
 def paired(voxel_map, partner):
@@ -95,11 +100,7 @@ def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
     assert sorted(keys_of(voxel_map)) == sorted(groups)
     seen = set()
     for voxel, key in enumerate(keys_of(voxel_map)):
-        around = [
-            members
-            for other, members in groups.items()
-            if other != key and max(abs(a - b) for a, b in zip(other, key, strict=True)) <= 1
-        ]
+        around = [members for other, members in groups.items() if other != key and adjacent(other, key)]
         kind, direction = naive.shape(groups[key], around, alone)
         np.testing.assert_allclose(cells[voxel, :dimension], groups[key].mean(0), atol=1e-12)
         assert SHAPES[cells[voxel, SHAPE]] == kind
@@ -133,6 +134,43 @@ def test_association_finds_the_nearest_mean(dimension, reach):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("alone", [8, 10**6])
+def test_trust_is_the_sensors_variance_over_the_residuals(dimension, alone):
+    points = some_points(dimension)
+    voxel_map = map_of(points, alone=alone)
+    groups = naive.group(points, 0.5)
+    T = lie.exp(np.array([0.1, -0.2, 0.1] if dimension == 2 else [0.1, -0.2, 0.1, 0.02, 0.03, 0.1]))
+    partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, T, 1, 0.6, partner)
+    variance = 0.02**2
+    weigh(voxel_map.voxels, points, T, partner, variance, trust)
+    keys, moved = keys_of(voxel_map), lie.transform(T, points)
+    assert np.array_equal(trust == 0.0, partner < 0)
+    for i, mean, kind, direction in paired(voxel_map, partner):
+        key = keys[partner[i]]
+        near = [members for other, members in groups.items() if other != key and adjacent(other, key)]
+        fit = naive.plane_fit(groups[key], near, alone) if kind == "plane" and dimension == 3 else None
+        expected = naive.trust(moved[i], T[:-1, -1], mean, kind, direction, fit, 0.5, variance)
+        assert trust[i] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_plane_seen_edge_on_is_not_trusted():
+    rng = np.random.default_rng(0)
+    slab = np.column_stack(
+        [rng.uniform(20.0, 23.0, 600), rng.uniform(-1.5, 1.5, 600), 0.001 * rng.normal(size=600)]
+    )
+    wall = slab[:, [2, 1, 0]] + np.array([20.0, 0.0, -21.5])
+    trusted = []
+    for points in (slab, wall):
+        voxel_map = map_of(points, size=1.0)
+        partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
+        associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, partner)
+        weigh(voxel_map.voxels, points, np.eye(4), partner, 0.02**2, trust)
+        trusted.append(np.median(trust))
+    assert trusted[0] < 0.001 and trusted[1] > 0.8
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     points = some_points(dimension)
     voxel_map = map_of(points)
@@ -144,8 +182,8 @@ def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     pairs = paired(voxel_map, partner)
     assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
     H, b = np.empty((k, k)), np.empty(k)
-    scale, weight = 0.2, 0.3
-    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, partner, scale, weight, False, H, b)
+    scale, weight = 0.2, np.random.default_rng(3).uniform(0.1, 1.0, len(points))
+    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, partner, weight, scale, False, H, b)
     assert total == pytest.approx(naive.cost(points, pairs, T, scale, weight), rel=1e-12)
     np.testing.assert_allclose(
         H, naive.gauss_newton_hessian(points, pairs, T, origin[:dimension], scale, weight), rtol=1e-6, atol=1e-5
@@ -167,16 +205,16 @@ def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimensio
     T = lie.exp(np.linspace(0.05, -0.08, k))
     origin, partner = np.zeros(3), np.empty(len(points), np.int32)
     associate(voxel_map.voxels, points, T, 1, 1.0, partner)
-    huge = 1e4  # every weight is one, the cost plain least squares
+    huge, full = 1e4, np.ones(len(points))  # every weight is one, the cost plain least squares
     H, b = np.empty((k, k)), np.empty(k)
-    normal_equations(voxel_map.voxels, points, T, origin, partner, huge, 1.0, True, H, b)
+    normal_equations(voxel_map.voxels, points, T, origin, partner, full, huge, True, H, b)
     h, moved, gradients = 1e-5, np.empty_like(T), []
     for axis in range(k):
         ends = []
         for sign in (h, -h):
             perturb(sign * np.eye(k)[axis], T.copy(), origin, moved)
             normal_equations(
-                voxel_map.voxels, points, moved, origin, partner, huge, 1.0, False, np.empty((k, k)), b
+                voxel_map.voxels, points, moved, origin, partner, full, huge, False, np.empty((k, k)), b
             )
             ends.append(b.copy())
         gradients.append((ends[0] - ends[1]) / (2 * h))

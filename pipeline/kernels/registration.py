@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pipeline.kernels.association import associate
 from pipeline.kernels.descent import LEVENBERG_MARQUARDT, NEWTON, predicted_decrease, relax, step
 from pipeline.kernels.residuals import normal_equations
+from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
 from pipeline.kernels.voxels import Voxels
 
@@ -22,7 +23,10 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 
 
 class Terms(NamedTuple):
-    """What an alignment runs under; the kernel's scale shrinks from first_scale_m to scale_m."""
+    """What an alignment runs under; the kernel's scale shrinks from first_scale_m to scale_m.
+
+    variance : of a range, σ² in m²
+    """
 
     optimiser: int
     max_iterations: int
@@ -30,7 +34,7 @@ class Terms(NamedTuple):
     max_distance_m: float
     first_scale_m: float
     scale_m: float
-    point_weight: float
+    variance: float
     tolerance_m: float
     tolerance_rad: float
 
@@ -54,13 +58,14 @@ class Outcome(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What stays through an alignment, but for ``partner`` (N,), the pairs of the moment."""
+    """What stays through an alignment, but for ``partner`` and ``trust`` (N,), the pairs of the moment."""
 
     voxels: Voxels
     points: NDArray[np.float64]
     origin: NDArray[np.float64]
     prior: NDArray[np.float64]
     partner: NDArray[np.int32]
+    trust: NDArray[np.float64]
     terms: Terms
 
 
@@ -88,7 +93,8 @@ def align(voxels, points, T, prior, terms):
     k = 3 if points.shape[1] == 2 else 6
     origin = np.zeros(3)
     origin[: points.shape[1]] = T[:-1, -1]
-    problem = Problem(voxels, points, origin, prior, np.empty(points.shape[0], np.int32), terms)
+    partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
+    problem = Problem(voxels, points, origin, prior, partner, trust, terms)
     now = Estimate(T, np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
@@ -98,10 +104,11 @@ def align(voxels, points, T, prior, terms):
     while iterations < terms.max_iterations:
         iterations += 1
         if settled < PATIENCE:
-            pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, problem.partner)
+            pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, partner)
             if pairs == 0:
                 ending = NO_PARTNERS
                 break
+            weigh(voxels, points, T, partner, terms.variance, trust)
             _linearise(problem, scale_m, now)
         if not _descend(problem, scale_m, now, trial, x, factor):
             ending = SINGULAR
@@ -130,8 +137,8 @@ def _linearise(problem, scale_m: float, estimate):
         estimate.T,
         problem.origin,
         problem.partner,
+        problem.trust,
         scale_m,
-        terms.point_weight,
         terms.optimiser == NEWTON,
         estimate.H,
         estimate.b,

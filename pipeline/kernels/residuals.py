@@ -6,9 +6,7 @@ from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(
-    voxels, points, T, origin, partner, scale_m: float, point_weight: float, second_order: bool, H, b
-):
+def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, second_order: bool, H, b):
     """Linearise every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
 
     With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
@@ -16,12 +14,11 @@ def normal_equations(
     changes the residual by
         r = nᵀ(p − q)        ∂r/∂ξ = [nᵀ, (p × n)ᵀ]     (Chen & Medioni 1992; in 2D Censi 2008)
     On a line the residuals are the two across it, on a point shape all components of p − q. Geman–McClure
-    weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985).
-    Off planes the mean of a voxel only stands for the surface to within the voxel's size, so there r² counts
-    ``point_weight`` = σ²/(σ² + variance of a point in a voxel).
+    weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985)
+    times the trust in the pair.
 
     points : (N, d) metres, source frame; origin : (3,), map frame
-    partner : (N,) rows of the map's voxels, −1 for none
+    partner : (N,) rows of the map's voxels, −1 for none; trust : (N,) in [0, 1], what each pair counts
     scale_m : s; residuals far above it are all but ignored
     second_order : adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
         held fixed)
@@ -51,10 +48,9 @@ def normal_equations(
             r2 = ex * ex + ey * ey + ez * ez
         else:
             r2 = ex * ex + ey * ey + ez * ez
-        trust = 1.0 if shape == PLANE else point_weight
-        r2 *= trust
+        r2 *= trust[i]
         ratio = s2 / (s2 + r2)
-        w = trust * ratio * ratio
+        w = trust[i] * ratio * ratio
         cost += 0.5 * r2 * ratio
         weights += w
         squares += ratio * ratio * r2

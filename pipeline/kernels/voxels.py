@@ -1,8 +1,10 @@
 """A hash map of voxels that keep running moments of their points and the local shape fitted to them.
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
-that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, one cache line: mean
-(3), direction (3), shape, tick of the last insertion. A 2D map is the plane z = 0 of the same layout.
+that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
+(3), direction (3), shape, tick of the last insertion; and of a plane in space its second direction (3), the
+variance across it, and how that carries over to the fit: at the mean, and by squared distance along both
+directions. A 2D map is the plane z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -16,10 +18,13 @@ from pipeline.kernels.hashing import find, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
+ACROSS, THICKNESS, MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 8, 11, 12, 13, 14
+CELL = 16
+MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
 
 
 class Voxels(NamedTuple):
-    """The arrays of a voxel map: ``keys`` (S,), ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 8)."""
+    """The arrays of a voxel map: ``keys`` (S,), ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 16)."""
 
     keys: NDArray[np.int64]
     row: NDArray[np.int32]
@@ -199,6 +204,11 @@ def _fit_3d(m, cell):
     if small < 0.1 * middle:
         cell[SHAPE] = PLANE
         chosen = small
+        wx, wy, wz = eigenvector_3d(xx, xy, xz, yy, yz, zz, middle)
+        cell[ACROSS], cell[ACROSS + 1], cell[ACROSS + 2] = wx, wy, wz
+        n = min(n, MANY)
+        cell[THICKNESS], cell[MEAN_TERM] = small, 1.0 / n
+        cell[SLOPE_ACROSS], cell[SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
     elif middle < 0.1 * large:
         cell[SHAPE] = LINE
         chosen = large

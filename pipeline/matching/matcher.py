@@ -62,13 +62,7 @@ class PointToShapeMatcher:
 
 
 def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
-    """The numbers a kernel runs under.
-
-    A mean of a voxel of size a is a/√12 away from the surface point it stands for: that variance, against the
-    sensor's, is what a pair off planes counts.
-    """
-    variance = config.sensor_noise_m**2
-    spread = target.config.voxel_size_m**2 / 12.0
+    """The numbers a kernel runs under."""
     return Terms(
         optimiser=OPTIMISERS[config.optimiser],
         max_iterations=config.max_iterations,
@@ -76,7 +70,7 @@ def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
         max_distance_m=config.wide_max_distance_m if wide else config.max_distance_m,
         first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
         scale_m=config.kernel_scale_m,
-        point_weight=variance / (variance + spread),
+        variance=config.sensor_noise_m**2,
         tolerance_m=config.tolerance_m,
         tolerance_rad=config.tolerance_rad,
     )

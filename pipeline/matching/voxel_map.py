@@ -7,7 +7,7 @@ import numpy as np
 from pipeline import lie
 from pipeline.config import LocalMapConfig
 from pipeline.data import Points, Pose
-from pipeline.kernels.voxels import TICK, Voxels, insert, keep
+from pipeline.kernels.voxels import CELL, TICK, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
@@ -51,7 +51,7 @@ class VoxelMap:
 
 def _empty(room: int, voxel_size_m: float) -> Voxels:
     capacity = 1 << max(12, int(np.ceil(np.log2(room))))
-    cells = np.zeros((capacity, 8))
+    cells = np.zeros((capacity, CELL))
     cells[:, TICK] = -1.0
     return Voxels(
         keys=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int64),

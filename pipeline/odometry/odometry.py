@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config
@@ -13,7 +14,7 @@ from pipeline.data import Match, Matrix, Points, Pose, Scan, State
 from pipeline.errors import InputError
 from pipeline.matching import VoxelMap, correlative_seed, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
-from pipeline.preprocess import downsample, middle_s, preprocess
+from pipeline.preprocess import Sweep, sweep_of
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
@@ -55,15 +56,15 @@ class Odometry:
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
         self.usual_cost = 0.0
+        self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
+        self.first_points = self.first_sweep.points  # as seen from its stamp, once the second scan is there
 
     def track(self, scan: Scan) -> Tracked:
         """Predict, correct by registration, extend the map."""
         started = perf_counter()
-        points = preprocess(
-            scan, self.predictor.T_previous_current, self.predictor.interval_s, self.config.preprocess
-        )
-        matched = downsample(points, self.config.preprocess.match_voxel_m)
-        if not len(matched):
+        sweep = sweep_of(scan, self.config.preprocess)
+        sparse = sweep.thinned(self.config.preprocess.match_voxel_m)
+        if not len(sparse.points):
             raise InputError(
                 f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
                 f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
@@ -71,16 +72,21 @@ class Odometry:
             )
         prepared = perf_counter()
         prediction = self.predictor.predict(scan)
+        matched = sparse.from_middle(self.predictor.velocity)
         if len(self.local_map):
             match = self._align(scan, matched, prediction)
+            if sparse.is_distorted and match.inlier_share >= self.config.matching.min_inlier_share:
+                matched, match = self._deskewed(scan, sparse, match, prediction)
             state, reason = self._judge(match)
         else:
             match = self._first_match(matched)
             state, reason = State.OK, match.reason
+            self.first_sweep, self.first_points = sweep, sweep.points
         T_odom_middle = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         aligned = perf_counter()
-        T_stamp_middle = self._from_middle_to_stamp(scan, T_odom_middle)
+        T_stamp_middle = self._from_middle_to_stamp(scan, sweep, T_odom_middle)
         self.predictor.correct(scan, T_odom_middle)
+        points = sweep.from_middle(self.predictor.velocity)
         self._extend(points, T_odom_middle, state)
         tracked = Tracked(
             scan=scan,
@@ -96,17 +102,37 @@ class Odometry:
         )
         return tracked if T_stamp_middle is None else seen_from(tracked, T_stamp_middle)
 
-    def _from_middle_to_stamp(self, scan: Scan, T_odom_middle: Pose) -> Pose | None:
+    def _deskewed(self, scan: Scan, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match]:
+        """Deskew once more with the velocity that the match tells, and align once more.
+
+        The second scan tells the velocity of the first one too, which stands distorted in the map until then.
+        """
+        T_odom_middle = match.T_target_source
+        velocity = self.predictor.velocity_at(scan, T_odom_middle)
+        if self.predictor.is_new:
+            T_odom_middle = self._restart(velocity) @ T_odom_middle
+        points = sparse.from_middle(velocity)
+        return points, self.matcher.align(points, self.local_map, T_odom_middle, prediction.information)
+
+    def _restart(self, velocity: NDArray[np.float64]) -> Pose:
+        """Make the map anew of the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
+        T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
+        self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
+        self.local_map = VoxelMap(self.dimension, self.config.local_map)
+        self.local_map.insert(self.first_points, lie.identity(self.dimension))
+        self.predictor.place(T_odom_middle)
+        return T_odom_middle
+
+    def _from_middle_to_stamp(self, scan: Scan, sweep: Sweep, T_odom_middle: Pose) -> Pose | None:
         """T_stamp_middle by the velocity from the last scan's middle to this one's; None where they are one.
 
         Scans are matched as seen from their middle; the stamp lies between two middles, or just beyond.
         """
         interval_s = self.predictor.interval_to(scan)
-        middle = middle_s(scan, self.config.preprocess)
-        if middle == 0.0 or interval_s <= 0.0:
+        if sweep.middle_s == 0.0 or interval_s <= 0.0:
             return None
         motion = lie.inverse(self.predictor.T_odom_lidar) @ T_odom_middle
-        return lie.exp(middle / interval_s * lie.log(motion))
+        return lie.exp(sweep.middle_s / interval_s * lie.log(motion))
 
     def _align(self, scan: Scan, points: Points, prediction: Prediction) -> Match:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""

@@ -12,6 +12,7 @@ from pipeline.config import OdometryConfig
 from pipeline.data import Pose, Scan
 from pipeline.errors import InputError
 
+_EVEN = 2.0  # intervals whose ratio is below this tell an acceleration
 _LARGEST_STRETCH = 20.0  # a longer gap says nothing about the motion in it
 
 
@@ -37,6 +38,7 @@ class Predictor:
         self.T_base_lidar = T_base_lidar
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
+        self.velocity = np.zeros(3 if len(T_base_lidar) == 3 else 6)
         self.interval_s = 0.0
         self.last_scan: Scan | None = None
 
@@ -62,10 +64,34 @@ class Predictor:
     def correct(self, scan: Scan, T_odom_lidar: Pose) -> None:
         """Take the pose that the scan turned out to have."""
         if self.last_scan is not None:
+            self.velocity = self.velocity_at(scan, T_odom_lidar)
             self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
             self.interval_s = self.interval_to(scan)
         self.T_odom_lidar = T_odom_lidar
         self.last_scan = scan
+
+    @property
+    def is_new(self) -> bool:
+        """Whether no motion is known yet: one scan at most has been corrected."""
+        return self.interval_s == 0.0
+
+    def place(self, T_odom_lidar: Pose) -> None:
+        """Move the last pose, before any motion is known."""
+        self.T_odom_lidar = T_odom_lidar
+
+    def velocity_at(self, scan: Scan, T_odom_lidar: Pose) -> NDArray[np.float64]:
+        """Twist (k,) per second at a scan of this pose, in its own frame; the last one where stamps stand still.
+
+        The mean since the last scan, carried on by half an interval with the acceleration between the last two.
+        """
+        interval_s = self.interval_to(scan)
+        if interval_s <= 0.0:
+            return self.velocity
+        mean = lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar) / interval_s
+        if not 0.0 < interval_s < _EVEN * self.interval_s < _EVEN**2 * interval_s:
+            return mean
+        before = lie.log(self.T_previous_current) / self.interval_s
+        return mean + interval_s / (interval_s + self.interval_s) * (mean - before)
 
     def interval_to(self, scan: Scan) -> float:
         """Seconds from the last scan's stamp to this one's; 0 for the first scan."""

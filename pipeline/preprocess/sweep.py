@@ -1,0 +1,81 @@
+"""What is left of a scan to be matched, as measured: each point from where the lidar was at its own instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import PreprocessConfig
+from pipeline.data import Points, Scan
+from pipeline.kernels import downsample as kernels
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Points of a scan, one a voxel, and when each was measured.
+
+    Attributes
+    ----------
+    points : (M, d) float64 metres, each in the lidar frame of its own instant
+    times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
+    middle_s : seconds from the scan's stamp to its middle
+    """
+
+    points: Points
+    times_s: NDArray[np.float64]
+    middle_s: float
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the lidar's motion is in the points."""
+        return len(self.times_s) > 0
+
+    def thinned(self, voxel_m: float) -> Sweep:
+        """The first point of every voxel of this size."""
+        chosen = _first_per_voxel(self.points, voxel_m, 0.0, np.inf)
+        times_s = self.times_s[chosen] if self.is_distorted else self.times_s
+        return Sweep(_gather(self.points, chosen), times_s, self.middle_s)
+
+    def from_middle(self, velocity: NDArray[np.float64]) -> Points:
+        """The points (M, d) as seen from the lidar in the middle of the scan.
+
+        velocity : (k,) twist per second in the lidar frame, constant through the scan
+        Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
+        alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
+        the other way, and so on for ever.
+        """
+        if not self.is_distorted:
+            return self.points
+        points = self.points.copy()
+        kernels.deskew(points, self.times_s, velocity)
+        return points
+
+
+def sweep_of(scan: Scan, config: PreprocessConfig) -> Sweep:
+    """The scan cropped to the range that is used and thinned out, times left out where deskewing is off."""
+    chosen = _first_per_voxel(scan.points, config.map_voxel_m, config.min_range_m, config.max_range_m)
+    points = _gather(scan.points, chosen)
+    if not config.deskew or not len(scan.times_s):
+        return Sweep(points, np.empty(0), 0.0)
+    middle_s = 0.5 * (float(scan.times_s.min()) + float(scan.times_s.max()))
+    return Sweep(points, scan.times_s[chosen].astype(np.float64) - middle_s, middle_s)
+
+
+def downsample(points: Points, voxel_m: float) -> Points:
+    """The first point of every voxel."""
+    return _gather(points, _first_per_voxel(points, voxel_m, 0.0, np.inf))
+
+
+def _first_per_voxel(
+    points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
+) -> NDArray[np.int32]:
+    chosen = np.empty(len(points), np.int32)
+    return chosen[: kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, chosen)]
+
+
+def _gather(points: NDArray[np.floating], chosen: NDArray[np.int32]) -> Points:
+    out = np.empty((len(chosen), points.shape[1]))
+    kernels.gather(points, chosen, out)
+    return out

@@ -1,0 +1,60 @@
+"""Scans made ready for matching: cropped, thinned out, and seen from one place."""
+
+import naive
+import numpy as np
+import pytest
+from scenes import configured
+
+from pipeline.config import PreprocessConfig
+from pipeline.data import Scan
+from pipeline.preprocess import downsample, sweep_of
+
+CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
+
+
+def scan_of(points, times_s=()):
+    return Scan(0, 0, 0, points.astype(np.float32), np.array(times_s, np.float32), 0, None)
+
+
+def some_scan(dimension=3, n=2000, with_times=True):
+    rng = np.random.default_rng(0)
+    return scan_of(rng.uniform(-60.0, 60.0, (n, dimension)), rng.uniform(0.02, 0.12, n) if with_times else ())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_sweep_is_the_first_point_of_every_voxel_in_range_with_its_time(dimension):
+    scan = some_scan(dimension)
+    sweep = sweep_of(scan, CONFIG)
+    chosen = naive.first_per_voxel(scan.points, 0.5, 1.0, 50.0)
+    assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
+    assert sweep.middle_s == pytest.approx(0.07, abs=1e-3)
+    np.testing.assert_allclose(sweep.times_s, scan.times_s[chosen] - sweep.middle_s, atol=1e-7)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_points_are_seen_from_the_middle_at_constant_velocity(dimension):
+    sweep = sweep_of(some_scan(dimension), CONFIG)
+    before = sweep.points.copy()
+    velocity = np.array([8.0, 0.5, 0.3] if dimension == 2 else [8.0, 0.5, -0.2, 0.1, -0.2, 0.6])
+    np.testing.assert_allclose(
+        sweep.from_middle(velocity), naive.deskew(sweep.points, sweep.times_s, velocity), atol=1e-9
+    )
+    assert np.array_equal(sweep.points, before)
+
+
+def test_a_thinned_sweep_keeps_the_times_of_its_points():
+    sweep = sweep_of(some_scan(), CONFIG)
+    thin = sweep.thinned(4.0)
+    assert 10 < len(thin.points) < len(sweep.points)
+    assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
+    place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
+    assert [place[tuple(point)] for point in thin.points] == thin.times_s.tolist()
+
+
+@pytest.mark.parametrize(("with_times", "deskew"), [(False, True), (True, False)])
+def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_times, deskew):
+    config = configured(3, {"preprocess.deskew": deskew}).preprocess
+    sweep = sweep_of(some_scan(with_times=with_times), config)
+    assert not sweep.is_distorted and sweep.middle_s == 0.0
+    assert np.array_equal(sweep.from_middle(np.ones(6)), sweep.points)
+    assert not sweep.thinned(4.0).is_distorted
