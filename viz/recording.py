@@ -9,7 +9,6 @@ import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
 from uuid import uuid4
 
 import numpy as np
@@ -20,14 +19,13 @@ from rerun.error_utils import catch_and_log_exceptions
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
 from pipeline.errors import InputError
+from pipeline.runs.recorder import SinkName
 from viz import entities, shapes, viewer
 from viz.batching import Batcher
 from viz.blueprint import blueprint
 from viz.keyframe_graph import KeyframeGraph
 from viz.messages import Message, Times
 from viz.sinks import Sink, file_sink, open_stream, viewer_sink
-
-SinkName = Literal["save", "spawn", "connect", "web"]
 
 
 class Recording:

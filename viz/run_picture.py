@@ -13,7 +13,7 @@ from viz.plots import GridPicture, draw_map
 def draw_run(directory: Path, picture: Path) -> None:
     """Draw trajectory, odometry and map of a run to a PNG: the occupancy grid of a 2D run, the cloud of a 3D one.
 
-    Raises InputError where the directory is no run's, or the picture's name does not end in .png.
+    Raises InputError where the directory is no run's, or the picture does not end in .png or cannot be written.
     """
     if picture.suffix != ".png":
         raise InputError(f"{picture}: is no .png; name a file that ends in .png")
@@ -22,11 +22,15 @@ def draw_run(directory: Path, picture: Path) -> None:
     points = read_ply(directory / "map.ply")
     is_planar = not points[:, 2].any()
     cells, resolution_m, origin_m = read_map(directory)
-    draw_map(
-        picture,
-        title=directory.resolve().name,
-        optimised=read_tum(directory / "trajectory.tum").poses,
-        odometry=read_tum(directory / "odometry.tum").poses,
-        points=None if is_planar else points,
-        grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
-    )
+    optimised, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
+    try:
+        draw_map(
+            picture,
+            title=directory.resolve().name,
+            optimised=optimised.poses,
+            odometry=odometry.poses,
+            points=None if is_planar else points,
+            grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
+        )
+    except OSError as error:
+        raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error

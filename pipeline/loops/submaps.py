@@ -26,7 +26,7 @@ class Submaps:
         self.held: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
 
     def anchor_of(self, keyframe: int) -> int:
-        """The keyframe whose submap this one is nearest the middle of."""
+        """The last keyframe up to this one that has a submap around it."""
         return keyframe // self.half_width * self.half_width
 
     def around(self, anchor: int, keyframes: Sequence[Keyframe], newest: int) -> VoxelMap:

@@ -17,6 +17,8 @@ from pipeline.runs.step_table import STAGES, StepTable
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 
+_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+
 
 class Accuracy(Struct, frozen=True):
     """A trajectory against the ground truth; ``kitti_*`` are null where the path is too short."""
@@ -174,8 +176,9 @@ def _accuracy_lines(truth: GroundTruth) -> list[str]:
     lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
         share, rotation = 100.0 * accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
+        of_path = f" ({share:.3f} % of the path)" if truth.path_length_m >= _SHORTEST_PATH_M else ""
         lines.append(
-            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m ({share:.3f} % of the path), "
+            f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m{of_path}, "
             f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"
         )
     return lines

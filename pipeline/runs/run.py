@@ -139,6 +139,8 @@ def _process(
         config=config.recording,
     )
     with recorder as recording:
+        if recording.web_address:
+            progress.say(f"viewer: {recording.web_address}")
         for step in map(slam.process, progress.track(log.scans(), log.scan_count)):
             recording.log(step)
             steps.append(step)
@@ -157,7 +159,7 @@ def _hold(recording: Recorder, progress: Progress) -> float:
     if not recording.web_address:
         return 0.0
     began = perf_counter()
-    progress.say(f"viewer: {recording.web_address} until Ctrl-C")
+    progress.say(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
     recording.hold()
     return perf_counter() - began
 
@@ -206,7 +208,7 @@ def _rescued(
     if not len(steps) and not is_bug:
         return error
     directory.worth_keeping()
-    reason = str(error) or type(error).__name__
+    reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
     msgspec.structs.replace(provenance, stopped=reason).write(directory.path / RUN_FILE)
     if is_bug:
         text = "".join(traceback.format_exception(error))
