@@ -99,13 +99,10 @@ def prepare(
             )
         case Download():
             raise InputError(
-                f"{destination}: {name} is not fetched by itself; download {source.url} and convert it: "
-                f"scanchain convert FILE {destination}"
+                f"{destination}: {name} is not fetched by itself; download {source.url} and put it there as MCAP"
             )
         case Local():
-            raise InputError(
-                f"{destination}: absent; convert the file: scanchain convert {source.path} {destination}"
-            )
+            raise InputError(f"{destination}: absent; put {source.path} there as MCAP")
     return destination
 
 

@@ -24,6 +24,7 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
     start_s: NonNegative = 0.0
     end_s: Positive = float("inf")
     every: Count = 1
+    bad_scans: Literal["stop", "skip"] = "stop"
     min_range_m: NonNegative = 0.0
     max_range_m: Positive = float("inf")
     prefetch_chunks: Count = 4

@@ -137,7 +137,7 @@ def test_an_empty_file(refused, tmp_path):
 def test_not_an_mcap(refused, tmp_path):
     (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n" * 9)
     text = refused("run", tmp_path / "x.bag", "--out", tmp_path / "a")
-    says(text, tmp_path / "x.bag", "not an MCAP", "scanchain convert")
+    says(text, tmp_path / "x.bag", "not an MCAP", "convert it to MCAP")
 
 
 def test_a_log_without_a_lidar_lists_what_it_holds(refused, tmp_path):
@@ -176,7 +176,7 @@ NOWHERE = np.full(60, np.nan, "<f4").view(POINTS.dtype)
 def test_a_malformed_cloud_is_told_by_its_number_and_what_is_wrong(refused, tmp_path, lie, words):
     path = write(tmp_path / "x.mcap", [cloud_said(STAMP_NS, point_cloud(STAMP_NS, POINTS, **lie))])
     text = refused("run", path, "--out", tmp_path / "a")
-    says(text, f"{path}: scan 0 of /points is malformed", *words, "--start or --end")
+    says(text, f"{path}: scan 0 of /points is malformed", *words, "--log.bad_scans skip", "--topic")
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_malformed_cloud_is_told_by_its_number_and_what_is_wrong(refused, tmp_
 def test_a_scan_without_a_valid_point_says_why_there_is_none(refused, tmp_path, said, why):
     path = write(tmp_path / "x.mcap", [said])
     text = refused("run", path, "--out", tmp_path / "a")
-    says(text, f"{path}: scan 0 of {said.topic} has no valid point", why, "--start or --end")
+    says(text, f"{path}: scan 0 of {said.topic} has no valid point", why, "--log.bad_scans skip", "--topic")
 
 
 def test_a_span_without_a_scan_names_the_length_of_the_log(refused, tmp_path, office):
@@ -267,7 +267,7 @@ def test_a_file_named_twice_is_refused(refused, tmp_path, office):
         (["simulate", "office", "x.mcap", "--duration", "long"], ["--duration", "simulate --help"]),
         (["simulate", "office", "x.tum"], ["x.tum", "x.mcap"]),
         (["sequence", "get", "mars"], ["'mars'", "demo-office"]),
-        (["sequence", "get", "intel", "--out", "logs"], ["intel.mcap", "download", "scanchain convert"]),
+        (["sequence", "get", "intel", "--out", "logs"], ["intel.mcap", "download", "as MCAP"]),
         (["info", "absent.mcap"], ["absent.mcap", "check the path"]),
         (["evaluate", "absent.tum"], ["GT.tum", "--relations"]),
         (["evaluate", "absent.tum", "absent.tum"], ["absent.tum", "check the path"]),

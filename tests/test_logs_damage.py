@@ -60,7 +60,7 @@ def test_an_empty_file(tmp_path):
 )
 def test_a_file_that_is_no_mcap(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
-    says(complaint(tmp_path / "a.mcap"), "not an MCAP", "scanchain convert")
+    says(complaint(tmp_path / "a.mcap"), "not an MCAP", "convert it")
 
 
 def test_the_magic_and_nothing_else(tmp_path):

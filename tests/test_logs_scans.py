@@ -29,6 +29,7 @@ from pipeline import lie
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
+from pipeline.logs.log import index_files
 
 
 def read(*paths, **config):
@@ -182,6 +183,39 @@ def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
     next(iterator)
     iterator.close()
     assert 1 <= len(opened) <= 12
+
+
+def test_bad_scans_are_left_out_and_counted_if_asked(tmp_path):
+    blind = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [np.nan] * 5)) for k in (5, 7)]
+    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blind]), bad_scans="skip")
+    assert [scan.index for scan in scans] == list(range(10))
+    assert any("2 of 12 scans of /scan were left out (the first: " in line for line in log.damage)
+    with pytest.raises(InputError, match=r"a\.mcap: no scan of /scan could be read: 2 of 2"):
+        read(write(tmp_path / "a.mcap", blind), bad_scans="skip")
+
+
+def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
+    stamps = [0, 1, 1, 3, 2, 4]
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + s, [1.0, 2.0])) for k, s in enumerate(stamps)]
+    path = write(tmp_path / "a.mcap", said)
+    log = open_log(path)
+    for _ in range(2):
+        assert [scan.stamp_ns - STAMP_NS for scan in log.scans()] == stamps
+        assert len(log.notes) == 2
+        assert any("1 header stamps of /scan step back" in note for note in log.notes)
+        assert any("1 scans of /scan have the same header stamp" in note for note in log.notes)
+
+
+def test_a_chunk_that_says_nothing_of_its_times_loses_no_scan(tmp_path):
+    path = write(tmp_path / "a.mcap", office(20), compression="none", crcs=False)
+    whole = bytearray(path.read_bytes())
+    times = np.array([STAMP_NS + 19 * SECOND // 10] * 2, "<u8").tobytes()
+    assert times[:8] in whole
+    for index in index_files([path])[0].blocks[-1:]:
+        head = whole.index(np.array([index.start_ns, index.end_ns], "<u8").tobytes())
+        whole[head : head + 16] = bytes(16)
+    path.write_bytes(whole)
+    assert len(list(open_log(path).scans())) == 20
 
 
 # the wheel-odometry prior

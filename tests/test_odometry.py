@@ -137,6 +137,45 @@ def test_a_gap_of_a_second_is_bridged(town):
     assert ate_m(trajectory(steps), truth) < 0.05
 
 
+def test_a_gap_is_bridged_at_constant_velocity(town):
+    scans, T_base_lidar, truth = town
+    kept = [scan for scan in scans if not 40 <= scan.index < 52]
+    steps = tracked(kept, T_base_lidar, configured(3, {"odometry.prior": "constant-velocity"}))
+    assert ate_m(trajectory(steps), truth) < 0.05
+
+
+@pytest.mark.parametrize("odd_ns", [0, 1_000, -3_600_000_000_000])
+def test_a_stamp_that_makes_no_sense_moves_nothing(town, odd_ns):
+    scans, T_base_lidar, truth = town
+    odd = [replace(scan, stamp_ns=scans[29].stamp_ns + odd_ns) if scan.index == 30 else scan for scan in scans]
+    steps = tracked(odd, T_base_lidar, configured(3, {"odometry.prior": "constant-velocity"}))
+    assert {step.state for step in steps} == {State.OK}
+    for k, step in enumerate(steps):
+        if k != 30:
+            error = lie.inverse(truth.poses[0] @ step.T_odom_lidar) @ truth.poses[k]
+            assert np.linalg.norm(error[:3, 3]) < 0.05
+
+
+def test_a_covered_lidar_is_lost_and_found_again(town):
+    scans, T_base_lidar, truth = town
+    covered = [replace(scan, points=0.001 * scan.points) if 30 <= scan.index < 33 else scan for scan in scans]
+    steps = tracked(covered, T_base_lidar, configured(3))
+    assert [step.state for step in steps[29:34]] == [State.OK, *[State.LOST] * 3, State.OK]
+    assert "preprocess.min_range_m (1)" in steps[31].reason
+    assert ate_m(trajectory(steps), truth) < 0.05
+
+
+def test_an_edge_over_lost_scans_is_one_that_closures_can_bend(town):
+    scans, T_base_lidar, _ = town
+    slam = Slam(configured(3), T_base_lidar)
+    for scan in scans:
+        slam.process(replace(scan, points=0.001 * scan.points) if 30 <= scan.index < 33 else scan)
+    result = slam.finish()
+    after = next(keyframe.index for keyframe in result.keyframes if keyframe.scan_index >= 33)
+    sigma_m = [np.sqrt(np.linalg.inv(information)[0, 0]) for information in result.graph.information]
+    assert sigma_m[after - 1] > 0.5 and max(sigma_m[: after - 1] + sigma_m[after:]) < 0.1
+
+
 def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
     rng = np.random.default_rng(0)
     config = configured(2, {"odometry.prior": "constant-velocity"})

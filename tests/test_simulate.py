@@ -1,6 +1,7 @@
 """Simulated sequences: the truth is true, the log says what the sensor saw, the same seed gives the same bytes."""
 
 from dataclasses import replace
+from functools import cache
 
 import msgspec
 import naive_raycast
@@ -11,18 +12,42 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline import catalogue, lie
 from pipeline.errors import InputError
-from pipeline.simulate import SENSORS, WORLDS, simulate
-from pipeline.simulate.motion import Motion
+from pipeline.simulate import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
+from pipeline.simulate.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
+from pipeline.simulate.normals import surface_normals
 from pipeline.simulate.solids import Solids
 from pipeline.simulate.sweep import take_sweep
 from pipeline.simulate.wheels import wheel_odometry
+
+LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
+STRESSING = [name for name in WORLDS if name not in ("office", "town")]
 
 
 def drive(name, duration_s, seed=0):
     world = WORLDS[name]
     solids = world.build(np.random.default_rng(seed))
     rng = np.random.default_rng(seed + 100)
-    return solids, Motion(world.route, world.vehicle, solids, duration_s=duration_s, rng=rng)
+    return solids, world.motion(solids, duration_s=duration_s, rng=rng)
+
+
+@cache
+def planned(name, sensor, seed=0):
+    """A drive of the world's usual length, without noise and losses."""
+    return plan(name, sensor=sensor, seed=seed, noise_m=0.0, dropout=0.0)
+
+
+def in_reach(solids, place, reach_m):
+    """The solids that a sensor at a place could hit."""
+
+    def near(group, size):
+        return group[np.linalg.norm(group[:, :2] - place[:2], axis=1) - size < reach_m]
+
+    return replace(
+        solids,
+        boxes=near(solids.boxes, np.linalg.norm(solids.boxes[:, 2:4], axis=1)),
+        cylinders=near(solids.cylinders, solids.cylinders[:, 2]),
+        ellipsoids=near(solids.ellipsoids, solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +85,11 @@ def pose_of(odometry):
 # --- ray casting -----------------------------------------------------------------------------------------------
 
 
-def random_solids(rng):
+SMOOTH = np.array([-3.0, 0.9, 0.08, 1.0, 0.7, 0.11, 2.0])
+ROUGH = np.concatenate([SMOOTH, [0.15, 0.5, 0.4, 1.0], [-0.1, -0.9, 0.5, 0.3]])
+
+
+def random_solids(rng, ground=SMOOTH):
     yaw = rng.uniform(-np.pi, np.pi, 30)
     places = rng.uniform(-40.0, 40.0, (30, 2))
     bottom = rng.uniform(-3.0, 3.0, 30)
@@ -70,14 +99,16 @@ def random_solids(rng):
         boxes=np.column_stack([places, size[:, :2], bottom, bottom + height, np.cos(yaw), np.sin(yaw)]),
         cylinders=np.column_stack([places[::-1] + 3.0, size[:, 0], bottom, bottom + height]),
         ellipsoids=np.column_stack([places[:, ::-1], bottom, size]),
-        ground=np.array([-3.0, 0.9, 0.08, 1.0, 0.7, 0.11, 2.0]),
+        ground=ground,
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_kernel_equals_the_naive_ray_caster(seed):
+@pytest.mark.parametrize(
+    ("seed", "ground"), [(0, SMOOTH), (1, SMOOTH), (2, SMOOTH), (3, SMOOTH), (4, ROUGH), (5, ROUGH)]
+)
+def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     rng = np.random.default_rng(seed)
-    solids = random_solids(rng)
+    solids = random_solids(rng, ground)
     poses = lie.exp(np.column_stack([rng.uniform(-0.8, 0.8, (20, 3)), rng.normal(0.0, 0.1, (20, 3))]))
     directions = rng.normal(size=(400, 3)) * [1.0, 1.0, 0.25]
     directions[0], directions[1], directions[2] = [0, 0, 1], [0, 0, -1], [1, 0, 0]
@@ -102,18 +133,33 @@ def test_a_ray_into_empty_space_comes_back_infinite():
     assert np.allclose(ranges, [np.inf, np.inf, 2.0, 2.5, np.inf])
 
 
+def test_a_normal_is_the_way_straight_off_the_surface():
+    rng = np.random.default_rng(0)
+    solids = random_solids(rng, ROUGH)
+    directions = rng.normal(size=(600, 3)) * [1.0, 1.0, 0.25]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranges, solid = solids.strike(np.eye(4)[None], np.zeros(600, dtype=np.int32), directions, 50.0)
+    hit = np.isfinite(ranges)
+    places = directions[hit] * ranges[hit, None]
+    normals = surface_normals(places, solid[hit], solids)
+    assert set(np.digitize(solid[hit], [30, 60, 90])) == {0, 1, 2, 3}  # boxes, cylinders, ellipsoids, ground
+    assert np.all(np.sum(normals * directions[hit], axis=1) < 0.0)
+    off = naive_raycast.distance_to_surface(places + 1e-4 * normals, solids)
+    assert np.mean(np.abs(off - 1e-4) < 1e-7) > 0.98  # but near the seam of two solids
+
+
 # --- worlds and motion -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
     solids, motion = drive(name, 120.0, seed)
-    places = motion.base(np.arange(0.0, 120.0, 0.05))[:, :2, 3]
+    places = motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
     assert solids.clearance_m(places, below_m=2.0).min() > WORLDS[name].vehicle.radius_m + 0.05
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", ["office", "town"])
 def test_the_drive_starts_from_standstill_and_never_jerks(drives, name):
     _, motion = drives[name]
     vehicle = WORLDS[name].vehicle
@@ -154,20 +200,215 @@ def test_a_sequence_comes_back_to_where_it_was(name):
     assert revisited_m > 20.0
 
 
+# --- worlds that are hard on odometry ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_the_seed_alone_draws_the_place_and_the_motion(name):
+    first, same, other = (plan(name, seed=seed, duration_s=5.0) for seed in (3, 3, 4))
+    for kind in ("boxes", "cylinders", "ellipsoids", "ground"):
+        assert np.array_equal(getattr(first.solids, kind), getattr(same.solids, kind))
+    assert np.array_equal(first.truth().poses, same.truth().poses)
+    assert any(
+        not np.array_equal(getattr(first.solids, kind), getattr(other.solids, kind))
+        for kind in ("boxes", "cylinders")
+    )
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_the_motion_is_smooth(name):
+    motion, step = planned(name, "vlp-16").motion, 1e-3
+    poses = motion.lidar(np.arange(0.0, WORLDS[name].duration_s, step))
+    rates = lie.log(lie.inverse(poses[:-1]) @ poses[1:]) / step
+    change = np.abs(np.diff(rates, axis=0)).max(axis=0)  # within a millisecond
+    assert change[:3].max() < 0.01 and change[3:].max() < 0.02
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+@pytest.mark.parametrize("name", STRESSING)
+def test_every_lidar_sees_something_everywhere(name, sensor):
+    drive = planned(name, sensor)
+    fewest = {"hdl-64": 90_000, "os1-32": 13_000, "vlp-16": 11_000, "rosette": 3_000}[sensor]
+    for index in drive.scans[[0, len(drive.scans) // 2, -1]]:
+        sweep = take_sweep(
+            drive.solids, drive.motion, drive.sensor, int(index), index * 0.1, np.random.default_rng(0)
+        )
+        assert sweep.returned.sum() > fewest
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_rays_hit_what_the_naive_ray_caster_says(name):
+    drive = planned(name, "rosette" if name == "hall" else "os1-32")
+    index = int(drive.scans[-20])
+    sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
+    poses = drive.motion.lidar(index * 0.1 + sweep.rays.instants_ns * 1e-9)[sweep.rays.instant_of_ray]
+    reach_m = drive.sensor.max_range_m
+    solids = in_reach(drive.solids, poses[0, :3, 3], reach_m)
+    some = np.random.default_rng(1).choice(len(poses), 16, replace=False)
+    naive = [
+        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], solids, reach_m)
+        for k in some
+    ]  # fmt: skip
+    assert np.allclose(sweep.ranges_m[some], naive, atol=1e-6, rtol=0.0)
+
+
+def test_the_highway_is_at_full_speed_from_the_first_scan():
+    drive = planned("highway", "vlp-16")
+    steps = np.linalg.norm(np.diff(drive.truth().poses[:, :3, 3], axis=0), axis=1)
+    assert np.all(np.abs(steps - 2.5) < 0.02)
+    assert np.abs(np.diff(lie.yaw(drive.truth().poses))).max() > 0.007  # a bend of 300 m is part of it
+
+
+def test_the_hall_stands_still_for_two_seconds_then_moves_half_a_metre_a_scan():
+    poses = planned("hall", "vlp-16").truth().poses
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps[:20].max() < 1e-6
+    assert np.all(np.abs(steps[47:85] - 0.5) < 1e-3)
+
+
+def test_rings_on_a_flat_floor_stay_where_they_are_while_the_lidar_moves():
+    drive = planned("hall", "vlp-16")
+    height = WORLDS["hall"].vehicle.T_base_lidar[2, 3]
+    for index in (5, 60):  # at rest, at 5 m/s
+        sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
+        points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
+        floor = np.abs(points[:, 2] + height) < 1e-4
+        for lowest, elevation_deg in enumerate((-15.0, -13.0, -11.0)):
+            radius = np.hypot(*points[floor & (ring == lowest), :2].T)
+            assert len(radius) > 1000
+            assert np.allclose(radius, height / np.tan(np.deg2rad(-elevation_deg)), atol=1e-4)
+
+
+def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
+    motion = planned("turns", "vlp-16").motion
+    times = np.arange(0.0, 40.0, 0.01)
+    poses = motion.base(times)
+    rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(poses))) / 0.01)
+    assert rate.max() == pytest.approx(120.0, abs=1.0) and rate.min() == pytest.approx(-120.0, abs=1.0)
+    turning = np.abs(rate) > 5.0
+    assert turning.mean() > 0.25 and motion.speed_m_s(times[:-1])[turning].max() < 1e-6
+    assert np.linalg.norm(poses[:, :2, 3], axis=1).max() < 5.0
+
+
+def test_the_staircase_is_climbed_with_a_swaying_hand():
+    drive = planned("staircase", "vlp-16")
+    poses = drive.motion.lidar(np.arange(0.0, 40.0, 0.05))
+    assert np.ptp(poses[:, 2, 3]) > 6.0
+    assert np.abs(poses[:, 2, :2]).max() > 0.03  # rolls and pitches
+    assert np.ptp(np.unwrap(lie.yaw(poses))) > 4.0 * np.pi  # turns the same way on every landing
+    for seed in range(3):
+        path = planned("staircase", "vlp-16", seed)
+        places = path.motion.lidar(np.arange(0.0, 40.0, 0.2))[:, :3, 3]
+        assert naive_raycast.distance_to_surface(places, path.solids).min() > 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gap_lacks_one_second_in_a_bend_and_one_on_a_straight(seed):
+    drive = planned("gap", "vlp-16", seed)
+    stamps = drive.truth().stamps_ns
+    steps = np.diff(stamps)
+    holes = np.flatnonzero(steps > 100_000_000)
+    assert steps[holes].tolist() == [1_100_000_000] * 2 and set(np.delete(steps, holes)) == {100_000_000}
+    yaw_rates = []
+    for hole in holes:
+        begin_s = (drive.scans[hole] + 1) * 0.1
+        times = np.linspace(begin_s, begin_s + 1.0, 101)
+        yaw_rates.append(np.diff(np.unwrap(lie.yaw(drive.motion.base(times)))) / 0.01)
+    assert np.abs(yaw_rates[0]).min() > 0.4 and np.abs(yaw_rates[1]).max() < 0.05
+
+
+def test_wheel_odometry_goes_on_in_a_gap_and_log_time_never_steps_back(tmp_path):
+    truth = simulate("gap", tmp_path / "a.mcap", duration_s=16.0, sensor="lms-270")
+    assert len(truth) == 150
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+    stamps = [nanoseconds(odometry) for _, odometry in messages(tmp_path / "a.mcap", "/odom")]
+    assert set(np.diff(stamps)) == {20_000_000} and stamps[-1] - stamps[0] == 16_000_000_000
+    assert [nanoseconds(scan) for _, scan in messages(tmp_path / "a.mcap", "/scan")] == truth.stamps_ns.tolist()
+
+
+# --- information -----------------------------------------------------------------------------------------------
+
+
+def informed(drive, scan):
+    """Shares, and the undetermined twists seen from the world: left perturbations of T_world_lidar."""
+    index = int(np.searchsorted(drive.scans, scan))
+    pose = drive.truth().poses[index]
+    H = information(drive.solids, pose, drive.sensor, index=scan)
+    return pose, spectrum(H)[0], undetermined(H) @ lie.adjoint(pose).T
+
+
+def test_information_is_the_curvature_of_the_point_to_plane_error():
+    drive, sensor = planned("forest", "vlp-16"), SENSORS["vlp-16"]
+    pose, rays = drive.truth().poses[100], sensor.rays(0)
+    standing = np.zeros(len(rays.directions), dtype=np.int32)
+    ranges, solid = drive.solids.strike(pose[None], standing, rays.directions, sensor.max_range_m)
+    hit = np.isfinite(ranges) & (ranges >= sensor.min_range_m)
+    points = rays.directions[hit] * ranges[hit, None]
+    places = lie.transform(pose, points)
+    normals = surface_normals(places, solid[hit], drive.solids)
+
+    def residuals(twist):
+        return np.sum(normals * (lie.transform(pose @ lie.exp(twist), points) - places), axis=1)
+
+    J = np.stack([(residuals(step) - residuals(-step)) / 2e-6 for step in 1e-6 * np.eye(6)], axis=1)
+    assert np.allclose(information(drive.solids, pose, sensor), J.T @ J, rtol=1e-5, atol=1e-3 * len(points))
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+def test_the_middle_of_the_corridor_leaves_the_way_along_it_undetermined(sensor):
+    drive = planned("corridor", sensor)
+    seen = set()
+    for scan in range(0, 400, 40):
+        pose, shares, twists = informed(drive, scan)
+        x = pose[0, 3]
+        if STRUCTURE_M + SIGHT_M < x < LENGTH_M - STRUCTURE_M - SIGHT_M:
+            assert shares[0] < 1e-12 and shares[1] > 1e-3 and len(twists) == 1
+            assert np.allclose(np.abs(twists[0]), [1.0, 0, 0, 0, 0, 0], atol=1e-6)
+            seen.add("middle")
+        elif x > LENGTH_M - 12.0:
+            assert shares[0] > 3e-3 and len(twists) == 0
+            seen.add("end")
+    assert seen == {"middle", "end"}
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+def test_the_field_leaves_place_and_heading_undetermined_where_no_pole_is_in_range(sensor):
+    drive = planned("field", sensor)
+    poles = drive.solids.cylinders[:, :2]
+    reach_m, wide = (58.0, 0.3) if sensor == "rosette" else (50.0, np.inf)  # it looks ahead only
+    seen = set()
+    for scan in range(0, 400, 20):
+        pose, shares, twists = informed(drive, scan)
+        offsets = (poles - pose[:2, 3]) @ pose[:2, :2]  # ahead, to the left
+        distance = np.linalg.norm(offsets, axis=1)
+        if distance.min() > WORLDS["field"].sight_m:
+            assert shares[2] < 1e-12 and shares[3] > 1e-3 and len(twists) == 3
+            assert np.abs(twists[:, [2, 3, 4]]).max() < 1e-6  # neither height nor roll nor pitch
+            seen.add("none")
+        elif np.sum((distance < reach_m) & (np.abs(offsets[:, 1]) < wide * offsets[:, 0])) == 3:
+            assert shares[0] > 1e-5 and len(twists) == 0
+            seen.add("poles")
+    assert seen == {"none", "poles"}
+
+
 # --- sweeps ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("world", "sensor"),
     [("office", "lms-270"), ("office", "utm-30"), ("office", "vlp-16"), ("town", "hdl-64"), ("town", "os1-32"),
-     ("town", "vlp-16"), ("town", "rosette")],
+     ("town", "vlp-16"), ("town", "rosette"), ("highway", "hdl-64"), ("corridor", "rosette"), ("field", "vlp-16"),
+     ("forest", "os1-32"), ("staircase", "hdl-64"), ("hall", "rosette"), ("turns", "os1-32")],
 )  # fmt: skip
 def test_undistorted_with_the_truth_every_point_lies_on_a_surface(drives, world, sensor):
-    solids, motion = drives[world]
+    planned_drive = planned(world, sensor)
+    solids, motion = drives.get(world, (planned_drive.solids, planned_drive.motion))
     sweep = take_sweep(solids, motion, perfect(sensor), 37, 12.3, np.random.default_rng(0))
     points = undistorted(sweep, motion, 12.3)
     some = np.random.default_rng(1).choice(len(points), min(len(points), 1500), replace=False)
-    assert len(points) > 0.5 * len(sweep.ranges_m)
+    assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
     assert naive_raycast.distance_to_surface(points[some], solids).max() < 1e-5
 
 
@@ -221,7 +462,7 @@ def test_wheels_without_drift_report_the_planar_truth(drives):
     assert np.allclose(odometry, lie.inverse(planar[0]) @ planar, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", ["office", "town"])
 def test_wheel_odometry_drifts_more_the_larger_the_drift(drives, name):
     poses = drives[name][1].base(np.arange(0.0, 60.0, 0.02))
     planar = lie.flatten(poses)
@@ -364,7 +605,7 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
 
 
 def test_a_recording_of_others_says_where_to_get_it(tmp_path):
-    with pytest.raises(InputError, match=r"download http.*intel\.clf and convert it"):
+    with pytest.raises(InputError, match=r"download http.*intel\.clf and put it there as MCAP"):
         catalogue.prepare("intel", tmp_path)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pipeline.baselines.baseline import Baseline
+from pipeline.baselines.genz import GenzIcp
 from pipeline.baselines.gicp import SmallGicpModel, SmallGicpPairs
 from pipeline.baselines.kiss import KissIcp
 from pipeline.baselines.open3d_pairs import Open3dPairs
@@ -16,6 +17,9 @@ _MAKERS: dict[str, Callable[[], Baseline]] = {
     "kiss-icp": KissIcp,
     "small-gicp": SmallGicpModel,
     "small-gicp-pairs": SmallGicpPairs,
+    "genz-icp": GenzIcp,
+    "genz-icp-indoor": lambda: GenzIcp("indoor"),
+    "genz-icp-kitti": lambda: GenzIcp("kitti"),
     "open3d-p2l": lambda: Open3dPairs("point-to-plane"),
     "open3d-p2p": lambda: Open3dPairs("point-to-point"),
 }

@@ -31,12 +31,17 @@ def finite(points: RawPoints, times_s: NDArray[np.float32]) -> tuple[NDArray[np.
 
     Times that say nothing, because all are equal, are left out: KISS-ICP divides by their span.
     """
-    good = np.isfinite(points).all(axis=1)
-    times = np.empty(0)
-    if len(times_s) == len(points):
-        good &= np.isfinite(times_s)
-        times = times_s[good].astype(np.float64)
-    if not good.all():
+    times = times_s.astype(np.float64) if len(times_s) == len(points) else np.empty(0)
+    if not (np.isfinite(points).all() and np.isfinite(times).all()):
+        good = np.isfinite(points).all(axis=1)
+        if len(times):
+            good &= np.isfinite(times)
+            times = times[good]
         points = points[good]
     unequal = len(times) > 0 and times.min() < times.max()
     return np.ascontiguousarray(points, dtype=np.float64), times if unequal else np.empty(0)
+
+
+def middle(times_s: NDArray[np.float64]) -> float:
+    """Seconds from the stamp to the middle of the sweep, where a distorted scan's pose holds; 0 if unknown."""
+    return 0.5 * float(times_s.min() + times_s.max()) if len(times_s) else 0.0

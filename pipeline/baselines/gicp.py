@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.baselines.baseline import finite
+from pipeline.baselines.at_stamp import AtStamp
+from pipeline.baselines.baseline import finite, middle
 from pipeline.data import Pose, RawPoints
 from pipeline.errors import MissingExtraError
 
@@ -30,6 +31,7 @@ class SmallGicpModel:
         self.started = False
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
+        self.at_stamp = AtStamp()
 
     @property
     def description(self) -> str:
@@ -41,8 +43,9 @@ class SmallGicpModel:
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan against the map, then add it."""
+        frame, times = finite(points, times_s)
         cloud, _ = self.library.preprocess_points(
-            finite(points, times_s)[0], downsampling_resolution=_THINNING_M, num_threads=self.threads
+            frame, downsampling_resolution=_THINNING_M, num_threads=self.threads
         )
         if self.started:
             guess = self.T_odom_lidar @ self.T_previous_current
@@ -52,7 +55,7 @@ class SmallGicpModel:
             self.T_odom_lidar = T_odom_lidar
         self.map.insert(cloud, self.T_odom_lidar)
         self.started = True
-        return self.T_odom_lidar
+        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 
 
 class SmallGicpPairs:
@@ -64,6 +67,7 @@ class SmallGicpPairs:
         self.previous: Any = None
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
+        self.at_stamp = AtStamp()
 
     @property
     def description(self) -> str:
@@ -75,8 +79,9 @@ class SmallGicpPairs:
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan against the last and chain the motions."""
+        frame, times = finite(points, times_s)
         cloud, tree = self.library.preprocess_points(
-            finite(points, times_s)[0], downsampling_resolution=_THINNING_M, num_threads=self.threads
+            frame, downsampling_resolution=_THINNING_M, num_threads=self.threads
         )
         if self.previous is not None:
             target, target_tree = self.previous
@@ -86,7 +91,7 @@ class SmallGicpPairs:
             self.T_previous_current = np.array(answer.T_target_source)
             self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud, tree
-        return self.T_odom_lidar
+        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 
 
 def _import_small_gicp() -> ModuleType:

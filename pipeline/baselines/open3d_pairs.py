@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.baselines.baseline import finite
+from pipeline.baselines.at_stamp import AtStamp
+from pipeline.baselines.baseline import finite, middle
 from pipeline.data import Pose, RawPoints
 from pipeline.errors import MissingExtraError
 
@@ -40,6 +41,7 @@ class Open3dPairs:
         self.previous: Any = None
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
+        self.at_stamp = AtStamp()
 
     @property
     def description(self) -> str:
@@ -51,7 +53,8 @@ class Open3dPairs:
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan against the last and chain the motions."""
-        cloud = self._cloud(finite(points, times_s)[0])
+        frame, times = finite(points, times_s)
+        cloud = self._cloud(frame)
         if self.previous is not None:
             answer = self.open3d.pipelines.registration.registration_icp(
                 cloud, self.previous, _MAX_DISTANCE_M, self.T_previous_current, self.estimation, self.criteria
@@ -59,7 +62,7 @@ class Open3dPairs:
             self.T_previous_current = np.array(answer.transformation)
             self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud
-        return self.T_odom_lidar
+        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 
     def _cloud(self, points: NDArray[np.float64]) -> Any:
         cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))

@@ -32,12 +32,25 @@ def simulate(
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
 
-    WORLD is office (2D laser scanner) or town (3D lidar).
+    \b
+    WORLD is one of
+      office     rooms and corridors, 2D laser scanner
+      town       streets on rolling ground
+      highway    guard rails and signs at 25 m/s, from the first scan on
+      corridor   80 m between bare walls: along it nothing is seen but at its ends
+      field      flat, a few poles far apart: between them nothing is seen but the ground
+      forest     trunks and crowns on rough ground
+      staircase  four storeys, walked with the lidar in the hand
+      hall       flat floor, few pillars, from standstill to 5 m/s
+      turns      turns on the spot at 120 deg/s and short moves in a yard
+      gap        the town, but one second of scans is missing in a bend, and one on a straight
+    All but the office are driven with a 3D lidar unless --sensor says otherwise.
 
     \b
     Examples:
       scanchain simulate office office.mcap
       scanchain simulate town town.mcap --duration 20 --seed 3
+      scanchain simulate highway fast.mcap --sensor os1-32
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
     """
     if destination.suffix != ".mcap":

@@ -14,13 +14,14 @@ if TYPE_CHECKING:
     from pipeline.data import Scan
 
 _REDRAW_S = 0.2
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class Terminal:
     """Shows how far a job is; a context manager.
 
-    On the first Ctrl-C (or SIGTERM) while scans are tracked no more of them come, and the run finishes with what
-    it has; at any other time, and on the second, it interrupts as usual.
+    On the first Ctrl-C (or SIGTERM, or a closed terminal) while scans are tracked no more of them come, and the
+    run finishes with what it has; at any other time, and on the second, it interrupts as usual.
     """
 
     def __init__(self, unit: str) -> None:
@@ -33,7 +34,7 @@ class Terminal:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in _SIGNALS:
                 self.handlers[number] = signal.signal(number, self._interrupt)
         return self
 
@@ -48,6 +49,14 @@ class Terminal:
     def say(self, line: str) -> None:
         """Tell something that happens, to a person only."""
         if self.bar is not None:
+            self.bar.say(line)
+
+    def tell(self, line: str) -> None:
+        """Tell something that must be known, also into a pipe."""
+        if self.bar is None:
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+        else:
             self.bar.say(line)
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:

@@ -17,7 +17,6 @@ CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # of the kernel's scale from one association to the next
 PATIENCE = 20  # associations at the last scale
-NEARLY = 1.0  # tolerances within which the pairs are kept
 COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 
@@ -86,8 +85,8 @@ def align(voxels, points, T, prior, terms):
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ diag(prior) ξ, where ξ is the twist away from
     the first value: prior (k,) is the information of the prediction times the variance of a residual. Twists
     turn about the first value's position.
-    Points find new partners after every step until the steps are nearly small, or PATIENCE were taken with the
-    kernel at its last scale: pairs that flip to and fro would go on for ever. From then on the pairs stay.
+    Points find new partners after every step until PATIENCE were taken with the kernel at its last scale: pairs
+    that flip to and fro would go on for ever. From then on the pairs stay.
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
@@ -114,10 +113,10 @@ def align(voxels, points, T, prior, terms):
             ending = SINGULAR
             break
         if scale_m <= terms.scale_m:
-            if _is_small(x, terms, 1.0):
+            if _is_small(x, terms):
                 ending = CONVERGED
                 break
-            settled = PATIENCE if _is_small(x, terms, NEARLY) else settled + 1
+            settled += 1
         scale_m = max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
     for i in range(k):
@@ -172,7 +171,7 @@ def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
             now.T[:, :], now.away[:] = trial.T, trial.away
             now.H[:, :], now.b[:], now.sums[:] = trial.H, trial.b, trial.sums
             return True
-        if _is_small(x, terms, 1.0) or now.sums[DAMPING] > _MOST_DAMPING:
+        if _is_small(x, terms) or now.sums[DAMPING] > _MOST_DAMPING:
             x[:] = 0.0
             return True
         now.sums[DAMPING] *= growth
@@ -181,7 +180,7 @@ def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
 
 
 @njit(cache=True, inline="always")
-def _is_small(x, terms, times: float) -> bool:
+def _is_small(x, terms) -> bool:
     d = 2 if x.shape[0] == 3 else 3
     shift = turn = 0.0
     for i in range(x.shape[0]):
@@ -189,4 +188,4 @@ def _is_small(x, terms, times: float) -> bool:
             shift += x[i] * x[i]
         else:
             turn += x[i] * x[i]
-    return shift < (times * terms.tolerance_m) ** 2 and turn < (times * terms.tolerance_rad) ** 2
+    return shift < terms.tolerance_m**2 and turn < terms.tolerance_rad**2

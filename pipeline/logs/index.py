@@ -213,6 +213,6 @@ def _map(path: Path) -> mmap.mmap:
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(
             f"{path}: is not an MCAP file (starts with {data[:8]!r}); "
-            f"convert it with: scanchain convert {path} OUT.mcap"
+            "convert it to MCAP, ROS bags with: mcap convert or rosbags-convert"
         )
     return data

@@ -22,6 +22,7 @@ from pipeline.logs.poses import StampedPose, decode_odometry
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
+from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
 from pipeline.logs.topics import LASER_SCAN, find_ground_truth, find_lidar, find_odometry, kind
 from pipeline.logs.wheels import WheelTrack
@@ -29,6 +30,7 @@ from pipeline.logs.wheels import WheelTrack
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
+_REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --topic"
 
 
 def open_log(paths: Path | str | Sequence[Path | str], config: LogConfig = _DEFAULTS) -> Log:
@@ -82,6 +84,7 @@ class Log:
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.damage: list[str] = [line for index in indexes for line in index.damage]
+        self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
     @property
@@ -92,34 +95,52 @@ class Log:
     def scans(self) -> Iterator[Scan]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
 
-        Raises InputError where a scan is malformed or has no valid point at all; damaged chunks are left out and
-        named in ``damage``.
+        Raises InputError where a scan is malformed or has no valid point at all, unless ``log.bad_scans`` is skip:
+        then it is counted in ``damage`` and left out, like damaged chunks.
         """
         self.damage = [line for index in self.indexes for line in index.damage]
-        poses = ToldPoses(self.odometry_topic, self.ground_truth_topic)
-        count, asked = 0, perf_counter()
+        self.notes = list(self._opening_notes)
+        poses, tally = (
+            ToldPoses(self.odometry_topic, self.ground_truth_topic),
+            Tally(self.topic, self.odometry_topic),
+        )
+        count, index, asked = 0, 0, perf_counter()
         for message, T_odom_base in self._with_wheels(poses):
             count += 1
             if (count - 1) % self.config.every:
                 continue
-            returns = self._checked(message, count - 1)
-            yield Scan(
-                index=(count - 1) // self.config.every,
-                stamp_ns=returns.stamp_ns,
-                log_time_ns=message.log_time_ns,
-                points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
-                times_s=returns.times_s,
-                dropped=returns.dropped,
-                T_odom_base=T_odom_base,
-                waited_s=perf_counter() - asked,
-            )
+            complaint = self._complaint(message, count - 1)
+            if complaint and self.config.bad_scans == "skip":
+                tally.skip(complaint)
+                continue
+            if complaint:
+                raise InputError(f"{complaint}; {_REMEDY}")
+            scan = self._scan(index, message, T_odom_base, waited_s=perf_counter() - asked)
+            tally.take(scan)
+            yield scan
+            index += 1
             asked = perf_counter()
         self._truth = poses.ground_truth()
-        self.damage += poses.complaints()
-        if not count:
+        self.damage += [*tally.losses(), *poses.complaints()]
+        self.notes += tally.notes()
+        if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
-            self.damage.append(f"{count} scans of {self.topic} were recovered")
+            self.damage.append(f"{count - tally.bad} scans of {self.topic} were recovered")
+
+    def _scan(self, index: int, message: Decoded, T_odom_base: Pose | None, *, waited_s: float) -> Scan:
+        returns = message.value
+        assert isinstance(returns, Returns)
+        return Scan(
+            index=index,
+            stamp_ns=returns.stamp_ns,
+            log_time_ns=message.log_time_ns,
+            points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
+            times_s=returns.times_s,
+            dropped=returns.dropped,
+            T_odom_base=T_odom_base,
+            waited_s=waited_s,
+        )
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
@@ -160,16 +181,11 @@ class Log:
     def _decode_pose(self, data: memoryview) -> StampedPose:
         return decode_odometry(data, self.dimension)
 
-    def _checked(self, message: Decoded, number: int) -> Returns:
+    def _complaint(self, message: Decoded, number: int) -> str:
+        """What is wrong with a scan, empty where it is good."""
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(message.value, Returns):
-            raise InputError(
-                f"{where} is malformed: {message.value}; "
-                "leave it out with --start or --end, or choose another --topic"
-            )
+            return f"{where} is malformed: {message.value}"
         if not len(message.value.points):
-            raise InputError(
-                f"{where} has no valid point ({message.value.why}); leave it out with --start or --end, or widen "
-                "log.min_range_m and log.max_range_m"
-            )
-        return message.value
+            return f"{where} has no valid point ({message.value.why})"
+        return ""

@@ -29,6 +29,9 @@ class Span(NamedTuple):
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
 
+EVERYTHING = Span(0, (1 << 64) - 1)
+
+
 def whole_span(indexes: Sequence[FileIndex]) -> Span:
     """From the first message of all topics to the last, (0, 0) where there is none."""
     blocks = [block for index in indexes for block in index.blocks]
@@ -38,7 +41,9 @@ def whole_span(indexes: Sequence[FileIndex]) -> Span:
 
 
 def chosen_span(whole: Span, config: LogConfig) -> Span:
-    """From ``log.start_s`` to ``log.end_s``, counted from the first message."""
+    """From ``log.start_s`` to ``log.end_s``, counted from the first message; everything where neither is set."""
+    if config.start_s == 0.0 and config.end_s == float("inf"):
+        return EVERYTHING
     begin_ns = whole.begin_ns + round(config.start_s * 1e9)
     end_s = min(config.end_s, whole.duration_s)
     return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
@@ -66,7 +71,7 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
     )
     if not total:
         raise InputError(f"{path}: topic {topic} has no messages; see scanchain info {path}")
-    chosen = total if span == whole else count_messages(indexes, topic, span)
+    chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
         raise InputError(
             f"{path}: no scan of {topic} lies between --start {config.start_s:g} s and --end {config.end_s:g} s; "

@@ -9,6 +9,7 @@ from pipeline.data import Points, Pose
 from pipeline.errors import ScanchainError
 
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
+_ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise
 
 
 class DegeneratePairsError(ScanchainError):
@@ -33,7 +34,8 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64])
     mean_x, mean_y = weight @ source / total, weight @ target / total
     W = ((source - mean_x) * weight[:, None]).T @ (target - mean_y)
     U, singular, Vt = np.linalg.svd(W)
-    if singular[d - 2] <= _RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny):
+    rounding = np.finfo(float).eps * total * np.linalg.norm(mean_x) * np.linalg.norm(mean_y)
+    if singular[d - 2] <= max(_RANK_TOLERANCE * singular[0] if d == 3 else 0.0, _ROUNDINGS * rounding):
         raise DegeneratePairsError(
             f"all {len(source)} pairs lie on a {'line' if d == 3 else 'point'}: the rotation about it is free"
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -10,36 +9,17 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Match, Matrix, Points, Pose, Scan, State
+from pipeline.data import Match, Points, Pose, Scan, State
 from pipeline.errors import InputError
 from pipeline.matching import VoxelMap, correlative_seed, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
+from pipeline.odometry.tracked import Tracked, first_match, nothing_to_match, seen_from
 from pipeline.preprocess import Sweep, sweep_of
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
 _DOUBT = 2.0  # cost per point over its running mean, from which on other guesses are tried
 _MEMORY = 0.9  # of that running mean, per scan
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """A scan with its place in the odometry frame.
-
-    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
-    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
-    """
-
-    scan: Scan
-    points: Points
-    matched: Points
-    T_odom_lidar: Pose
-    match: Match
-    state: State
-    reason: str
-    preprocess_s: float
-    match_s: float
-    map_s: float
 
 
 class Odometry:
@@ -64,7 +44,7 @@ class Odometry:
         started = perf_counter()
         sweep = sweep_of(scan, self.config.preprocess)
         sparse = sweep.thinned(self.config.preprocess.match_voxel_m)
-        if not len(sparse.points):
+        if not len(sparse.points) and not len(self.local_map):
             raise InputError(
                 f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
                 f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
@@ -73,13 +53,16 @@ class Odometry:
         prepared = perf_counter()
         prediction = self.predictor.predict(scan)
         matched = sparse.from_middle(self.predictor.velocity)
-        if len(self.local_map):
+        if not len(matched):
+            match = nothing_to_match(prediction, self.config.preprocess)
+            state, reason = State.LOST, match.reason
+        elif len(self.local_map):
             match = self._align(scan, matched, prediction)
             if sparse.is_distorted and match.inlier_share >= self.config.matching.min_inlier_share:
                 matched, match = self._deskewed(scan, sparse, match, prediction)
             state, reason = self._judge(match)
         else:
-            match = self._first_match(matched)
+            match = first_match(self.predictor.T_odom_lidar, matched, self.config.matching)
             state, reason = State.OK, match.reason
             self.first_sweep, self.first_points = sweep, sweep.points
         T_odom_middle = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
@@ -136,11 +119,11 @@ class Odometry:
 
     def _align(self, scan: Scan, points: Points, prediction: Prediction) -> Match:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
-        wide = self.wide_scans > 0
+        wide = self.wide_scans > 0 or prediction.is_guess
         best = self.matcher.align(
             points, self.local_map, prediction.T_odom_lidar, prediction.information, wide=wide
         )
-        doubtful_cost = _DOUBT * self.usual_cost * len(points)
+        doubtful_cost = (1.0 if prediction.is_guess else _DOUBT) * self.usual_cost * len(points)
         if best.cost > doubtful_cost > 0.0:
             for guess in self._guesses(scan, points, prediction):
                 other = self.matcher.align(points, self.local_map, guess, self.no_prior, wide=True)
@@ -202,40 +185,3 @@ class Odometry:
         config = self.config.local_map
         distance_m = float(np.linalg.norm(T[:-1, -1]))
         return distance_m >= config.insert_distance_m or float(lie.rotation_angle(T)) >= config.insert_angle_rad
-
-    def _first_match(self, points: Points) -> Match:
-        k = 3 if self.dimension == 2 else 6
-        information: Matrix = np.diag(np.full(k, 1.0 / self.config.matching.sensor_noise_m**2)) * len(points)
-        return Match(
-            T_target_source=self.predictor.T_odom_lidar,
-            information=information,
-            cost=0.0,
-            inliers=len(points),
-            points=len(points),
-            iterations=0,
-            residual_m=0.0,
-            converged=True,
-            reason="first scan: the frame starts here",
-            degeneracy_eigenvalue=1.0,
-            degeneracy_direction=np.eye(k)[0],
-        )
-
-
-def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
-    """The same scan as seen from another frame that moves with it: points, pose, information."""
-    T_old_new = lie.inverse(T_new_old)
-    match = tracked.match
-    direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
-    Ad_inverse = lie.adjoint(T_old_new)
-    return replace(
-        tracked,
-        points=lie.transform(T_new_old, tracked.points),
-        matched=lie.transform(T_new_old, tracked.matched),
-        T_odom_lidar=tracked.T_odom_lidar @ T_old_new,
-        match=replace(
-            match,
-            T_target_source=match.T_target_source @ T_old_new,
-            information=Ad_inverse.T @ match.information @ Ad_inverse,
-            degeneracy_direction=direction / np.linalg.norm(direction),
-        ),
-    )

@@ -13,7 +13,10 @@ from pipeline.data import Pose, Scan
 from pipeline.errors import InputError
 
 _EVEN = 2.0  # intervals whose ratio is below this tell an acceleration
-_LARGEST_STRETCH = 20.0  # a longer gap says nothing about the motion in it
+_GAP = 5.0  # times the usual interval, from which on scans are missing
+_ALIKE = 1.4  # ratio up to which two intervals agree
+_LONGEST = 100.0  # times the usual interval, beyond which stamps make no sense
+_MEMORY = 0.9  # of the usual interval, per scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +27,12 @@ class Prediction:
     ----------
     T_odom_lidar : the expected pose
     information : (k,) inverse variances of the expected pose, m⁻² and rad⁻²
+    is_guess : whether much time has passed, so that the pose may be far off
     """
 
     T_odom_lidar: Pose
     information: NDArray[np.float64]
+    is_guess: bool
 
 
 class Predictor:
@@ -40,6 +45,7 @@ class Predictor:
         self.T_previous_current = self.T_odom_lidar
         self.velocity = np.zeros(3 if len(T_base_lidar) == 3 else 6)
         self.interval_s = 0.0
+        self.usual_s = 0.0
         self.last_scan: Scan | None = None
 
     def predict(self, scan: Scan) -> Prediction:
@@ -47,19 +53,21 @@ class Predictor:
         wheel = self._wheel_motion(scan)
         config = self.config
         if wheel is None:
-            expected = self.T_odom_lidar @ self.T_previous_current
-            return Prediction(expected, self._information(config.velocity_sigma_m, config.velocity_sigma_rad))
-        expected = self.T_odom_lidar @ wheel
-        return Prediction(expected, self._information(config.wheel_sigma_m, config.wheel_sigma_rad))
+            expected = self.T_odom_lidar @ self._carried_on(scan)
+            information = self._information(config.velocity_sigma_m, config.velocity_sigma_rad)
+            return Prediction(expected, information, is_guess=self._has_gap_before(scan))
+        information = self._information(config.wheel_sigma_m, config.wheel_sigma_rad)
+        return Prediction(self.T_odom_lidar @ wheel, information, is_guess=False)
 
     def alternatives(self, scan: Scan) -> tuple[Pose, ...]:
         """Poses worth trying where the expected one leads nowhere good.
 
-        Constant velocity, the same over the time that passed by the stamps, and standing still.
+        The last motion again, the same over the time that passed by the stamps or half of that, half as much more,
+        and standing still.
         """
         T = self.T_odom_lidar
-        stretched = lie.exp(self._stretch(scan) * lie.log(self.T_previous_current))
-        return T @ self.T_previous_current, T @ stretched, T
+        stretched = tuple(T @ self._stretched(scan, share) for share in (0.5, 1.0, 1.5))
+        return T @ self.T_previous_current, *stretched, T
 
     def correct(self, scan: Scan, T_odom_lidar: Pose) -> None:
         """Take the pose that the scan turned out to have."""
@@ -67,6 +75,9 @@ class Predictor:
             self.velocity = self.velocity_at(scan, T_odom_lidar)
             self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
             self.interval_s = self.interval_to(scan)
+            if not self._has_gap_before(scan):
+                gain = 1.0 - _MEMORY if self.usual_s else 1.0
+                self.usual_s += gain * (self.interval_s - self.usual_s)
         self.T_odom_lidar = T_odom_lidar
         self.last_scan = scan
 
@@ -94,8 +105,33 @@ class Predictor:
         return mean + interval_s / (interval_s + self.interval_s) * (mean - before)
 
     def interval_to(self, scan: Scan) -> float:
-        """Seconds from the last scan's stamp to this one's; 0 for the first scan."""
-        return (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9 if self.last_scan is not None else 0.0
+        """Seconds since the last scan, 0 for the first.
+
+        By the stamps where these agree with the usual interval or with the times of the log, else as usual.
+        """
+        if self.last_scan is None:
+            return 0.0
+        stamped_s = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9
+        logged_s = (scan.log_time_ns - self.last_scan.log_time_ns) * 1e-9
+        if not self.usual_s or _are_alike(stamped_s, self.usual_s):
+            return stamped_s
+        is_sound = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
+        return stamped_s if is_sound else self.usual_s
+
+    def _has_gap_before(self, scan: Scan) -> bool:
+        """Whether scans are missing."""
+        return self.usual_s > 0.0 and self.interval_to(scan) > _GAP * self.usual_s
+
+    def _carried_on(self, scan: Scan) -> Pose:
+        """The motion to expect: the last one again or, over a gap, the same velocity for longer."""
+        return self._stretched(scan) if self._has_gap_before(scan) else self.T_previous_current
+
+    def _stretched(self, scan: Scan, share: float = 1.0) -> Pose:
+        """The motion over a share of the time that passed; the shortest intervals tell a velocity badly."""
+        last_s = max(self.interval_s, 0.5 * self.usual_s)
+        if last_s <= 0.0:
+            return self.T_previous_current
+        return lie.exp(share * self.interval_to(scan) / last_s * lie.log(self.T_previous_current))
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
@@ -111,14 +147,12 @@ class Predictor:
             return None
         return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
 
-    def _stretch(self, scan: Scan) -> float:
-        """The interval up to this scan over the last one; 1 where the stamps make no sense."""
-        if self.last_scan is None or self.interval_s <= 0.0:
-            return 1.0
-        ratio = self.interval_to(scan) / self.interval_s
-        return ratio if 0.0 < ratio < _LARGEST_STRETCH else 1.0
-
     def _information(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
         d = self.T_odom_lidar.shape[0] - 1
         turns = 1 if d == 2 else 3
         return np.array([sigma_m**-2] * d + [sigma_rad**-2] * turns)
+
+
+def _are_alike(a: float, b: float) -> bool:
+    """Whether two intervals are positive and of about the same length."""
+    return 0.0 < b <= _ALIKE * a <= _ALIKE**2 * b

@@ -17,7 +17,11 @@ class Progress(Protocol):
         ...
 
     def say(self, line: str) -> None:
-        """Tell something that happens."""
+        """Tell something that happens, to a person who looks on."""
+        ...
+
+    def tell(self, line: str) -> None:
+        """Tell something that must be known, to anyone."""
         ...
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
@@ -31,6 +35,9 @@ class Unwatched:
     stopped = False
 
     def say(self, line: str) -> None:
+        """Nothing is told."""
+
+    def tell(self, line: str) -> None:
         """Nothing is told."""
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -14,11 +15,14 @@ from pipeline.data import Points, Pose
 from pipeline.graph.g2o import write_g2o
 from pipeline.maps import OccupancyGrid, build_point_map, draw_grid, fitting_resolution, write_map, write_ply
 from pipeline.runs.recorder import Recorder
+from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_kitti, write_tum
 
 
-def write_results(folder: Path, result: SlamResult, config: MapsConfig, recording: Recorder) -> None:
+def write_results(
+    folder: Path, result: SlamResult, judged: Sequence[JudgedClosure], config: MapsConfig, recording: Recorder
+) -> None:
     """Write trajectories, graph and maps into a run directory, and show them in the recording."""
     write_tum(folder / "trajectory.tum", result.trajectory)
     write_tum(folder / "odometry.tum", result.odometry)
@@ -26,7 +30,7 @@ def write_results(folder: Path, result: SlamResult, config: MapsConfig, recordin
     write_g2o(folder / "graph.g2o", result.graph)
     indices = np.arange(len(result.trajectory), dtype=np.int64)
     recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
-    recording.log_closures(result.closures, result.state)
+    recording.log_closures([replace(item.closure, verdict=item.verdict) for item in judged], result.state)
     dimension = result.trajectory.dimension
     cloud = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.voxel_size_m).points()
     write_ply(folder / "map.ply", cloud)

@@ -10,6 +10,7 @@ from time import perf_counter
 
 import msgspec
 
+from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError, ScanchainError
@@ -23,7 +24,7 @@ from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
 from pipeline.runs.results import write_results
 from pipeline.runs.step_table import StepTable
-from pipeline.runs.verdicts import final_verdicts
+from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
 from pipeline.trajectory import read_tum, write_tum
@@ -81,6 +82,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
     directory = RunDirectory(job.out, force=job.force)
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
+    _check_prior(log, settings.config)
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable()
@@ -92,8 +94,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
             truth, note = _judge(job, log, recorded.result, reference)
             warnings = (*log.damage, *recorded.warnings, *note)
             run_s = perf_counter() - started - recorded.held_s
-            judged = final_verdicts(recorded.result.closures, recorded.result.state)
-            metrics = measure(steps, recorded.result, judged, run_s=run_s, ground_truth=truth)
+            metrics = measure(steps, recorded.result, recorded.judged, run_s=run_s, ground_truth=truth)
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
             metrics.write(directory.path / "metrics.json")
@@ -111,11 +112,21 @@ def _check_distinct(paths: tuple[Path, ...]) -> None:
             raise InputError(f"{path}: is named {count} times; name each file of a log once")
 
 
+def _check_prior(log: Log, config: Config) -> None:
+    """Refuse a prior that the log does not have before anything is processed."""
+    if config.odometry.prior == "wheel" and not log.has_odometry:
+        raise InputError(
+            f"{log.paths[0]}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
+            "set log.odometry_topic, or odometry.prior to 'auto'"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class _Recorded:
     """The result of a log that went through, what the recording has to say, and how long the user looked at it."""
 
     result: SlamResult
+    judged: tuple[JudgedClosure, ...]
     warnings: tuple[str, ...]
     held_s: float
 
@@ -140,18 +151,18 @@ def _process(
     )
     with recorder as recording:
         if recording.web_address:
-            progress.say(f"viewer: {recording.web_address}")
+            progress.tell(f"viewer: {recording.web_address}")
         for step in map(slam.process, progress.track(log.scans(), log.scan_count)):
             recording.log(step)
             steps.append(step)
         progress.say("optimising and writing")
         result = slam.finish()
-        write_results(folder, result, config.maps, recording)
         judged = final_verdicts(result.closures, result.state)
+        write_results(folder, result, judged, config.maps, recording)
         write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
         steps.write(folder / "steps.parquet", result.trajectory)
         held_s = _hold(recording, progress)
-    return _Recorded(result, tuple(recording.warnings), held_s)
+    return _Recorded(result, judged, tuple(recording.warnings), held_s)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:
@@ -159,7 +170,7 @@ def _hold(recording: Recorder, progress: Progress) -> float:
     if not recording.web_address:
         return 0.0
     began = perf_counter()
-    progress.say(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
+    progress.tell(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
     recording.hold()
     return perf_counter() - began
 
@@ -181,7 +192,12 @@ def _judge(
 
 def _heading(log: Log, stopped: str) -> str:
     paths = ", ".join(str(path) for path in log.paths)
-    return f"{paths} {log.topic}" + (f" (PARTIAL: {stopped})" if stopped else "")
+    place = lie.lift(log.T_base_lidar)[:3, 3]
+    mounting = (
+        f"lidar at x {place[0]:.2f}, y {place[1]:.2f}, z {place[2]:.2f} m of the base" if place.any() else ""
+    )
+    known = ", ".join(part for part in (f"wheels {log.odometry_topic or 'none'}", mounting) if part)
+    return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
 
 
 def _complete(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +12,13 @@ from pipeline import lie
 from pipeline.data import Matrix, Trajectory
 from pipeline.errors import InputError
 from pipeline.logs.write import LogWriter
+from pipeline.simulate.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
 from pipeline.simulate.motion import Motion
-from pipeline.simulate.sensors import SENSORS, Sensor
-from pipeline.simulate.solids import Solids
+from pipeline.simulate.sensors import Sensor
 from pipeline.simulate.sweep import Sweep, take_sweep
 from pipeline.simulate.wheels import wheel_odometry
-from pipeline.simulate.worlds import find_world
 
-EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 ODOMETRY_PERIOD_NS = 20_000_000
-_LONGEST_S = 36_000.0
-_PLACE, _WANDER, _WHEELS, _RANGES = range(4)  # every purpose draws its own random numbers
 
 
 def simulate(
@@ -43,36 +38,32 @@ def simulate(
 
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
-    of every scan, exact) and /tf_static (T_base_lidar). ``drift`` multiplies the errors of the wheel odometry;
-    ``noise_m`` and ``dropout`` replace the sensor's own; ``progress`` is told scans done and scans in all.
+    of every scan, exact) and /tf_static (T_base_lidar); in the holes of a world, /odom alone goes on. ``drift``
+    multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
+    ``progress`` is told scans done and scans in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
-    place = find_world(world)
-    lidar = _sensor(sensor or place.sensor, noise_m, dropout)
-    length_s = place.duration_s if duration_s is None else duration_s
-    _check(length_s, drift, lidar, destination, force)
-    count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
-    solids = place.build(_random(seed, _PLACE))
-    motion = Motion(
-        place.route,
-        place.vehicle,
-        solids,
-        duration_s=length_s + lidar.period_ns * 1e-9,
-        rng=_random(seed, _WANDER),
-    )
-    truth = _truth(motion, lidar, count)
+    check_range("drift", drift, 0.0, 100.0)
+    truth_file = destination.with_suffix(".tum")
+    if truth_file.exists() and not force:
+        raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
+    drive = plan(world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout)
+    truth = drive.truth()
+    period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
-        log.static_transform(EPOCH_NS, "base_link", "lidar", place.vehicle.T_base_lidar)
-        wheels = _Wheels(log, motion, count * lidar.period_ns, drift, _random(seed, _WHEELS))
-        for index, sweep in enumerate(_sweeps(solids, motion, lidar, count, _random(seed, _RANGES))):
-            stamp_ns = EPOCH_NS + index * lidar.period_ns
-            log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[index])
-            wheels.write_until(stamp_ns + lidar.period_ns)
-            _write_sweep(log, sweep, lidar, stamp_ns)
+        log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
+        end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
+        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
+        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
+            stamp_ns = int(truth.stamps_ns[done])
+            wheels.write_until(stamp_ns - 1)  # in a hole
+            log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
+            wheels.write_until(stamp_ns + period_ns)
+            _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
-                progress(index + 1, count)
-    write_tum(truth, destination.with_suffix(".tum"))
+                progress(done + 1, len(truth))
+    write_tum(truth, truth_file)
     return truth
 
 
@@ -87,19 +78,18 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _sweeps(
-    solids: Solids, motion: Motion, sensor: Sensor, count: int, rng: np.random.Generator
-) -> Iterator[Sweep]:
-    """All scans in order; the next is cast in a thread while the last is written."""
+def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
+    """All recorded scans in order; the next is cast in a thread while the last is written."""
 
     def take(index: int) -> Sweep:
-        return take_sweep(solids, motion, sensor, index, index * sensor.period_ns * 1e-9, rng)
+        start_s = index * drive.sensor.period_ns * 1e-9
+        return take_sweep(drive.solids, drive.motion, drive.sensor, index, start_s, rng)
 
     with ThreadPoolExecutor(max_workers=1) as caster:
-        upcoming = caster.submit(take, 0)
-        for index in range(1, count):
+        upcoming = caster.submit(take, int(drive.scans[0]))
+        for index in drive.scans[1:]:
             sweep = upcoming.result()
-            upcoming = caster.submit(take, index)
+            upcoming = caster.submit(take, int(index))
             yield sweep
         yield upcoming.result()
 
@@ -148,41 +138,3 @@ def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) ->
         scan_time_s=sensor.period_ns * 1e-9,
         log_time_ns=end_ns,
     )
-
-
-def _truth(motion: Motion, sensor: Sensor, count: int) -> Trajectory:
-    starts_ns = np.arange(count, dtype=np.int64) * sensor.period_ns
-    poses = motion.lidar(starts_ns * 1e-9)
-    return Trajectory(EPOCH_NS + starts_ns, lie.flatten(poses) if sensor.dimension == 2 else poses)
-
-
-def _sensor(name: str, noise_m: float | None, dropout: float | None) -> Sensor:
-    if name not in SENSORS:
-        raise InputError(f"sensor {name!r} does not exist; choose one of {', '.join(SENSORS)}")
-    sensor = SENSORS[name]
-    return replace(
-        sensor,
-        noise_m=sensor.noise_m if noise_m is None else noise_m,
-        dropout=sensor.dropout if dropout is None else dropout,
-    )
-
-
-def _check(duration_s: float, drift: float, sensor: Sensor, destination: Path, force: bool) -> None:
-    shortest_s = sensor.period_ns * 1e-9
-    for name, value, low, high in (
-        ("duration_s", duration_s, shortest_s, _LONGEST_S),
-        ("drift", drift, 0.0, 100.0),
-        ("noise_m", sensor.noise_m, 0.0, 10.0),
-        ("dropout", sensor.dropout, 0.0, 1.0),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"{name} {value:g} is out of range; choose one from {low:g} to {high:g}")
-    truth = destination.with_suffix(".tum")
-    if truth.exists() and not force:
-        raise InputError(f"{truth}: exists; choose another name or pass --force to replace it")
-
-
-def _random(seed: int, purpose: int) -> np.random.Generator:
-    if seed < 0:
-        raise InputError(f"seed {seed} is negative; choose one from 0 up")
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose,)))

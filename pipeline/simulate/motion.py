@@ -1,27 +1,22 @@
-"""A smooth drive along a route, whose pose is known at any instant."""
+"""What moves the lidar, how it sways, and how it stands on the ground."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
-from scipy.interpolate import BSpline, make_interp_spline
-from scipy.ndimage import gaussian_filter1d
 
-from pipeline import lie
 from pipeline.data import Matrix
 from pipeline.simulate.solids import Solids
 
-_HOLD_S = 1.0  # standstill at the beginning, as long as the easing reaches
-_STEP_S = 0.02  # spacing of the speed profile
-_EASE_S = 0.25  # standard deviation of the smoothing that makes the acceleration continuous
+_HERTZ = {2: 1.3, 3: 0.9, 4: 1.1, 1: 0.8, 5: 0.6}  # of the sway, by twist axis
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """How a robot or a car moves, and where its lidar sits.
+    """How a robot, a car or a walking person moves, and where the lidar sits.
 
     Attributes
     ----------
@@ -31,6 +26,9 @@ class Vehicle:
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
     radius_m : half its width
     T_base_lidar : (4, 4)
+    swing_rad, swing_m : heading and sideways motion of the body at full speed, amplitudes
+    start_m_s : speed at the first instant
+    standstill_s : how long it stands before it sets off
     """
 
     speed_m_s: float
@@ -42,102 +40,50 @@ class Vehicle:
     heave_m: float
     radius_m: float
     T_base_lidar: Matrix
+    swing_rad: float = 0.0
+    swing_m: float = 0.0
+    start_m_s: float = 0.0
+    standstill_s: float = 0.0
 
 
-class Motion:
-    """A drive round a closed ``route`` (W, 2), lap after lap, from standstill."""
+def mount(x_m: float, z_m: float) -> Matrix:
+    """T_base_lidar (4, 4) of a lidar that looks ahead, so far before and above the base."""
+    return np.array([[1.0, 0, 0, x_m], [0, 1, 0, 0], [0, 0, 1, z_m], [0, 0, 0, 1]])
 
-    def __init__(
-        self,
-        route: Matrix,
-        vehicle: Vehicle,
-        solids: Solids,
-        *,
-        duration_s: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._vehicle = vehicle
-        self._solids = solids
-        self._phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-        reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m
-        line = _wander(_densify(route, reach_m, 0.02 * vehicle.corner_m), vehicle, rng)
-        smooth = gaussian_filter1d(line, 50.0, axis=0, mode="nearest")
-        arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-        self._position = make_interp_spline(arc_m, smooth, k=3)
-        self._arc = _drive(self._position, arc_m, vehicle, duration_s)
+
+class Motion(Protocol):
+    """A motion whose pose is known at any instant."""
 
     def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
         """Speed along the path at (N,) instants."""
-        return self._arc(times_s, 1)
+        ...
 
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
-        arc_m = self._arc(times_s)
-        xy = self._position(arc_m)
-        forward = self._position(arc_m, 1)
-        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        poses = _on_ground(xy, forward, self._solids)
-        if self._vehicle.sway_rad > 0.0 or self._vehicle.heave_m > 0.0:
-            poses = poses @ lie.exp(self._sway(times_s))
-        return poses
+        """T_world_base at (N,) instants, (N, 4, 4)."""
+        ...
 
     def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_lidar at (N,) instants, (N, 4, 4)."""
-        return self.base(times_s) @ self._vehicle.T_base_lidar
+        ...
 
-    def _sway(self, times_s: NDArray[np.floating]) -> Matrix:
-        """Twists (N, 6) of the body on its springs: heave at 1.3 Hz, roll at 0.9 Hz, pitch at 1.1 Hz."""
-        share = self.speed_m_s(times_s) / self._vehicle.speed_m_s
-        twist = np.zeros((len(times_s), 6))
-        for column, hertz, size, phase in zip(
-            (2, 3, 4),
-            (1.3, 0.9, 1.1),
-            (self._vehicle.heave_m, self._vehicle.sway_rad, self._vehicle.sway_rad),
-            self._phases,
-            strict=True,
-        ):
+
+def sway(
+    vehicle: Vehicle, phases: NDArray[np.float64], times_s: NDArray[np.floating], share: NDArray[np.float64]
+) -> Matrix:
+    """Twists (N, 6) of a body on its springs or legs, as large as the ``share`` (N,) of the full speed.
+
+    Heave at 1.3 Hz, roll at 0.9 Hz, pitch at 1.1 Hz, sideways at 0.8 Hz, heading at 0.6 Hz; ``phases`` (5,).
+    """
+    sizes = (vehicle.heave_m, vehicle.sway_rad, vehicle.sway_rad, vehicle.swing_m, vehicle.swing_rad)
+    twist = np.zeros((len(times_s), 6))
+    for (column, hertz), size, phase in zip(_HERTZ.items(), sizes, phases, strict=True):
+        if size > 0.0:
             twist[:, column] = share * size * np.sin(2.0 * np.pi * hertz * times_s + phase)
-        return twist
+    return twist
 
 
-def _densify(route: Matrix, reach_m: float, step_m: float) -> Matrix:
-    """Points every ``step_m`` along as many laps of the closed route as ``reach_m`` takes."""
-    lap = np.vstack([route, route[:1]])
-    corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lap, axis=0), axis=1))])
-    along_m = np.arange(0.0, reach_m, step_m) % corners_m[-1]
-    return np.stack([np.interp(along_m, corners_m, lap[:, axis]) for axis in (0, 1)], axis=1)
-
-
-def _wander(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix:
-    """The line shifted by slow waves, at most ``wander_m`` in x and in y."""
-    place = np.arange(len(line)) / 50.0  # in units of corner_m
-    shift = np.zeros_like(line)
-    for axis in (0, 1):
-        for wavelength in rng.uniform(8.0, 30.0, 3):
-            shift[:, axis] += np.sin(2.0 * np.pi * (place / wavelength + rng.uniform())) / 3.0
-    return line + vehicle.wander_m * shift
-
-
-def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, duration_s: float) -> BSpline:
-    """Arc length over time: as fast as the limits allow, then eased so that the acceleration is continuous."""
-    first, second = position(arc_m, 1), position(arc_m, 2)
-    bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-    energy = np.minimum(vehicle.speed_m_s**2, vehicle.lateral_acceleration_m_s2 / np.maximum(bend, 1e-9))
-    energy[0] = 0.0
-    gain = 2.0 * vehicle.acceleration_m_s2 * arc_m  # v² grows by at most 2 a Δs, ahead and looking back
-    energy = np.minimum.accumulate(energy - gain) + gain
-    energy = (np.minimum.accumulate((energy + gain)[::-1]))[::-1] - gain
-    speed = np.sqrt(np.maximum(energy, 0.0))
-    taken_s = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(arc_m) / (speed[1:] + speed[:-1]))])
-    times_s = np.arange(-2.0, duration_s + 2.0, _STEP_S)
-    eased = gaussian_filter1d(np.interp(times_s - _HOLD_S, taken_s, speed), _EASE_S / _STEP_S)
-    reached_m = cumulative_trapezoid(eased, dx=_STEP_S, initial=0.0)
-    return make_interp_spline(times_s, reached_m, k=3)
-
-
-def _on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
-    """Poses (N, 4, 4) that stand on the ground and look along ``forward`` (N, 2)."""
-    slope = solids.ground_slope(xy)
+def stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Matrix) -> Matrix:
+    """Poses (N, 4, 4) at that height that look along ``forward`` (N, 2), z normal to a ``slope`` (N, 2)."""
     ahead = np.column_stack([forward, np.sum(slope * forward, axis=1)])
     up = np.column_stack([-slope, np.ones(len(xy))])
     poses = np.zeros((len(xy), 4, 4))
@@ -145,6 +91,11 @@ def _on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
     poses[:, :3, 2] = up / np.linalg.norm(up, axis=1, keepdims=True)
     poses[:, :3, 1] = np.cross(poses[:, :3, 2], poses[:, :3, 0])
     poses[:, :2, 3] = xy
-    poses[:, 2, 3] = solids.ground_height(xy)
+    poses[:, 2, 3] = height_m
     poses[:, 3, 3] = 1.0
     return poses
+
+
+def stand_on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
+    """Poses (N, 4, 4) that stand on the ground and look along ``forward`` (N, 2)."""
+    return stand(xy, solids.ground_height(xy), solids.ground_slope(xy), forward)

@@ -22,7 +22,7 @@ class Solids:
     boxes : (B, 8) centre x, y, half lengths x, y, bottom, top, cos and sin of the yaw
     cylinders : (C, 5) upright: centre x, y, radius, bottom, top
     ellipsoids : (E, 6) centre x, y, z, radii x, y, z
-    ground : (7,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6)
+    ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
     """
 
     boxes: Matrix
@@ -39,20 +39,33 @@ class Solids:
         g = self.ground
         along_x = g[1] * g[2] * np.cos(g[2] * xy[..., 0] + g[3])
         along_y = g[4] * g[5] * np.cos(g[5] * xy[..., 1] + g[6])
+        for a, b, c, d in g[7:].reshape(-1, 4):
+            steepness = a * np.cos(b * xy[..., 0] + c * xy[..., 1] + d)
+            along_x, along_y = along_x + b * steepness, along_y + c * steepness
         return np.stack([along_x, along_y], axis=-1)
 
     def cast(
         self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
     ) -> NDArray[np.float64]:
         """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
+        return self.strike(T_world_sensor, pose_of_ray, directions, max_range_m)[0]
+
+    def strike(
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Range along each ray as in ``cast``, and which solid it hit, −1 where none.
+
+        Solids are counted through boxes, cylinders, ellipsoids, the ground last.
+        """
         ranges_m = np.empty(len(directions))
+        solid_of_ray = np.empty(len(directions), dtype=np.int32)
         origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
         cast_rays(
             origins, rotations, pose_of_ray, directions,
-            self.boxes, self.cylinders, self.ellipsoids, self.ground, max_range_m, ranges_m,
+            self.boxes, self.cylinders, self.ellipsoids, self.ground, max_range_m, ranges_m, solid_of_ray,
         )  # fmt: skip
-        return ranges_m
+        return ranges_m, solid_of_ray
 
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
         """Distance in the plane from (N, 2) places to the nearest solid that begins less than ``below_m`` up."""
@@ -115,4 +128,7 @@ class Scenery:
 
 def _height(ground: NDArray[np.float64], xy: Matrix) -> NDArray[np.float64]:
     g = ground
-    return g[0] + g[1] * np.sin(g[2] * xy[..., 0] + g[3]) + g[4] * np.sin(g[5] * xy[..., 1] + g[6])
+    height = g[0] + g[1] * np.sin(g[2] * xy[..., 0] + g[3]) + g[4] * np.sin(g[5] * xy[..., 1] + g[6])
+    for a, b, c, d in g[7:].reshape(-1, 4):
+        height = height + a * np.sin(b * xy[..., 0] + c * xy[..., 1] + d)
+    return height

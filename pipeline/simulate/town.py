@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulate.motion import Vehicle
+from pipeline.simulate.outdoors import BELOW_M, parked_car, tree
 from pipeline.simulate.solids import Scenery, Solids
 
 _STREETS_X_M = (-50.0, 0.0, 50.0, 100.0, 150.0)  # middles of the streets that run north
 _STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
 _KERB_M, _PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 4.0, 3.1, 4.7, 5.2, 7.0  # from the middle of the street
-_BELOW_M = -1.0  # foundations reach this deep, so that nothing floats on a slope
 
 CAR = Vehicle(
     speed_m_s=9.0,
@@ -66,14 +66,14 @@ def _block(
             gap = rng.uniform(1.5, 5.0)
             if rng.random() < 0.6:
                 hedge = (place + width + 0.5 * gap, front + facing * 0.3)
-                scenery.box(hedge, (gap, rng.uniform(0.2, 0.6)), (_BELOW_M, rng.uniform(0.8, 1.8)))
+                scenery.box(hedge, (gap, rng.uniform(0.2, 0.6)), (BELOW_M, rng.uniform(0.8, 1.8)))
             place += width + gap
     for x in (west + _FRONT_M - 0.5, east - _FRONT_M + 0.5):
         half = rng.uniform(2.0, 4.0)
-        scenery.box((x, 0.5 * (south + north)), (0.25, 2.0 * half), (_BELOW_M, rng.uniform(0.7, 1.6)))
+        scenery.box((x, 0.5 * (south + north)), (0.25, 2.0 * half), (BELOW_M, rng.uniform(0.7, 1.6)))
     for _ in range(4):
         x = rng.uniform(west + 12.0, east - 12.0)
-        _tree(scenery, x, 0.5 * (south + north) + rng.uniform(-1.5, 1.5), rng)
+        tree(scenery, x, 0.5 * (south + north) + rng.uniform(-1.5, 1.5), rng)
 
 
 def _house(
@@ -91,18 +91,18 @@ def _house(
     for start, end, set_back in ((left, left + split, 0.0), (left + split, right, recess)):
         depth = rng.uniform(6.5, 9.0) - set_back
         middle = (0.5 * (start + end), front + facing * (set_back + 0.5 * depth))
-        scenery.box(middle, (end - start + 0.1, depth), (_BELOW_M, height), yaw)
+        scenery.box(middle, (end - start + 0.1, depth), (BELOW_M, height), yaw)
     for place in np.arange(left + 0.2, left + split, rng.uniform(1.8, 3.5)):
-        scenery.box((float(place), front), (0.35, 0.3), (_BELOW_M, height), yaw)
+        scenery.box((float(place), front), (0.35, 0.3), (BELOW_M, height), yaw)
     extra = rng.random()
     if extra < 0.35:  # bay
         centre = (left + split * rng.uniform(0.4, 0.6), front - facing * 0.4)
-        scenery.box(centre, (rng.uniform(1.6, 2.6), 0.8), (_BELOW_M, rng.uniform(2.8, height)), yaw)
+        scenery.box(centre, (rng.uniform(1.6, 2.6), 0.8), (BELOW_M, rng.uniform(2.8, height)), yaw)
     elif extra < 0.7:  # steps and the posts of a porch
         door = left + split + 0.3 * (width - split)
-        scenery.box((door, front + facing * (recess - 0.6)), (1.6, 1.2), (_BELOW_M, 0.35), yaw)
+        scenery.box((door, front + facing * (recess - 0.6)), (1.6, 1.2), (BELOW_M, 0.35), yaw)
         for side in (-0.7, 0.7):
-            scenery.cylinder((door + side, front + facing * (recess - 1.1)), 0.07, (_BELOW_M, 2.5))
+            scenery.cylinder((door + side, front + facing * (recess - 1.1)), 0.07, (BELOW_M, 2.5))
         scenery.box((door, front + facing * (recess - 0.6)), (1.8, 1.4), (2.5, 2.65), yaw)
 
 
@@ -119,41 +119,14 @@ def _street(
         while place < length - 12.0:
             if rng.random() < 0.55:
                 x, y = start + place * along + side * (_PARKED_M + rng.normal(0.0, 0.08)) * aside
-                _parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
+                parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
             place += rng.uniform(5.2, 7.5)
         for place in np.arange(9.0 + rng.uniform(0.0, 4.0), length - 9.0, rng.uniform(9.0, 14.0)):
             x, y = start + place * along + side * _TREE_M * aside
             if rng.random() < 0.6:
-                _tree(scenery, float(x), float(y), rng)
+                tree(scenery, float(x), float(y), rng)
         for place, radius, height in ((8.0, 0.09, 6.5), (length - 7.5, 0.03, 2.4), (0.55 * length, 0.09, 6.5)):
             x, y = start + place * along + side * _LAMP_M * aside
-            scenery.cylinder((float(x), float(y)), radius, (_BELOW_M, height + rng.uniform(-0.3, 0.3)))
+            scenery.cylinder((float(x), float(y)), radius, (BELOW_M, height + rng.uniform(-0.3, 0.3)))
         x, y = start + rng.uniform(10.0, length - 10.0) * along + side * 6.2 * aside
-        scenery.box((float(x), float(y)), (0.6, 0.7), (_BELOW_M, 1.1), yaw)
-
-
-def _parked_car(scenery: Scenery, x: float, y: float, yaw: float, rng: np.random.Generator) -> None:
-    """A body, a cabin and four wheels; now and then a van."""
-    length, width = rng.uniform(3.8, 4.8), rng.uniform(1.7, 1.85)
-    c, s = np.cos(yaw), np.sin(yaw)
-    if rng.random() < 0.15:
-        scenery.box((x, y), (length + 0.4, width + 0.15), (0.25, rng.uniform(2.0, 2.5)), yaw)
-    else:
-        back = rng.choice([-1.0, 1.0]) * 0.08 * length
-        scenery.box((x, y), (length, width), (0.22, rng.uniform(0.8, 1.0)), yaw)
-        scenery.box((x + c * back, y + s * back), (0.5 * length, width - 0.2), (0.8, rng.uniform(1.4, 1.6)), yaw)
-    for u in (-0.32 * length, 0.32 * length):
-        for v in (-0.5 * width + 0.1, 0.5 * width - 0.1):
-            scenery.box((x + c * u - s * v, y + s * u + c * v), (0.6, 0.2), (-0.1, 0.3), yaw)
-
-
-def _tree(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None:
-    """A trunk, a crown of two ellipsoids, sometimes a shrub at its foot."""
-    radius, height = rng.uniform(0.12, 0.28), rng.uniform(3.2, 4.6)
-    scenery.cylinder((x, y), radius, (_BELOW_M, height))
-    size = rng.uniform(1.1, 1.9)
-    scenery.ellipsoid((x, y, height + 0.5 * size), (size, size, rng.uniform(0.9, 1.3) * size))
-    offset = rng.normal(0.0, 0.4, 2)
-    scenery.ellipsoid((x + offset[0], y + offset[1], height + 1.4 * size), (0.8 * size, 0.7 * size, 0.8 * size))
-    if rng.random() < 0.3:
-        scenery.ellipsoid((x, y, 0.3), (rng.uniform(0.4, 0.7), rng.uniform(0.4, 0.7), rng.uniform(0.4, 0.8)))
+        scenery.box((float(x), float(y)), (0.6, 0.7), (BELOW_M, 1.1), yaw)

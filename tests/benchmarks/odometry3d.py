@@ -1,159 +1,148 @@
 """3D odometry, ours against others, on the same decoded scans, scan by scan in turn.
 
-    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,svd,kiss-icp,...] [--scans N]
+    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,kiss-icp,...] [--scans N] [--indoor] [--quick]
 
-The scans are decoded once into memory. Each method first gets the first few scans on a throwaway instance, so that
-compilation and imports are done; then every scan goes through all methods in turn, starting with another one each
-time, so that whatever else the machine does meets all of them alike. The time is that of ``track`` alone.
+LOG is any MCAP with a 3D lidar. Its scans are decoded once into memory. Each method first gets the first few
+scans on a throwaway instance, so that compilation and imports are done; then every scan goes through all methods
+in turn, starting with another one each time, so that whatever else the machine does meets all of them alike. The
+time is that of ``track`` alone. Poses hold at the scan's stamp; where a method's own hold elsewhere in the sweep,
+its wrapper moves them. Every log has a process of its own, and so has every method for its memory (the scans held
+here would drown it). --indoor takes the settings that others recommend for indoors where they have some; --quick
+leaves memory and sharpness out.
 """
+
+from __future__ import annotations
 
 import argparse
 import os
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
-from pipeline import baselines, lie
-from pipeline.config import LogConfig
-from pipeline.data import Scan, Trajectory
+from pipeline.data import Trajectory
 from pipeline.errors import InputError
-from pipeline.evaluate import SHORT_LENGTHS_M, absolute_error, kitti_error, pair
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import Override, load_settings
+from pipeline.evaluate import SHORT_LENGTHS_M, absolute_error, kitti_error, pair, relative_error_over_frames
+from tests.benchmarks.contest import OURS, Recording, Run, default_methods, in_fresh_process, read, run_all
+from tests.benchmarks.peak_memory import PeakMemory, measure
+from tests.benchmarks.sharpness import Sharpness, sharpness
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data")) / "3d"
 DEFAULT_LOGS = ("kitti_0005_first60.mcap", "kitti_0001_first54.mcap")
-WARM_UP_SCANS = 4
-
-
-class Ours:
-    """Our odometry behind the verb of the baselines, with the configuration that a run would choose."""
-
-    def __init__(self, matcher):
-        config = load_settings(3, overrides=(Override("matching.matcher", matcher, "--methods"),)).config
-        self.odometry = Odometry(config, np.eye(4))
-        self.description = f"ours, {matcher}, scan to map, one thread, preset lidar3d"
-        self.index = 0
-
-    def track(self, points, times_s, stamp_ns):
-        scan = Scan(self.index, stamp_ns, stamp_ns, points, times_s, 0, None)
-        self.index += 1
-        return self.odometry.track(scan).T_odom_lidar
-
-
-OURS = ("plicp", "svd")
+LEGEND = f"""\
+  x: the same over that of the first row of ours; time on {os.cpu_count()} cores
+  peak: resident memory of a process that reads the log and runs this method only; growth: of it, after one scan
+  ATE: rmse after rigid alignment; RPE: rmse from scan to scan; KITTI: mean over all stretches of 10, 20 and 40 m
+  entropy, planes: mean map entropy and plane thickness, lower is sharper (defined in sharpness.py)"""
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
-    """A log in memory: scans and, where the log has it, the ground truth."""
+class Column:
+    """How a number is shown, and whether its ratio to ours says anything."""
 
-    scans: list[Scan]
-    ground_truth: Trajectory | None
+    head: str
+    digits: int
+    has_ratio: bool = True
 
+    @property
+    def width(self) -> int:
+        return max(len(self.head), 14 if self.has_ratio else 7) + 2
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """What a method made of a recording."""
-
-    name: str
-    description: str
-    trajectory: Trajectory
-    seconds: np.ndarray
-
-
-def read(path, count):
-    """The first ``count`` scans of a log, and its ground truth."""
-    log = open_log([path], LogConfig())
-    if log.dimension != 3:
-        raise InputError(f"{path}: {log.topic} is 2D; this benchmark is for 3D lidars")
-    return Recording(list(islice(log.scans(), count)), log.ground_truth())
+    def show(self, value: float, base: float) -> str:
+        if not np.isfinite(value):
+            return f"{'-':>{self.width}}"
+        ratio = f" x{value / base:.2f}" if self.has_ratio and base > 0.0 else ""
+        return f"{f'{value:.{self.digits}f}{ratio}':>{self.width}}"
 
 
-def create(name):
-    return Ours(name) if name in OURS else baselines.create(name)
+COLUMNS = (
+    *(Column("median ms", 2), Column("p95 ms", 1, False), Column("peak MiB", 0), Column("growth MiB", 1, False)),
+    *(Column("ATE m", 4), Column("RPE mm", 1), Column("KITTI %", 3), Column("KITTI deg/m", 4)),
+    *(Column("entropy nats", 4, False), Column("planes mm", 2)),
+)
 
 
-def track(racer, scan):
-    return racer.track(scan.points, scan.times_s, scan.stamp_ns)
+def run_log(path: Path, methods: tuple[str, ...], scans: int, quick: bool) -> None:
+    """Race, measure, print."""
+    recording = read(path, scans)
+    runs = run_all(recording, methods)
+    whole = [run for run in runs if run.is_whole]
+    sharp: dict[str, Sharpness] = {}
+    memory: dict[str, PeakMemory | None] = {}
+    if not quick:
+        answers = sharpness(recording, [run.trajectory for run in whole])
+        sharp = {run.name: answer for run, answer in zip(whole, answers, strict=True)}
+        memory = {run.name: measure(path, run.name, len(recording.scans)) for run in runs}
+    report(path, recording, runs, sharp, memory)
 
 
-def run(recording, methods):
-    """All methods over all scans, in turn."""
-    for name in methods:
-        throwaway = create(name)
-        for scan in recording.scans[:WARM_UP_SCANS]:
-            track(throwaway, scan)
-    racers = [create(name) for name in methods]
-    poses = np.zeros((len(methods), len(recording.scans), 4, 4))
-    seconds = np.zeros((len(methods), len(recording.scans)))
-    for k, scan in enumerate(recording.scans):
-        for place in range(len(methods)):
-            m = (place + k) % len(methods)
-            started = perf_counter()
-            poses[m, k] = track(racers[m], scan)
-            seconds[m, k] = perf_counter() - started
-    stamps_ns = np.array([scan.stamp_ns for scan in recording.scans])
-    return [
-        Run(name, racer.description, Trajectory(stamps_ns, poses[m]), seconds[m])
-        for m, (name, racer) in enumerate(zip(methods, racers, strict=True))
-    ]
+def report(
+    path: Path,
+    recording: Recording,
+    runs: list[Run],
+    sharp: dict[str, Sharpness],
+    memory: dict[str, PeakMemory | None],
+) -> None:
+    """One line a method, then what each one did."""
+    points = np.mean([len(scan.points) for scan in recording.scans])
+    timed = "with" if len(recording.scans[0].times_s) else "without"
+    print(f"\n{path.name}: {len(recording.scans)} scans of {points:.0f} points, {timed} times")
+    print(f"{'method':17}" + "".join(f"{column.head:>{column.width}}" for column in COLUMNS))
+    rows = {
+        run.name: (
+            *(1e3 * np.median(run.seconds), 1e3 * np.percentile(run.seconds, 95)),
+            *_memory(memory.get(run.name)),
+            *accuracy(run, recording.ground_truth),
+            *_sharpness(sharp.get(run.name)),
+        )
+        for run in runs
+    }
+    base = rows[next((run.name for run in runs if run.name in OURS), runs[0].name)]
+    for name, row in rows.items():
+        print(f"{name:17}" + "".join(c.show(v, b) for c, v, b in zip(COLUMNS, row, base, strict=True)))
+    print(LEGEND)
+    for run in runs:
+        print(f"  {run.name}: {run.description}{'; FAILED at ' + run.failure if run.failure else ''}", flush=True)
 
 
-def disagreement_m(a, b):
-    """Median over the scans of the distance between two methods' motions since the scan before."""
-    first = lie.inverse(a.trajectory.poses[:-1]) @ a.trajectory.poses[1:]
-    second = lie.inverse(b.trajectory.poses[:-1]) @ b.trajectory.poses[1:]
-    return float(np.median(np.linalg.norm((lie.inverse(first) @ second)[:, :3, 3], axis=1)))
-
-
-def accuracy(result, ground_truth):
-    """ATE and KITTI metric as text, dashes where the log has no ground truth or is too short for it."""
-    if ground_truth is None:
-        return f"{'-':>11}" * 3
-    pairs = pair(result.trajectory, ground_truth)
-    ate = f"{absolute_error(pairs).translation_m.rmse:11.4f}"
+def accuracy(run: Run, ground_truth: Trajectory | None) -> tuple[float, float, float, float]:
+    """ATE in metres, RPE in mm, KITTI in % and deg/m; NaN where there is no ground truth or too short a path."""
+    if ground_truth is None or not run.is_whole:
+        return (np.nan,) * 4
+    pairs = pair(run.trajectory, ground_truth)
+    ate_m = absolute_error(pairs).translation_m.rmse
+    rpe_mm = 1e3 * relative_error_over_frames(pairs).translation_m.rmse
     try:
         drift = kitti_error(pairs, SHORT_LENGTHS_M, every=1)
     except InputError:
-        return ate + f"{'-':>11}" * 2
-    return f"{ate}{100 * drift.translation_share:11.3f}{np.degrees(drift.rotation_rad_per_m):11.4f}"
+        return ate_m, rpe_mm, np.nan, np.nan
+    return ate_m, rpe_mm, 100.0 * drift.translation_share, float(np.degrees(drift.rotation_rad_per_m))
 
 
-def report(path, recording, results):
-    """One line a method; ratios are of medians, to the first of ours if it ran, else to the first method."""
-    base = next((r for r in results if r.name in OURS), results[0])
-    kiss = next((r for r in results if r.name == "kiss-icp"), None)
-    points = np.mean([len(scan.points) for scan in recording.scans])
-    print(f"\n{Path(path).name}: {len(recording.scans)} scans of {points:.0f} points, {os.cpu_count()} cores")
-    heads = ("median ms", "p95 ms", "ratio", "ATE m", "KITTI %", "deg/m", "to KISS mm")
-    print(f"{'method':18}" + "".join(f"{head:>11}" for head in heads))
-    for result in results:
-        ms = 1e3 * result.seconds
-        ratio = np.median(result.seconds) / np.median(base.seconds)
-        to_kiss = f"{1e3 * disagreement_m(result, kiss):.1f}" if kiss else "-"
-        print(
-            f"{result.name:18}{np.median(ms):11.2f}{np.percentile(ms, 95):11.2f}{ratio:11.2f}"
-            f"{accuracy(result, recording.ground_truth)}{to_kiss:>11}"
-        )
-    for result in results:
-        print(f"  {result.name}: {result.description}")
+def _memory(memory: PeakMemory | None) -> tuple[float, float]:
+    return (memory.peak_mib, memory.growth_mib) if memory else (np.nan, np.nan)
 
 
-def main():
+def _sharpness(sharp: Sharpness | None) -> tuple[float, float]:
+    return (sharp.mean_map_entropy, 1e3 * sharp.plane_thickness_m) if sharp else (np.nan, np.nan)
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_LOGS])
-    parser.add_argument("--methods", default=",".join((*OURS, *baselines.names())))
+    parser.add_argument(
+        "--methods", help="ours are plicp and svd; one that is unknown is answered with all others"
+    )
     parser.add_argument("--scans", type=int, default=10**9)
+    parser.add_argument("--indoor", action="store_true")
+    parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     for path in arguments.logs:
-        recording = read(path, arguments.scans)
-        report(path, recording, run(recording, arguments.methods.split(",")))
+        methods = (
+            arguments.methods.split(",") if arguments.methods else default_methods(path, indoor=arguments.indoor)
+        )
+        in_fresh_process(run_log, path, tuple(methods), arguments.scans, arguments.quick)
 
 
 if __name__ == "__main__":

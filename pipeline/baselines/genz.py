@@ -1,0 +1,53 @@
+"""GenZ-ICP (Lee et al. 2025) as a baseline."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.baselines.at_stamp import AtStamp
+from pipeline.baselines.baseline import finite, middle
+from pipeline.data import Pose, RawPoints
+from pipeline.errors import MissingExtraError
+
+Place = Literal["outdoor", "indoor", "kitti"]
+
+# What its outdoor.yaml, indoor.yaml and kitti.yaml say beside its defaults.
+_DATA = {"outdoor": {"min_range": 0.5}, "indoor": {"min_range": 0.3}, "kitti": {"min_range": 5.0}}
+_OUTDOOR = {"voxel_size": 0.6, "desired_num_voxelized_points": 3000, "max_points_per_voxel": 3}
+_MAPPING = {"outdoor": _OUTDOOR, "indoor": {}, "kitti": _OUTDOOR | {"planarity_threshold": 0.18}}
+
+
+class GenzIcp:
+    """GenZ-ICP as its authors tuned it for a kind of place.
+
+    It lets its voxels grow and shrink until a scan has the wished number of points, and keeps their size in a
+    static variable: a second odometry in the same process goes on with the voxels of the first.
+    """
+
+    def __init__(self, place: Place = "outdoor") -> None:
+        try:
+            from genz_icp.config import load_config
+            from genz_icp.genz_icp import GenZICP
+        except ImportError:
+            raise MissingExtraError("genz-icp", "baselines") from None
+        config = load_config(None)
+        config.data = config.data.model_copy(update={"deskew": True} | _DATA[place])
+        config.mapping = config.mapping.model_copy(update=_MAPPING[place])
+        self.description = (
+            f"GenZ-ICP, planes and points, scan to map, its {place}.yaml: {config.data.min_range:g} to "
+            f"{config.data.max_range:g} m, voxels of {config.mapping.voxel_size:g} m, about "
+            f"{config.mapping.desired_num_voxelized_points} points a scan, all threads; its own deskewing, off in "
+            "that file, on where the log has times"
+        )
+        self.odometry = GenZICP(config)
+        self.at_stamp = AtStamp()
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan; GenZ-ICP wants times from 0 to 1 and its pose holds at 0.5, ours at the stamp."""
+        frame, times = finite(points, times_s)
+        share = (times - times.min()) / np.ptp(times) if len(times) else times
+        self.odometry.register_frame(frame, share)
+        return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, middle(times))

@@ -1,0 +1,90 @@
+"""A scan with its place, and the matches of those that have nothing to be matched with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.config import MatchingConfig, PreprocessConfig
+from pipeline.data import Match, Points, Pose, Scan, State
+from pipeline.odometry.prediction import Prediction
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """A scan with its place in the odometry frame.
+
+    ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
+    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
+    """
+
+    scan: Scan
+    points: Points
+    matched: Points
+    T_odom_lidar: Pose
+    match: Match
+    state: State
+    reason: str
+    preprocess_s: float
+    match_s: float
+    map_s: float
+
+
+def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> Match:
+    """What stands for a match where there is no map yet: the frame starts at this scan."""
+    k = 3 if len(T_odom_lidar) == 3 else 6
+    return Match(
+        T_target_source=T_odom_lidar,
+        information=np.diag(np.full(k, len(points) / config.sensor_noise_m**2)),
+        cost=0.0,
+        inliers=len(points),
+        points=len(points),
+        iterations=0,
+        residual_m=0.0,
+        converged=True,
+        reason="first scan: the frame starts here",
+        degeneracy_eigenvalue=1.0,
+        degeneracy_direction=np.eye(k)[0],
+    )
+
+
+def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
+    """What stands for a match where no point is left: the prediction."""
+    return Match(
+        T_target_source=prediction.T_odom_lidar,
+        information=np.diag(prediction.information),
+        cost=0.0,
+        inliers=0,
+        points=0,
+        iterations=0,
+        residual_m=0.0,
+        converged=False,
+        reason=(
+            f"no point lies between preprocess.min_range_m ({config.min_range_m:g}) and "
+            f"preprocess.max_range_m ({config.max_range_m:g})"
+        ),
+        degeneracy_eigenvalue=0.0,
+        degeneracy_direction=np.eye(len(prediction.information))[0],
+    )
+
+
+def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
+    """The same scan as seen from another frame that moves with it: points, pose, information."""
+    T_old_new = lie.inverse(T_new_old)
+    match = tracked.match
+    direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
+    Ad_inverse = lie.adjoint(T_old_new)
+    return replace(
+        tracked,
+        points=lie.transform(T_new_old, tracked.points),
+        matched=lie.transform(T_new_old, tracked.matched),
+        T_odom_lidar=tracked.T_odom_lidar @ T_old_new,
+        match=replace(
+            match,
+            T_target_source=match.T_target_source @ T_old_new,
+            information=Ad_inverse.T @ match.information @ Ad_inverse,
+            degeneracy_direction=direction / np.linalg.norm(direction),
+        ),
+    )
