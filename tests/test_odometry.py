@@ -192,6 +192,25 @@ def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
     assert "is undetermined" in step.reason
 
 
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    """Eighteen seconds into a corridor; from the ninth on its ends are out of sight."""
+    path = tmp_path_factory.mktemp("corridor") / "corridor.mcap"
+    truth = simulate("corridor", path, duration_s=18.0, seed=3, sensor="vlp-16")
+    log = open_log(path)
+    return list(log.scans()), log.T_base_lidar, truth
+
+
+def test_in_a_blank_corridor_the_wheels_lead_along_it_and_the_scans_across(corridor):
+    scans, T_base_lidar, truth = corridor
+    steps = tracked(scans, T_base_lidar, configured(3))
+    blind = [step for step in steps[90:] if step.state is State.DEGENERATE]
+    along = [abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0)) for step in blind]
+    assert len(blind) > 0.95 * len(steps[90:]) and np.mean(along) > 0.95
+    assert sum(step.state is State.DEGENERATE for step in steps[:80]) < 5
+    assert ate_m(trajectory(steps), truth) < 0.15
+
+
 def test_a_scan_with_nothing_in_range_names_the_limits(office):
     scans, T_base_lidar, _ = office
     with pytest.raises(InputError, match=r"scan 0 has none of its \d+ points .*preprocess\.max_range_m"):

@@ -11,7 +11,7 @@ from pipeline.kernels.descent import LEVENBERG_MARQUARDT, NEWTON, predicted_decr
 from pipeline.kernels.residuals import normal_equations
 from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
-from pipeline.kernels.voxels import Voxels
+from pipeline.kernels.voxels import POINT, SHAPE, Voxels
 
 CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
@@ -41,7 +41,8 @@ class Terms(NamedTuple):
 class Outcome(NamedTuple):
     """How an alignment ended.
 
-    H (k, k) : Σ w JᵀJ of the data alone, twists about the first value's position, map axes
+    H (k, k) : Σ w JᵀJ over planes and lines alone, twists about the first value's position, map axes; the mean
+        of a voxel without a shape holds a pose in every direction, whether the surface there does or not
     cost : robust cost in m², every unpaired point at its limit ½s²
     weights, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : points with a partner, linearisations, one of the codes above
@@ -82,9 +83,9 @@ class Estimate(NamedTuple):
 def align(voxels, points, T, prior, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
 
-    The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ diag(prior) ξ, where ξ is the twist away from
-    the first value: prior (k,) is the information of the prediction times the variance of a residual. Twists
-    turn about the first value's position.
+    The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, where ξ is the twist away from the
+    first value: prior (k, k) is the information of the prediction times the variance of a residual. Twists turn
+    about the first value's position.
     Points find new partners after every step until PATIENCE were taken with the kernel at its last scale: pairs
     that flip to and fro would go on for ever. From then on the pairs stay.
     Returns an ``Outcome``.
@@ -119,11 +120,19 @@ def align(voxels, points, T, prior, terms):
             settled += 1
         scale_m = max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
-    for i in range(k):
-        now.H[i, i] -= prior[i]
-        now.sums[COST] -= 0.5 * prior[i] * now.away[i] * now.away[i]
-    cost = now.sums[COST] + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
+    cost = now.sums[COST] - 0.5 * now.away @ prior @ now.away + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
+    _leave_out_points(problem)
+    normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, False, now.H, now.b)
     return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
+
+
+@njit(cache=True, nogil=True)
+def _leave_out_points(problem):
+    """Take the trust from pairs with a voxel that has no shape."""
+    for i in range(problem.partner.shape[0]):
+        voxel = problem.partner[i]
+        if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
+            problem.trust[i] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -143,8 +152,10 @@ def _linearise(problem, scale_m: float, estimate):
         estimate.b,
     )
     for i in range(estimate.b.shape[0]):
-        pull = problem.prior[i] * estimate.away[i]
-        estimate.H[i, i] += problem.prior[i]
+        pull = 0.0
+        for j in range(estimate.b.shape[0]):
+            pull += problem.prior[i, j] * estimate.away[j]
+            estimate.H[i, j] += problem.prior[i, j]
         estimate.b[i] += pull
         cost += 0.5 * pull * estimate.away[i]
     estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares

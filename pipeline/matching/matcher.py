@@ -22,6 +22,8 @@ OPTIMISERS = {
     "levenberg-marquardt": LEVENBERG_MARQUARDT,
 }
 
+_FIRM = 1e3  # times what all residuals together know of a direction
+
 _ENDINGS = {
     registration.CONVERGED: "converged",
     registration.OUT_OF_ITERATIONS: "out of iterations",
@@ -55,9 +57,14 @@ class PointToShapeMatcher:
         prior : (k,) information of the prediction, m⁻² and rad⁻², twist order
         wide : search far, for a prediction that is little more than a guess
         """
+        terms = terms_of(self.config, target, wide)
+        information = np.diag(prior * terms.variance)
         T = T_predicted.copy()
-        variance = self.config.sensor_noise_m**2
-        outcome = align(target.voxels, points, T, prior * variance, terms_of(self.config, target, wide))
+        outcome = align(target.voxels, points, T, information, terms)
+        anchor = hold_undetermined(outcome, points, self.config.min_information)
+        if anchor.any():
+            T = T_predicted.copy()
+            outcome = align(target.voxels, points, T, information + anchor, terms)
         return judge(T, T_predicted, outcome, points, self.config.sensor_noise_m)
 
 
@@ -102,14 +109,33 @@ def judge(T: Pose, T_first: Pose, outcome: Outcome, points: Points, sensor_noise
     )
 
 
+def hold_undetermined(outcome: Outcome, points: Points, min_information: float) -> Matrix:
+    """Information (k, k), in the kernel's units, that keeps a pose from moving where the data determine nothing.
+
+    The solution is restricted to the directions whose eigenvalue is at least ``min_information`` (Zhang, Kaess &
+    Singh 2016); zero where that is all of them.
+    """
+    scale, values, vectors = _spectrum(outcome.H, outcome.weights, points)
+    held = vectors[:, values < min_information] / scale[:, None]
+    return _FIRM * outcome.weights * held @ held.T
+
+
 def degeneracy(H: Matrix, weights: float, points: Points) -> tuple[float, NDArray[np.float64]]:
-    """Smallest eigenvalue of the information per weight, and its direction (k,).
+    """Smallest eigenvalue of the information per weight, and its direction (k,)."""
+    _, values, vectors = _spectrum(H, weights, points)
+    return max(float(values[0]), 0.0), vectors[:, 0]
+
+
+def _spectrum(
+    H: Matrix, weights: float, points: Points
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Matrix]:
+    """Lengths of a unit of each coordinate, ascending eigenvalues and eigenvectors of the information per weight.
 
     Rotations are counted as the lengths they move a point at the scan's root mean square range, so that the
-    eigenvalues compare (Zhang, Kaess & Singh 2016 with the units evened out).
+    eigenvalues compare.
     """
     d = points.shape[1]
     scale = np.ones(len(H))
     scale[d:] = 1.0 / max(math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)), 1e-9)
     values, vectors = np.linalg.eigh(scale[:, None] * H * scale / max(weights, 1e-300))
-    return max(float(values[0]), 0.0), vectors[:, 0]
+    return scale, values, vectors

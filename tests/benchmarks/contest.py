@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import TypeVar
 
 import numpy as np
@@ -59,12 +60,16 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a method made of a recording; the poses after a ``failure`` (empty if there was none) are NaN."""
+    """What a method made of a recording; the poses after a ``failure`` (empty if there was none) are NaN.
+
+    ``seconds`` (N,) passed on the clock while a scan was tracked, ``cpu_seconds`` were spent by all threads.
+    """
 
     name: str
     description: str
     trajectory: Trajectory
     seconds: NDArray[np.float64]
+    cpu_seconds: NDArray[np.float64]
     failure: str
 
     @property
@@ -97,27 +102,32 @@ def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
         _warm_up(name, recording.scans)
     racers = [create(name) for name in methods]
     poses = np.full((len(methods), len(recording.scans), 4, 4), np.nan)
-    seconds = np.zeros((len(methods), len(recording.scans)))
+    seconds, cpu_seconds = np.zeros((2, len(methods), len(recording.scans)))
     failures = [""] * len(methods)
     for k, scan in enumerate(recording.scans):
         for place in range(len(methods)):
             m = (place + k) % len(methods)
             if failures[m]:
                 continue
-            started = perf_counter()
+            started, cpu_started = perf_counter(), process_time()
             try:
                 poses[m, k] = racers[m].track(scan.points, scan.times_s, scan.stamp_ns)
             except Exception as error:  # others' code may raise anything; the race goes on
                 failures[m] = f"scan {k}: {type(error).__name__}: {error}"
-            seconds[m, k] = perf_counter() - started
-    return [
-        Run(name, racer.description, Trajectory(recording.stamps_ns, poses[m]), seconds[m], failures[m])
-        for m, (name, racer) in enumerate(zip(methods, racers, strict=True))
-    ]
+            seconds[m, k], cpu_seconds[m, k] = perf_counter() - started, process_time() - cpu_started
+    trajectories = [Trajectory(recording.stamps_ns, each) for each in poses]
+    descriptions = [racer.description for racer in racers]
+    columns = zip(methods, descriptions, trajectories, seconds, cpu_seconds, failures, strict=True)
+    return [Run(*column) for column in columns]
 
 
 def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Answer:
-    """The function's answer from a process of its own: GenZ-ICP remembers its last log, others may crash."""
+    """The function's answer from a process of its own: GenZ-ICP remembers its last log, others may crash.
+
+    Threads wait asleep there: small_gicp's spin by default, and where somebody else has one of two cores they
+    spin away the time that the other thread needs.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as executor:
         return executor.submit(function, *arguments).result()
 

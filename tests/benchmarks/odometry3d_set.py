@@ -61,6 +61,7 @@ def log_of(world: str, sensor: str, scans: int, cache: Path) -> Path:
     if not path.exists():
         draft = path.with_suffix(".draft.mcap")
         simulate(world, draft, seed=SEED, duration_s=duration_s, sensor=sensor, force=True)
+        draft.with_suffix(".tum").unlink()  # the log has the truth
         draft.rename(path)
     return path
 
