@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,11 +62,13 @@ class PointToShapeMatcher:
         information = np.diag(prior * terms.variance)
         T = T_predicted.copy()
         outcome = align(target.voxels, points, T, information, terms)
-        anchor = hold_undetermined(outcome, points, self.config.min_information)
-        if anchor.any():
+        spectrum = spectrum_of(outcome, points)
+        if spectrum.values[0] < self.config.min_information:
             T = T_predicted.copy()
+            anchor = hold_undetermined(spectrum, outcome.weights, self.config.min_information)
             outcome = align(target.voxels, points, T, information + anchor, terms)
-        return judge(T, T_predicted, outcome, points, self.config.sensor_noise_m)
+            spectrum = spectrum_of(outcome, points)
+        return judge(T, T_predicted, outcome, spectrum, len(points), self.config.sensor_noise_m)
 
 
 def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
@@ -83,8 +86,43 @@ def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
     )
 
 
-def judge(T: Pose, T_first: Pose, outcome: Outcome, points: Points, sensor_noise_m: float) -> Match:
-    """The match that an outcome amounts to: information in the source's frame, degeneracy, words.
+class Spectrum(NamedTuple):
+    """What the data determine, by direction, about the prediction's position and in the map's axes.
+
+    scale : (k,) that evens out the units: rotations count as the lengths they move a point at the scan's root mean
+        square range
+    values : (k,) eigenvalues, ascending, of the information per weight; 1 is a direction that every residual sees
+    vectors : (k, k) unit eigenvectors, a column each, in evened units
+    """
+
+    scale: NDArray[np.float64]
+    values: NDArray[np.float64]
+    vectors: Matrix
+
+
+def spectrum_of(outcome: Outcome, points: Points) -> Spectrum:
+    """The spectrum of an outcome's information."""
+    d = points.shape[1]
+    scale = np.ones(len(outcome.H))
+    scale[d:] = 1.0 / max(math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)), 1e-9)
+    evened = outcome.H * (scale * scale[:, None] / max(outcome.weights, 1e-300))
+    return Spectrum(scale, *np.linalg.eigh(evened))
+
+
+def hold_undetermined(spectrum: Spectrum, weights: float, min_information: float) -> Matrix:
+    """Information (k, k), in the kernel's units, that keeps a pose from moving where the data determine nothing.
+
+    The solution is restricted to the directions whose eigenvalue is at least ``min_information`` (Zhang, Kaess &
+    Singh 2016).
+    """
+    held = spectrum.vectors[:, spectrum.values < min_information] / spectrum.scale[:, None]
+    return _FIRM * weights * held @ held.T
+
+
+def judge(
+    T: Pose, T_first: Pose, outcome: Outcome, spectrum: Spectrum, points: int, sensor_noise_m: float
+) -> Match:
+    """The match that an outcome amounts to: information and worst direction in the source's frame, words.
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
     """
@@ -92,50 +130,18 @@ def judge(T: Pose, T_first: Pose, outcome: Outcome, points: Points, sensor_noise
     centred = T.copy()
     centred[:-1, -1] -= T_first[:-1, -1]
     Ad = lie.adjoint(centred)
-    H = Ad.T @ outcome.H @ Ad
-    eigenvalue, direction = degeneracy(H, outcome.weights, points)
+    centred[:-1, -1] = 0.0
+    direction = lie.adjoint(centred).T @ spectrum.vectors[:, 0]
     return Match(
         T_target_source=T,
-        information=H / max(sensor_noise_m, residual_m) ** 2,
+        information=Ad.T @ outcome.H @ Ad / max(sensor_noise_m, residual_m) ** 2,
         cost=outcome.cost,
         inliers=outcome.pairs,
-        points=len(points),
+        points=points,
         iterations=outcome.iterations,
         residual_m=residual_m,
         converged=outcome.ending == registration.CONVERGED,
         reason=_ENDINGS[outcome.ending],
-        degeneracy_eigenvalue=eigenvalue,
+        degeneracy_eigenvalue=max(float(spectrum.values[0]), 0.0),
         degeneracy_direction=direction,
     )
-
-
-def hold_undetermined(outcome: Outcome, points: Points, min_information: float) -> Matrix:
-    """Information (k, k), in the kernel's units, that keeps a pose from moving where the data determine nothing.
-
-    The solution is restricted to the directions whose eigenvalue is at least ``min_information`` (Zhang, Kaess &
-    Singh 2016); zero where that is all of them.
-    """
-    scale, values, vectors = _spectrum(outcome.H, outcome.weights, points)
-    held = vectors[:, values < min_information] / scale[:, None]
-    return _FIRM * outcome.weights * held @ held.T
-
-
-def degeneracy(H: Matrix, weights: float, points: Points) -> tuple[float, NDArray[np.float64]]:
-    """Smallest eigenvalue of the information per weight, and its direction (k,)."""
-    _, values, vectors = _spectrum(H, weights, points)
-    return max(float(values[0]), 0.0), vectors[:, 0]
-
-
-def _spectrum(
-    H: Matrix, weights: float, points: Points
-) -> tuple[NDArray[np.float64], NDArray[np.float64], Matrix]:
-    """Lengths of a unit of each coordinate, ascending eigenvalues and eigenvectors of the information per weight.
-
-    Rotations are counted as the lengths they move a point at the scan's root mean square range, so that the
-    eigenvalues compare.
-    """
-    d = points.shape[1]
-    scale = np.ones(len(H))
-    scale[d:] = 1.0 / max(math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)), 1e-9)
-    values, vectors = np.linalg.eigh(scale[:, None] * H * scale / max(weights, 1e-300))
-    return scale, values, vectors

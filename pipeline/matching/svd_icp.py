@@ -12,7 +12,7 @@ from pipeline.kernels import registration
 from pipeline.kernels.association import associate
 from pipeline.kernels.cross_covariance import weighted_pairs
 from pipeline.kernels.registration import SHRINK, Outcome
-from pipeline.matching.matcher import judge, terms_of
+from pipeline.matching.matcher import judge, spectrum_of, terms_of
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.voxel_map import VoxelMap
 
@@ -59,7 +59,7 @@ class SvdMatcher:
         outcome = self._outcome(
             T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
         )
-        return judge(T, T, outcome, points, self.config.sensor_noise_m)
+        return judge(T, T, outcome, spectrum_of(outcome, points), len(points), self.config.sensor_noise_m)
 
     def _stands_still(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]
