@@ -114,9 +114,11 @@ def summary(rows: dict[str, list[Score]], methods: Sequence[str]) -> None:
     """Means, ranks and losses, and what the issue asks for."""
     table = list(rows.values())
     percent = np.array([[score.translation_percent for score in row] for row in table])
+    held = percent[[not any(score.is_lost for score in row) for row in table]]
     for head, values in (
         ("mean", [f"{value:.3f}" for value in percent.mean(axis=0)]),
         ("median", [f"{value:.3f}" for value in np.median(percent, axis=0)]),
+        (f"mean of {len(held)} all hold", [f"{value:.3f}" for value in held.mean(axis=0)] if len(held) else []),
         ("lost", [str(sum(row[m].is_lost for row in table)) for m in range(len(methods))]),
         ("ms a scan", [f"{1e3 * np.median([row[m].median_s for row in table]):.1f}" for m in range(len(methods))]),
     ):
