@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import configured, shared_data
 
-from pipeline import lie
+from pipeline import baselines, lie
 from pipeline.config import Config
 from pipeline.data import Scan, State, Trajectory, Verdict
 from pipeline.errors import InputError
@@ -274,6 +274,18 @@ def test_kitti_stays_within_its_error_of_the_gps(matcher, limit_m):
     steps = tracked(log.scans(), log.T_base_lidar, configured(3, {"matching.matcher": matcher}))
     truth = log.ground_truth()
     assert ate_m(trajectory(steps), truth) < limit_m
+
+
+def test_every_motion_agrees_with_kiss_icp_to_two_centimetres():
+    pytest.importorskip("kiss_icp")
+    log = open_log(shared_data("3d/kitti_0005_first60.mcap"))
+    scans = list(log.scans())
+    ours = np.array([step.T_odom_lidar for step in tracked(scans, log.T_base_lidar, configured(3))])
+    kiss = baselines.create("kiss-icp")
+    theirs = np.array([kiss.track(scan.points, scan.times_s, scan.stamp_ns) for scan in scans])
+    motions = [lie.inverse(poses[:-1]) @ poses[1:] for poses in (ours, theirs)]
+    apart_m = np.linalg.norm((lie.inverse(motions[0]) @ motions[1])[:, :3, 3], axis=1)
+    assert np.median(apart_m) < 0.02
 
 
 def test_the_configuration_survives_the_presets():
