@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline import lie
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import SHORT_LENGTHS_M, absolute_error, kitti_error, pair, relative_error_over_frames
@@ -34,7 +35,8 @@ LEGEND = """\
   x: over the same of the first row of ours; CPU ms: median, all threads together
   peak: resident memory of a process that reads the log and runs this method only; growth: of it, after one scan
   ATE: rmse after rigid alignment; RPE: rmse from scan to scan; KITTI: mean over all stretches of 10, 20 and 40 m
-  entropy, planes: mean map entropy and plane thickness, lower is sharper (defined in sharpness.py)"""
+  entropy, planes: mean map entropy and plane thickness, lower is sharper (defined in sharpness.py)
+  to KISS: median distance between the motion of a scan and that which KISS-ICP finds"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,7 @@ COLUMNS = (
         Column("growth MiB", 1, False),
     ),
     *(Column("ATE m", 4), Column("RPE mm", 1), Column("KITTI %", 3), Column("KITTI deg/m", 4)),
-    *(Column("entropy nats", 4, False), Column("planes mm", 2)),
+    *(Column("entropy nats", 4, False), Column("planes mm", 2), Column("to KISS mm", 1, False)),
 )
 
 
@@ -96,6 +98,7 @@ def report(
     print(f"\n{path.name}: {len(recording.scans)} scans of {points:.0f} points, {timed} times")
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
     print(f"{'method':17}" + "".join(f"{column.head:>{column.width}}" for column in COLUMNS))
+    kiss = next((run for run in runs if run.name == "kiss-icp" and run.is_whole), None)
     rows = {
         run.name: (
             *(1e3 * np.median(run.seconds), 1e3 * np.percentile(run.seconds, 95)),
@@ -103,6 +106,7 @@ def report(
             *_memory(memory.get(run.name)),
             *accuracy(run, recording.ground_truth),
             *_sharpness(sharp.get(run.name)),
+            apart_mm(run, kiss),
         )
         for run in runs
     }
@@ -126,6 +130,14 @@ def accuracy(run: Run, ground_truth: Trajectory | None) -> tuple[float, float, f
     except InputError:
         return ate_m, rpe_mm, np.nan, np.nan
     return ate_m, rpe_mm, 100.0 * drift.translation_share, float(np.degrees(drift.rotation_rad_per_m))
+
+
+def apart_mm(run: Run, other: Run | None) -> float:
+    """Median over the scans of the distance between two methods' motions; NaN without one of them."""
+    if other is None or not run.is_whole:
+        return np.nan
+    first, second = (lie.inverse(r.trajectory.poses[:-1]) @ r.trajectory.poses[1:] for r in (run, other))
+    return 1e3 * float(np.median(np.linalg.norm((lie.inverse(first) @ second)[:, :3, 3], axis=1)))
 
 
 def _memory(memory: PeakMemory | None) -> tuple[float, float]:
