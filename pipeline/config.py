@@ -31,13 +31,21 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PreprocessConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is done to a scan before it is matched: cropped, thinned out, freed of the lidar's own motion."""
+    """What is done to a scan before it is matched: cropped, thinned out, freed of the lidar's own motion.
 
-    min_range_m: NonNegative = 1.0
+    Voxels are as large as said where the place is wide, and down to ``min_scale`` times that where it is narrow:
+    the median range spans about ``range_voxels`` voxels of the local map, or more. Those of matching shrink
+    further, to those of the map at the least, until about ``match_points`` are matched.
+    """
+
+    min_range_m: NonNegative = 0.5
     max_range_m: Positive = 100.0
     deskew: bool = True
     map_voxel_m: Positive = 0.5
     match_voxel_m: Positive = 1.5
+    match_points: Count = 2500
+    range_voxels: Positive = 14.0
+    min_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.125
 
 
 class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):

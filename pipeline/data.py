@@ -54,6 +54,27 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Prior:
+    """What is believed of a pose before it is matched.
+
+    Attributes
+    ----------
+    T_target_source : (d+1, d+1) the expected pose
+    covariance : (k, k) of a twist ξ in the source's own frame, T exp(ξ); m², rad m, rad²
+    widest : (k,) standard deviations that hold whatever happens, as when the vehicle brakes
+    """
+
+    T_target_source: Pose
+    covariance: Matrix
+    widest: NDArray[np.float64]
+
+    @property
+    def information(self) -> Matrix:
+        """(k, k) inverse covariance."""
+        return np.linalg.inv(self.covariance).astype(np.float64, copy=False)
+
+
+@dataclass(frozen=True, slots=True)
 class Match:
     """The answer of a registration.
 

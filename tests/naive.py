@@ -17,14 +17,21 @@ def group(points, size):
     return {key: np.array(members) for key, members in groups.items()}
 
 
-def shape(points, neighbours, alone):
-    """Shape name and direction of one voxel's points; neighbours' points join in while they are few."""
-    members = points if len(points) >= alone else np.concatenate([points, *neighbours])
+def members_of(points, neighbours, alone, size):
+    """A voxel's own points where they are many and show some width, else those of the neighbours too."""
+    if len(points) >= alone and len(points) >= (3 if points.shape[1] == 2 else 5):
+        width2 = np.linalg.eigvalsh(np.cov(points.T, bias=True))[1]
+        if width2 >= (size / 8) ** 2:
+            return points
+    return np.concatenate([points, *neighbours])
+
+
+def shape(members):
+    """Shape name and direction of points."""
     d = members.shape[1]
     if len(members) < (3 if d == 2 else 5):
         return "point", None
-    centred = members - members.mean(0)
-    values, vectors = np.linalg.eigh(centred.T @ centred / len(members))
+    values, vectors = np.linalg.eigh(np.cov(members.T, bias=True))
     if d == 2:
         return ("plane", vectors[:, 0]) if values[0] < 0.1 * values[1] else ("point", None)
     if values[0] < 0.1 * values[1]:
@@ -34,28 +41,26 @@ def shape(points, neighbours, alone):
     return "point", None
 
 
-def plane_fit(points, neighbours, alone, many=30):
-    """Thickness, directions across and along, 1/n and the variances of the slopes, of a voxel's plane in space."""
-    members = points if len(points) >= alone else np.concatenate([points, *neighbours])
-    centred = members - members.mean(0)
-    values, vectors = np.linalg.eigh(centred.T @ centred / len(members))
-    n = min(len(members), many)
-    return values[0], vectors[:, 1], vectors[:, 2], 1 / n, 1 / (n * values[1]), 1 / (n * values[2])
-
-
-def trust(p, lidar, mean, kind, direction, fit, size, variance):
-    """Sensor variance over the variance of the residual of a point p of the map's frame."""
+def trust(p, T, mean, kind, direction, members, size, variance):
+    """Sensor variance over the variance of the residual of a point p of the map's frame, the lidar at T."""
     d = len(p)
-    if kind != "plane":
-        return variance / (variance + size**2 / 12)
-    if d == 2:
+    if kind == "plane" and d == 2:
         return 1.0
-    thickness, across, along, of_mean, of_across, of_along = fit
-    e = p - mean
-    uncertainty = of_mean + of_across * (across @ e) ** 2 + of_along * (along @ e) ** 2
-    ray = (p - lidar) / np.linalg.norm(p - lidar)
-    grazing = (direction @ ray) ** 2 / ((direction @ ray) ** 2 + 0.05**2)
-    return grazing * variance / (max(thickness, variance) * (1 + uncertainty))
+    off_shapes = variance / (variance + size**2 / 4)
+    if kind == "point" or d == 2:
+        return off_shapes
+    values, vectors = np.linalg.eigh(np.cov(members.T, bias=True))
+    ray = p - T[:3, 3]
+    ray /= np.linalg.norm(ray)
+    if kind == "line":
+        up = T[:3, 2] - ray * (ray @ T[:3, 2])
+        cosine2 = (direction @ up) ** 2 / (up @ up)
+        return max(cosine2 / (cosine2 + 0.25) * variance / max(variance, values[1]), off_shapes)
+    e, n = p - mean, min(len(members), 30)
+    uncertainty = 1 / n + (vectors[:, 1] @ e) ** 2 / (n * values[1]) + (vectors[:, 2] @ e) ** 2 / (n * values[2])
+    sine2 = (direction @ ray) ** 2
+    clarity = sine2 / (sine2 + 0.05**2 + 4 * values[0] / values[1]) * values[1] / (values[1] + 9 * variance)
+    return clarity * variance / (max(values[0], variance) * (1 + uncertainty))
 
 
 def nearest_mean(point, means, size, reach, max_distance):

@@ -101,7 +101,7 @@ def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
     seen = set()
     for voxel, key in enumerate(keys_of(voxel_map)):
         around = [members for other, members in groups.items() if other != key and adjacent(other, key)]
-        kind, direction = naive.shape(groups[key], around, alone)
+        kind, direction = naive.shape(naive.members_of(groups[key], around, alone, 0.5))
         np.testing.assert_allclose(cells[voxel, :dimension], groups[key].mean(0), atol=1e-12)
         assert SHAPES[cells[voxel, SHAPE]] == kind
         seen.add(kind)
@@ -149,8 +149,8 @@ def test_trust_is_the_sensors_variance_over_the_residuals(dimension, alone):
     for i, mean, kind, direction in paired(voxel_map, partner):
         key = keys[partner[i]]
         near = [members for other, members in groups.items() if other != key and adjacent(other, key)]
-        fit = naive.plane_fit(groups[key], near, alone) if kind == "plane" and dimension == 3 else None
-        expected = naive.trust(moved[i], T[:-1, -1], mean, kind, direction, fit, 0.5, variance)
+        members = naive.members_of(groups[key], near, alone, 0.5)
+        expected = naive.trust(moved[i], T, mean, kind, direction, members, 0.5, variance)
         assert trust[i] == pytest.approx(expected, rel=1e-6)
 
 
@@ -168,6 +168,43 @@ def test_a_plane_seen_edge_on_is_not_trusted():
         weigh(voxel_map.voxels, points, np.eye(4), partner, 0.02**2, trust)
         trusted.append(np.median(trust))
     assert trusted[0] < 0.001 and trusted[1] > 0.8
+
+
+def trust_of(points, *, size=1.0, noise_m=0.02, passes=1):
+    """Median trust of points in a map of themselves, inserted so many times, seen from the origin."""
+    voxel_map = VoxelMap(3, LocalMapConfig(voxel_size_m=size))
+    for _ in range(passes):
+        voxel_map.insert(points, np.eye(4))
+    partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, partner)
+    weigh(voxel_map.voxels, points, np.eye(4), partner, noise_m**2, trust)
+    return float(np.median(trust[partner >= 0]))
+
+
+def ring_on(surface_m, elevation, n=4000, noise_m=0.02, seed=0):
+    """Where one ring strikes a surface that is surface_m(azimuth) away, good to noise_m along the ray."""
+    rng = np.random.default_rng(seed)
+    azimuth = rng.uniform(-0.3, 0.3, n)
+    cone = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(n, np.tan(elevation))])
+    ranges = surface_m(azimuth) + noise_m * rng.normal(size=n)
+    return cone / np.linalg.norm(cone, axis=1)[:, None] * ranges[:, None]
+
+
+@pytest.mark.parametrize("passes", [1, 10])
+def test_a_ring_seen_over_and_over_is_no_surface(passes):
+    """Neither the arc on a smooth wall nor the sheet that a ragged hedge makes of it."""
+    arc = ring_on(lambda azimuth: 15.0 / np.cos(azimuth), 0.1)
+    hedge = ring_on(lambda azimuth: 15.0 + np.sin(40.0 * azimuth), 0.1)
+    assert max(trust_of(arc, passes=passes), trust_of(hedge, passes=passes)) < 0.05
+
+
+def test_a_pole_counts_and_a_ring_on_a_rail_does_not():
+    rng = np.random.default_rng(0)
+    thin = 0.01 * rng.normal(size=(300, 2))
+    length = rng.uniform(-0.5, 0.5, 300)
+    pole = np.column_stack([12.5 + thin[:, 0], 0.5 + thin[:, 1], length])
+    rail = np.column_stack([12.5 + thin[:, 0], 0.5 + length, 0.5 + thin[:, 1]])
+    assert trust_of(pole) > 0.5 > 0.01 > trust_of(rail)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -161,7 +161,7 @@ def test_a_covered_lidar_is_lost_and_found_again(town):
     covered = [replace(scan, points=0.001 * scan.points) if 30 <= scan.index < 33 else scan for scan in scans]
     steps = tracked(covered, T_base_lidar, configured(3))
     assert [step.state for step in steps[29:34]] == [State.OK, *[State.LOST] * 3, State.OK]
-    assert "preprocess.min_range_m (1)" in steps[31].reason
+    assert "preprocess.min_range_m (0.5)" in steps[31].reason
     assert ate_m(trajectory(steps), truth) < 0.05
 
 

@@ -7,7 +7,7 @@ from scenes import configured
 
 from pipeline.config import PreprocessConfig
 from pipeline.data import Scan
-from pipeline.preprocess import downsample, sweep_of
+from pipeline.preprocess import Resolution, downsample, sweep_of
 
 CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
 
@@ -58,3 +58,50 @@ def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_tim
     assert not sweep.is_distorted and sweep.middle_s == 0.0
     assert np.array_equal(sweep.from_middle(np.ones(6)), sweep.points)
     assert not sweep.thinned(4.0).is_distorted
+
+
+def box_scan(half_m, n=60_000, seed=0):
+    """A lidar in the middle of a box."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3))
+    return scan_of(half_m * points / np.abs(points).max(axis=1)[:, None])
+
+
+@pytest.mark.parametrize(("half_m", "scale"), [(30.0, 1.0), (13.0, 1.0), (5.0, 0.5), (2.5, 0.25), (0.8, 0.125)])
+def test_voxels_are_small_where_the_place_is_narrow_and_enough_points_are_matched(half_m, scale):
+    resolution = Resolution(PreprocessConfig(match_points=2000), 1.0)
+    for k in range(5):
+        sweep, sparse = resolution.look(box_scan(half_m, seed=k))
+    assert resolution.scale == scale
+    assert len(sweep.points) == len(
+        naive.first_per_voxel(box_scan(half_m, seed=4).points, 0.5 * scale, 0.5, 100.0)
+    )
+    most = resolution.match_voxel_m == 1.5 * scale
+    least = resolution.match_voxel_m == 0.5 * scale
+    assert most or least or 1500 < len(sparse.points) < 2600
+    assert len(sparse.points) > 1500 or least
+
+
+def test_voxels_change_when_the_place_does_and_not_for_a_glance():
+    resolution = Resolution(PreprocessConfig(), 1.0)
+    resolution.look(box_scan(6.0))
+    assert resolution.scale == 0.5
+    for half_m in (4.5, 9.0, 6.0):
+        resolution.look(box_scan(half_m))
+        assert resolution.scale == 0.5
+    resolution.look(box_scan(30.0))
+    assert resolution.scale == 1.0
+
+
+def test_the_plane_keeps_the_voxels_of_its_preset():
+    resolution = Resolution(configured(2).preprocess, 0.1)
+    resolution.look(scan_of(np.random.default_rng(0).uniform(-1.0, 1.0, (500, 2))))
+    assert (resolution.scale, resolution.match_voxel_m) == (1.0, 0.01)
+
+
+def test_a_scan_without_a_point_in_range_leaves_the_voxels_alone():
+    resolution = Resolution(PreprocessConfig(), 1.0)
+    sweep, sparse = resolution.look(scan_of(np.zeros((10, 3))))
+    assert len(sweep.points) == len(sparse.points) == 0
+    resolution.look(box_scan(2.5))
+    assert resolution.scale == 0.25

@@ -70,7 +70,7 @@ class Problem(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A pose, the twist ``away`` from the first one, and the normal equations there; ``sums`` (4,) as above."""
+    """A pose, the twist ``away`` from the predicted one, and the normal equations there; ``sums`` (4,) above."""
 
     T: NDArray[np.float64]
     away: NDArray[np.float64]
@@ -80,12 +80,12 @@ class Estimate(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def align(voxels, points, T, prior, terms):
+def align(voxels, points, T, away, prior, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, where ξ is the twist away from the
-    first value: prior (k, k) is the information of the prediction times the variance of a residual. Twists turn
-    about the first value's position.
+    prediction, ``away`` (k,) for the first value: prior (k, k) is the information of the prediction times the
+    variance of a residual. Twists turn about the first value's position, along the map's axes.
     Points find new partners after every step until PATIENCE were taken with the kernel at its last scale: pairs
     that flip to and fro would go on for ever. From then on the pairs stay.
     Returns an ``Outcome``.
@@ -95,7 +95,7 @@ def align(voxels, points, T, prior, terms):
     origin[: points.shape[1]] = T[:-1, -1]
     partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
     problem = Problem(voxels, points, origin, prior, partner, trust, terms)
-    now = Estimate(T, np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
+    now = Estimate(T, away.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
     now.sums[DAMPING] = _FIRST_DAMPING

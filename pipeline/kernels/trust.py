@@ -5,6 +5,7 @@ from numba import njit
 from pipeline.kernels.voxels import (
     ACROSS,
     DIRECTION,
+    LINE,
     MEAN_TERM,
     PLANE,
     SHAPE,
@@ -15,6 +16,9 @@ from pipeline.kernels.voxels import (
 )
 
 _GRAZING = 0.05  # sine of the angle between ray and plane at which a pair counts half
+_SHEET = 2.0  # widths of a plane that a ray may spend within its thickness before the pair counts half
+_NARROW = 3.0  # times σ, the width of a plane at which its normal is half noise
+_UPRIGHT = 0.5  # cosine between a line and the lidar's vertical at which the line counts half
 
 
 @njit(cache=True, nogil=True)
@@ -22,32 +26,38 @@ def weigh(voxels, points, T, partner, variance: float, trust):
     """Fill ``trust`` (N,) with σ²/(variance of the residual) ≤ 1 of every pair at the pose T; 0 without a partner.
 
     On a plane of thickness τ, fitted to n points with eigenvalues λ along and λ' across it, the residual at
-    (a, c) from the mean has the variance max(τ², σ²)·(1 + 1/n + a²/(nλ) + c²/(nλ'))    (after Yuan et al. 2022)
-    and a ray that grazes it tells little: rings that cross a far wall lie in a plane of their own, seen edge-on,
-    which turns with the lidar. In the plane (2D) every pair on a line counts in full.
-    Off planes the mean of a voxel of size s only stands for the surface to within s²/12, the variance of a point
-    in a voxel.
+    (a, c) from the mean has the variance max(τ², σ²)·(1 + 1/n + a²/(nλ) + c²/(nλ'))    (after Yuan et al. 2022).
+    What a lidar strikes with one ring lies in a plane of its own, seen edge-on, that turns and rises with the
+    lidar and would hold it back: little is known where a ray grazes the plane, where it would run through τ for
+    longer than √λ', and where √λ' is but noise. In the plane (2D) every pair on a line counts in full.
+    A line is worth its thickness where it stands upright, so that several rings have struck it: poles and trunks.
+    Other lines are rings, mostly, and like voxels without a shape their mean stands for a surface to within s/2
+    of a voxel of size s.
 
     points : (N, d) metres, source frame; partner : (N,) rows of the map's voxels, −1 for none
+    T : (d+1, d+1), the lidar's z axis is that of its rings
     variance : σ² of the sensor, m²
     """
     planar = points.shape[1] == 2
-    off_planes = variance / (variance + voxels.size_m * voxels.size_m / 12.0)
+    off_shapes = variance / (variance + 0.25 * voxels.size_m * voxels.size_m)
     for i in range(points.shape[0]):
         if partner[i] < 0:
             trust[i] = 0.0
             continue
         cell = voxels.cells[partner[i]]
-        if cell[SHAPE] != PLANE:
-            trust[i] = off_planes
-        elif planar:
-            trust[i] = 1.0
+        if planar:
+            trust[i] = 1.0 if cell[SHAPE] == PLANE else off_shapes
+            continue
+        x, y, z = move(T, points, i)
+        ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
+        x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
+        if cell[SHAPE] == PLANE:
+            worth = _clarity(cell, x, y, z, variance) / (1.0 + _uncertainty(cell, ex, ey, ez))
+            trust[i] = worth * variance / max(cell[THICKNESS], variance)
+        elif cell[SHAPE] == LINE:
+            trust[i] = max(_uprightness(cell, T, x, y, z) * variance / max(cell[THICKNESS], variance), off_shapes)
         else:
-            x, y, z = move(T, points, i)
-            fit = _uncertainty(cell, x - cell[0], y - cell[1], z - cell[2])
-            sine2 = _sine_squared(cell, x - T[0, 3], y - T[1, 3], z - T[2, 3])
-            grazing = sine2 / (sine2 + _GRAZING * _GRAZING)
-            trust[i] = grazing * variance / (max(cell[THICKNESS], variance) * (1.0 + fit))
+            trust[i] = off_shapes
 
 
 @njit(cache=True, inline="always")
@@ -60,7 +70,21 @@ def _uncertainty(cell, ex, ey, ez) -> float:
 
 
 @njit(cache=True, inline="always")
-def _sine_squared(cell, x, y, z) -> float:
-    """Squared sine of the angle between the ray (x, y, z) and the plane."""
+def _clarity(cell, x, y, z, variance: float) -> float:
+    """How clearly the ray (x, y, z) shows that the plane is a surface and not the sheet of a ring, 0 to 1."""
     out = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
-    return out * out / max(x * x + y * y + z * z, 1e-300)
+    sine2 = out * out / max(x * x + y * y + z * z, 1e-300)
+    width2 = cell[MEAN_TERM] / cell[SLOPE_ACROSS]
+    edge = _GRAZING * _GRAZING + _SHEET * _SHEET * cell[THICKNESS] / width2
+    return sine2 / (sine2 + edge) * width2 / (width2 + _NARROW * _NARROW * variance)
+
+
+@njit(cache=True, inline="always")
+def _uprightness(cell, T, x, y, z) -> float:
+    """How far a line runs from ring to ring, the way the ray (x, y, z) goes when its elevation grows, 0 to 1."""
+    zx, zy, zz = T[0, 2], T[1, 2], T[2, 2]
+    height = (x * zx + y * zy + z * zz) / max(x * x + y * y + z * z, 1e-300)
+    ux, uy, uz = zx - height * x, zy - height * y, zz - height * z
+    cosine = cell[DIRECTION] * ux + cell[DIRECTION + 1] * uy + cell[DIRECTION + 2] * uz
+    cosine2 = cosine * cosine / max(ux * ux + uy * uy + uz * uz, 1e-300)
+    return cosine2 / (cosine2 + _UPRIGHT * _UPRIGHT)

@@ -2,9 +2,9 @@
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
-(3), direction (3), shape, tick of the last insertion; and of a plane in space its second direction (3), the
-variance across it, and how that carries over to the fit: at the mean, and by squared distance along both
-directions. A 2D map is the plane z = 0 of the same layout.
+(3), direction (3), shape, tick of the last insertion; of a line or plane in space the variance across it; and
+of a plane there its second direction (3), and how that variance carries over to the fit: at the mean, and by
+squared distance along both directions. A 2D map is the plane z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -20,6 +20,7 @@ POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
 ACROSS, THICKNESS, MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 8, 11, 12, 13, 14
 CELL = 16
+_BROAD = 0.125  # voxels, the least width of a plane that is fitted to a voxel's own points
 MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
 
 
@@ -131,7 +132,11 @@ def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
 
 @njit(cache=True, nogil=True)
 def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
-    """Mean of the voxel's own points; shape and direction from them, or from the neighbours' too if few."""
+    """Mean of the voxel's own points; shape and direction from them, or from the neighbours' too.
+
+    The neighbours help where the points are few or show no width: a ring that passes again and again while the
+    lidar stands still leaves many points and no surface.
+    """
     ix, iy, iz = unpack(voxels.voxel_keys[voxel])
     m = voxels.moments[voxel]
     size = voxels.size_m
@@ -139,13 +144,16 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     cell[0] = (ix + 0.5) * size + m[1] / m[0]
     cell[1] = (iy + 0.5) * size + m[2] / m[0]
     cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
-    if m[0] < alone:
-        _sum_neighbourhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
-        m = sums
-    if dimension == 2:
-        _fit_2d(m, cell)
-    else:
-        _fit_3d(m, cell)
+    if m[0] >= alone and _fit_shape(m, dimension, cell) >= (_BROAD * size) ** 2:
+        return
+    _sum_neighbourhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+    _fit_shape(sums, dimension, cell)
+
+
+@njit(cache=True, inline="always")
+def _fit_shape(m, dimension: int, cell) -> float:
+    """Shape and direction of the points with the moments m (10,); returns the least variance within that, m²."""
+    return _fit_2d(m, cell) if dimension == 2 else _fit_3d(m, cell)
 
 
 @njit(cache=True, nogil=True)
@@ -179,12 +187,13 @@ def _fit_2d(m, cell):
     cell[SHAPE] = POINT
     n = m[0]
     if n < 3.0:
-        return
+        return 0.0
     mx, my = m[1] / n, m[2] / n
     small, large, nx, ny = normal_2d(m[4] / n - mx * mx, m[5] / n - mx * my, m[7] / n - my * my)
     if large > 1e-12 and small < 0.1 * large:
         cell[SHAPE] = PLANE
         cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
+    return large
 
 
 @njit(cache=True, nogil=True)
@@ -196,7 +205,7 @@ def _fit_3d(m, cell):
     cell[SHAPE] = POINT
     n = m[0]
     if n < 5.0:
-        return
+        return 0.0
     mx, my, mz = m[1] / n, m[2] / n, m[3] / n
     xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
     yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
@@ -212,9 +221,11 @@ def _fit_3d(m, cell):
     elif middle < 0.1 * large:
         cell[SHAPE] = LINE
         chosen = large
+        cell[THICKNESS] = middle
     else:
-        return
+        return middle
     vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
     cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2] = vx, vy, vz
     if vx == 0.0 and vy == 0.0 and vz == 0.0:
         cell[SHAPE] = POINT
+    return middle

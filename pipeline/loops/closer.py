@@ -23,7 +23,6 @@ class LoopCloser:
         self.match_voxel_m = config.preprocess.match_voxel_m
         self.matcher = PointToShapeMatcher(config.matching)
         self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map)
-        self.no_prior = np.zeros(3 if dimension == 2 else 6)
 
     def close(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
         """Closures of the newest keyframe to the nearest older place, accepted or not.
@@ -37,7 +36,7 @@ class LoopCloser:
         T_predicted = lie.inverse(T_world_keyframes[target]) @ T_world_keyframes[source.index]
         submap = self.submaps.around(target, keyframes, self._newest_old(keyframes))
         points = downsample(source.points, self.match_voxel_m)
-        match = self.matcher.align(points, submap, T_predicted, self.no_prior, wide=True)
+        match = self.matcher.align(points, submap, T_predicted, wide=True)
         return (self._judge(target, source.index, match, points, submap, T_predicted),)
 
     def _newest_old(self, keyframes: Sequence[Keyframe]) -> int:

@@ -2,11 +2,8 @@
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.config import MatchingConfig
-from pipeline.data import Match, Points, Pose
+from pipeline.data import Match, Points, Pose, Prior
 from pipeline.matching.correlative import correlative_seed
 from pipeline.matching.matcher import PointToShapeMatcher
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
@@ -29,15 +26,9 @@ class Matcher(Protocol):
     """Whatever aligns a scan to a voxel map."""
 
     def align(
-        self,
-        points: Points,
-        target: VoxelMap,
-        T_predicted: Pose,
-        prior: NDArray[np.float64],
-        *,
-        wide: bool = False,
+        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the prediction."""
+        """Pose of the scan in the map's frame, near the first one."""
         ...
 
 

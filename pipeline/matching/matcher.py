@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import MatchingConfig
-from pipeline.data import Match, Matrix, Points, Pose
+from pipeline.data import Match, Matrix, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from pipeline.kernels.registration import Outcome, Terms, align
@@ -23,6 +23,8 @@ OPTIMISERS = {
     "levenberg-marquardt": LEVENBERG_MARQUARDT,
 }
 
+_DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
+_WEAK = 10.0  # times the least information, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction
 
 _ENDINGS = {
@@ -44,41 +46,70 @@ class PointToShapeMatcher:
         self.config = config
 
     def align(
-        self,
-        points: Points,
-        target: VoxelMap,
-        T_predicted: Pose,
-        prior: NDArray[np.float64],
-        *,
-        wide: bool = False,
+        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the prediction.
+        """Pose of the scan in the map's frame, near the first one.
 
         points : (N, d) metres, lidar frame
-        prior : (k,) information of the prediction, m⁻² and rad⁻², twist order
-        wide : search far, for a prediction that is little more than a guess
+        prior : what the pose is expected to be, and how surely; its doubt sets the first scale of the kernel
+        wide : search far, for a first pose that is little more than a guess
         """
-        terms = terms_of(self.config, target, wide)
-        information = np.diag(prior * terms.variance)
-        T = T_predicted.copy()
-        outcome = align(target.voxels, points, T, information, terms)
+        information, away, doubt_m = np.zeros((k_of(T_first),) * 2), np.zeros(k_of(T_first)), 0.0
+        if prior is not None:
+            information = turned(np.diag(prior.widest**-2.0), T_first) * self.config.sensor_noise_m**2
+            away = twist_between(prior.T_target_source, T_first)
+            doubt_m = doubt_of(prior, points)
+        terms = terms_of(self.config, target, wide, doubt_m)
+        T = T_first.copy()
+        outcome = align(target.voxels, points, T, away, information, terms)
         spectrum = spectrum_of(outcome, points)
-        if spectrum.values[0] < self.config.min_information:
-            T = T_predicted.copy()
-            anchor = hold_undetermined(spectrum, outcome.weights, self.config.min_information)
-            outcome = align(target.voxels, points, T, information + anchor, terms)
+        if spectrum.values[0] < _WEAK * self.config.min_information:
+            expected = information if prior is None else turned(prior.information, T_first) * terms.variance
+            anchor = hold(spectrum, outcome.weights, expected, self.config.min_information)
+            T = T_first.copy()
+            outcome = align(target.voxels, points, T, away, information + anchor, terms)
             spectrum = spectrum_of(outcome, points)
-        return judge(T, T_predicted, outcome, spectrum, len(points), self.config.sensor_noise_m)
+        return judge(T, T_first, outcome, spectrum, len(points), self.config.sensor_noise_m)
 
 
-def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool) -> Terms:
-    """The numbers a kernel runs under."""
+def k_of(T: Pose) -> int:
+    """Entries of a twist: 3 in the plane, 6 in space."""
+    return 3 if len(T) == 3 else 6
+
+
+def turned(information: Matrix, T: Pose) -> Matrix:
+    """Information (k, k) about twists in the source's frame as that about twists along the target's axes."""
+    centred = T.copy()
+    centred[:-1, -1] = 0.0
+    Ad = lie.adjoint(centred)
+    return Ad @ information @ Ad.T
+
+
+def twist_between(T_from: Pose, T_to: Pose) -> NDArray[np.float64]:
+    """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
+    a, b = T_from.copy(), T_to.copy()
+    a[:-1, -1] -= T_to[:-1, -1]
+    b[:-1, -1] = 0.0
+    return lie.log(b @ lie.inverse(a))
+
+
+def doubt_of(prior: Prior, points: Points) -> float:
+    """How far a point may be from where the prior expects it: one standard deviation, metres."""
+    d = points.shape[1]
+    variances = prior.covariance.diagonal()
+    square_range = np.einsum("ij,ij->", points, points) / max(len(points), 1)
+    return math.sqrt(variances[:d].mean() + square_range * variances[d:].mean())
+
+
+def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool, doubt_m: float = 0.0) -> Terms:
+    """The numbers a kernel runs under; doubt_m is how far off points may be, one standard deviation."""
+    first_scale_m = min(max(config.kernel_scale_m, _DOUBTS * doubt_m), config.wide_kernel_scale_m)
     return Terms(
         optimiser=OPTIMISERS[config.optimiser],
         max_iterations=config.max_iterations,
         reach=config.wide_reach_voxels if wide else config.reach_voxels,
-        max_distance_m=config.wide_max_distance_m if wide else config.max_distance_m,
-        first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
+        max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
+        first_scale_m=config.wide_kernel_scale_m if wide else first_scale_m,
         scale_m=config.kernel_scale_m,
         variance=config.sensor_noise_m**2,
         tolerance_m=config.tolerance_m,
@@ -109,14 +140,20 @@ def spectrum_of(outcome: Outcome, points: Points) -> Spectrum:
     return Spectrum(scale, *np.linalg.eigh(evened))
 
 
-def hold_undetermined(spectrum: Spectrum, weights: float, min_information: float) -> Matrix:
-    """Information (k, k), in the kernel's units, that keeps a pose from moving where the data determine nothing.
+def hold(spectrum: Spectrum, weights: float, expected: Matrix, min_information: float) -> Matrix:
+    """Information (k, k), in the kernel's units, that keeps a pose near the prediction where the data tell little.
 
-    The solution is restricted to the directions whose eigenvalue is at least ``min_information`` (Zhang, Kaess &
-    Singh 2016).
+    Along directions whose eigenvalue is below ``min_information`` the pose does not move at all (Zhang, Kaess &
+    Singh 2016). Up to _WEAK times that the data may be mistaken about themselves, and the information ``expected``
+    (k, k) of the prediction is taken as it is; beyond, a vehicle that brakes may contradict any experience.
     """
-    held = spectrum.vectors[:, spectrum.values < min_information] / spectrum.scale[:, None]
-    return _FIRM * weights * held @ held.T
+    weak = spectrum.values < _WEAK * min_information
+    values, vectors = spectrum.values[weak], spectrum.vectors[:, weak]
+    twists = vectors * spectrum.scale[:, None]
+    strength = np.einsum("ik,ij,jk->k", twists, expected, twists)
+    strength = np.where(values < min_information, _FIRM * weights, strength)
+    held = vectors / spectrum.scale[:, None]
+    return (held * strength) @ held.T
 
 
 def judge(

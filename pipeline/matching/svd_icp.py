@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import MatchingConfig
-from pipeline.data import Match, Points, Pose
+from pipeline.data import Match, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.association import associate
 from pipeline.kernels.cross_covariance import weighted_pairs
@@ -24,21 +24,15 @@ class SvdMatcher:
         self.config = config
 
     def align(
-        self,
-        points: Points,
-        target: VoxelMap,
-        T_predicted: Pose,
-        prior: NDArray[np.float64],
-        *,
-        wide: bool = False,
+        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the prediction; arguments as ``PointToShapeMatcher.align``.
+        """Pose of the scan in the map's frame, near the first one; arguments as ``PointToShapeMatcher.align``.
 
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """
         del prior
         terms = terms_of(self.config, target, wide)
-        T, scale_m = T_predicted.copy(), terms.first_scale_m
+        T, scale_m = T_first.copy(), terms.first_scale_m
         partner = np.empty(len(points), np.int32)
         source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
         ending, iterations, pairs = registration.OUT_OF_ITERATIONS, 0, 0

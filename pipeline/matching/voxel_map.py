@@ -19,11 +19,12 @@ class VoxelMap:
     ``voxels`` holds the arrays for the kernels; nobody else writes into them.
     """
 
-    def __init__(self, dimension: int, config: LocalMapConfig) -> None:
+    def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0) -> None:
         self.dimension = dimension
         self.config = config
+        self.scale = scale
         self.insertions = 0
-        self.voxels = _empty(1 << 12, config.voxel_size_m)
+        self.voxels = _empty(1 << 12, scale * config.voxel_size_m)
 
     def __len__(self) -> int:
         return int(self.voxels.used[0])
@@ -42,7 +43,7 @@ class VoxelMap:
         return self.voxels.cells[: len(self), : self.dimension].copy()
 
     def _rebuild(self, room: int, T_map_lidar: Pose, radius_m: float) -> None:
-        kept = _empty(max(room, len(self)), self.config.voxel_size_m)
+        kept = _empty(max(room, len(self)), self.voxels.size_m)
         x, y, z = lie.lift(T_map_lidar)[:3, 3]
         oldest = self.insertions - self.config.max_insertions
         keep(self.voxels, kept, x, y, z, radius_m, float(oldest))

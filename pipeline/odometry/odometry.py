@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from time import perf_counter
 
 import numpy as np
@@ -13,12 +14,13 @@ from pipeline.data import Match, Points, Pose, Scan, State
 from pipeline.errors import InputError
 from pipeline.matching import VoxelMap, correlative_seed, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
-from pipeline.odometry.tracked import Tracked, first_match, nothing_to_match, seen_from
-from pipeline.preprocess import Sweep, sweep_of
+from pipeline.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
+from pipeline.preprocess import Resolution, Sweep
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
 _DOUBT = 2.0  # cost per point over its running mean, from which on other guesses are tried
+_RECENT = 20  # scans that a map with other voxels starts from
 _MEMORY = 0.9  # of that running mean, per scan
 
 
@@ -31,8 +33,9 @@ class Odometry:
         self.predictor = Predictor(config.odometry, T_base_lidar)
         self.matcher = create_matcher(config.matching)
         self.local_map = VoxelMap(self.dimension, config.local_map)
+        self.resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
+        self.recent: deque[tuple[Points, Pose]] = deque(maxlen=_RECENT)
         self.T_odom_inserted = self.predictor.T_odom_lidar
-        self.no_prior = np.zeros(3 if self.dimension == 2 else 6)
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
         self.usual_cost = 0.0
@@ -42,8 +45,9 @@ class Odometry:
     def track(self, scan: Scan) -> Tracked:
         """Predict, correct by registration, extend the map."""
         started = perf_counter()
-        sweep = sweep_of(scan, self.config.preprocess)
-        sparse = sweep.thinned(self.config.preprocess.match_voxel_m)
+        sweep, sparse = self.resolution.look(scan)
+        if self.resolution.scale != self.local_map.scale:
+            self._rescale()
         if not len(sparse.points) and not len(self.local_map):
             raise InputError(
                 f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
@@ -68,7 +72,7 @@ class Odometry:
         T_odom_middle = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         aligned = perf_counter()
         T_stamp_middle = self._from_middle_to_stamp(scan, sweep, T_odom_middle)
-        self.predictor.correct(scan, T_odom_middle)
+        self.predictor.correct(scan, prediction, match, state)
         points = sweep.from_middle(self.predictor.velocity)
         self._extend(points, T_odom_middle, state)
         tracked = Tracked(
@@ -93,16 +97,23 @@ class Odometry:
         T_odom_middle = match.T_target_source
         velocity = self.predictor.velocity_at(scan, T_odom_middle)
         if self.predictor.is_new:
-            T_odom_middle = self._restart(velocity) @ T_odom_middle
+            T_moved = self._restart(velocity)
+            T_odom_middle = T_moved @ T_odom_middle
+            prediction = prediction.moved(T_moved)
         points = sparse.from_middle(velocity)
-        return points, self.matcher.align(points, self.local_map, T_odom_middle, prediction.information)
+        match = self.matcher.align(points, self.local_map, T_odom_middle, prediction.prior)
+        return points, blurred(
+            match, self.predictor.deskewing_error(scan, match.T_target_source, sparse.duration_s)
+        )
 
     def _restart(self, velocity: NDArray[np.float64]) -> Pose:
         """Make the map anew of the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
         T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
         self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
-        self.local_map = VoxelMap(self.dimension, self.config.local_map)
+        self.local_map = VoxelMap(self.dimension, self.config.local_map, self.resolution.scale)
         self.local_map.insert(self.first_points, lie.identity(self.dimension))
+        self.recent.clear()
+        self.recent.append((self.first_points, lie.identity(self.dimension)))
         self.predictor.place(T_odom_middle)
         return T_odom_middle
 
@@ -120,13 +131,11 @@ class Odometry:
     def _align(self, scan: Scan, points: Points, prediction: Prediction) -> Match:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
         wide = self.wide_scans > 0 or prediction.is_guess
-        best = self.matcher.align(
-            points, self.local_map, prediction.T_odom_lidar, prediction.information, wide=wide
-        )
+        best = self.matcher.align(points, self.local_map, prediction.T_odom_lidar, prediction.prior, wide=wide)
         doubtful_cost = (1.0 if prediction.is_guess else _DOUBT) * self.usual_cost * len(points)
         if best.cost > doubtful_cost > 0.0:
             for guess in self._guesses(scan, points, prediction):
-                other = self.matcher.align(points, self.local_map, guess, self.no_prior, wide=True)
+                other = self.matcher.align(points, self.local_map, guess, wide=True)
                 if other.cost < best.cost:
                     best = other
         cost = best.cost / len(points)
@@ -178,7 +187,14 @@ class Odometry:
         if len(self.local_map) and not self._moved_enough(T_odom_lidar) and state is not State.LOST:
             return
         self.local_map.insert(points, T_odom_lidar)
+        self.recent.append((points, T_odom_lidar))
         self.T_odom_inserted = T_odom_lidar
+
+    def _rescale(self) -> None:
+        """Make the map anew, with voxels of another size, of the last scans."""
+        self.local_map = VoxelMap(self.dimension, self.config.local_map, self.resolution.scale)
+        for points, T_odom_lidar in self.recent:
+            self.local_map.insert(points, T_odom_lidar)
 
     def _moved_enough(self, T_odom_lidar: Pose) -> bool:
         T = lie.inverse(self.T_odom_inserted) @ T_odom_lidar

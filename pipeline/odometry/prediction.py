@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import OdometryConfig
-from pipeline.data import Pose, Scan
+from pipeline.data import Match, Matrix, Pose, Prior, Scan, State
 from pipeline.errors import InputError
+from pipeline.odometry.experience import Experience
 
 _EVEN = 2.0  # intervals whose ratio is below this tell an acceleration
 _GAP = 5.0  # times the usual interval, from which on scans are missing
@@ -25,18 +26,35 @@ class Prediction:
 
     Attributes
     ----------
-    T_odom_lidar : the expected pose
-    information : (k,) inverse variances of the expected pose, m⁻² and rad⁻²
+    prior : the expected pose and how surely
+    experience : that the doubt comes from, of predictions by the same means
     is_guess : whether much time has passed, so that the pose may be far off
     """
 
-    T_odom_lidar: Pose
-    information: NDArray[np.float64]
+    prior: Prior
+    experience: Experience
     is_guess: bool
+
+    @property
+    def T_odom_lidar(self) -> Pose:
+        """The expected pose."""
+        return self.prior.T_target_source
+
+    def moved(self, T: Pose) -> Prediction:
+        """The same in an odometry frame whose origin stands elsewhere."""
+        return Prediction(
+            Prior(T @ self.T_odom_lidar, self.prior.covariance, self.prior.widest), self.experience, self.is_guess
+        )
 
 
 class Predictor:
-    """Remembers the last pose, the last motion and the last wheel reading."""
+    """Remembers the last pose, the last motion and the last wheel reading, and how sure these were.
+
+    Without wheels the motion goes on as it was: a Kalman filter whose state is the velocity, whose process noise
+    is learnt from the errors of the predictions, and whose measurement is the match (its information is added to
+    that of the prediction). Where a scan tells nothing along a direction, the velocity there is carried on and
+    its variance grows.
+    """
 
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose) -> None:
         self.config = config
@@ -44,6 +62,10 @@ class Predictor:
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         self.velocity = np.zeros(3 if len(T_base_lidar) == 3 else 6)
+        self.any_motion = np.diag(self._sigmas(config.velocity_sigma_m, config.velocity_sigma_rad) ** 2)
+        self.motion_covariance = self.any_motion
+        self.by_velocity = Experience(self._sigmas(config.velocity_sigma_m, config.velocity_sigma_rad))
+        self.by_wheels = Experience(self._sigmas(config.wheel_sigma_m, config.wheel_sigma_rad))
         self.interval_s = 0.0
         self.usual_s = 0.0
         self.last_scan: Scan | None = None
@@ -51,13 +73,18 @@ class Predictor:
     def predict(self, scan: Scan) -> Prediction:
         """The expected pose of a scan that follows the last one corrected."""
         wheel = self._wheel_motion(scan)
-        config = self.config
-        if wheel is None:
-            expected = self.T_odom_lidar @ self._carried_on(scan)
-            information = self._information(config.velocity_sigma_m, config.velocity_sigma_rad)
-            return Prediction(expected, information, is_guess=self._has_gap_before(scan))
-        information = self._information(config.wheel_sigma_m, config.wheel_sigma_rad)
-        return Prediction(self.T_odom_lidar @ wheel, information, is_guess=False)
+        if wheel is not None:
+            return self._prediction(wheel, np.diag(self.by_wheels.variances), self.by_wheels)
+        if self._has_gap_before(scan):
+            return self._prediction(self._stretched(scan), self.any_motion, self.by_velocity, is_guess=True)
+        covariance = self.motion_covariance + np.diag(self.by_velocity.variances)
+        return self._prediction(self.T_previous_current, covariance, self.by_velocity)
+
+    def _prediction(
+        self, motion: Pose, covariance: Matrix, experience: Experience, *, is_guess: bool = False
+    ) -> Prediction:
+        prior = Prior(self.T_odom_lidar @ motion, covariance, experience.first_sigma)
+        return Prediction(prior, experience, is_guess)
 
     def alternatives(self, scan: Scan) -> tuple[Pose, ...]:
         """Poses worth trying where the expected one leads nowhere good.
@@ -69,8 +96,14 @@ class Predictor:
         stretched = tuple(T @ self._stretched(scan, share) for share in (0.5, 1.0, 1.5))
         return T @ self.T_previous_current, *stretched, T
 
-    def correct(self, scan: Scan, T_odom_lidar: Pose) -> None:
-        """Take the pose that the scan turned out to have."""
+    def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
+        """Take the pose that the scan turned out to have: that of its match or, where it is lost, the expected."""
+        T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
+        self.motion_covariance = self.any_motion
+        if state is not State.LOST:
+            self.motion_covariance = np.linalg.inv(prediction.prior.information + match.information)
+        if state is State.OK and not prediction.is_guess and not self.is_new:
+            prediction.experience.learn(lie.log(lie.inverse(prediction.T_odom_lidar) @ T_odom_lidar))
         if self.last_scan is not None:
             self.velocity = self.velocity_at(scan, T_odom_lidar)
             self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
@@ -104,6 +137,19 @@ class Predictor:
         before = lie.log(self.T_previous_current) / self.interval_s
         return mean + interval_s / (interval_s + self.interval_s) * (mean - before)
 
+    def deskewing_error(self, scan: Scan, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
+        """(k,) by how much a scan of this duration is off after deskewing at constant velocity, about.
+
+        Under an acceleration a the points lie ½ a t² off at the time t from the middle, on average a T²/24 over a
+        scan of T seconds; a by the last two motions.
+        """
+        interval_s = self.interval_to(scan)
+        if interval_s <= 0.0 or self.is_new:
+            return np.zeros(len(self.velocity))
+        mean = lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar) / interval_s
+        before = lie.log(self.T_previous_current) / self.interval_s
+        return (mean - before) / interval_s * duration_s**2 / 24.0
+
     def interval_to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
 
@@ -122,12 +168,11 @@ class Predictor:
         """Whether scans are missing."""
         return self.usual_s > 0.0 and self.interval_to(scan) > _GAP * self.usual_s
 
-    def _carried_on(self, scan: Scan) -> Pose:
-        """The motion to expect: the last one again or, over a gap, the same velocity for longer."""
-        return self._stretched(scan) if self._has_gap_before(scan) else self.T_previous_current
-
     def _stretched(self, scan: Scan, share: float = 1.0) -> Pose:
-        """The motion over a share of the time that passed; the shortest intervals tell a velocity badly."""
+        """The motion at the same velocity over a share of the time that passed.
+
+        The shortest intervals tell a velocity badly.
+        """
         last_s = max(self.interval_s, 0.5 * self.usual_s)
         if last_s <= 0.0:
             return self.T_previous_current
@@ -147,10 +192,9 @@ class Predictor:
             return None
         return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
 
-    def _information(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
+    def _sigmas(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
         d = self.T_odom_lidar.shape[0] - 1
-        turns = 1 if d == 2 else 3
-        return np.array([sigma_m**-2] * d + [sigma_rad**-2] * turns)
+        return np.array([sigma_m] * d + [sigma_rad] * (1 if d == 2 else 3))
 
 
 def _are_alike(a: float, b: float) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import MatchingConfig, PreprocessConfig
@@ -54,7 +55,7 @@ def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
     """What stands for a match where no point is left: the prediction."""
     return Match(
         T_target_source=prediction.T_odom_lidar,
-        information=np.diag(prediction.information),
+        information=prediction.prior.information,
         cost=0.0,
         inliers=0,
         points=0,
@@ -66,7 +67,15 @@ def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
             f"preprocess.max_range_m ({config.max_range_m:g})"
         ),
         degeneracy_eigenvalue=0.0,
-        degeneracy_direction=np.eye(len(prediction.information))[0],
+        degeneracy_direction=np.eye(len(prediction.prior.information))[0],
+    )
+
+
+def blurred(match: Match, error: NDArray[np.float64]) -> Match:
+    """The same match with an error (k,), one standard deviation, that the points do not show."""
+    blur = np.diag(error**2)
+    return replace(
+        match, information=match.information @ np.linalg.inv(np.eye(len(blur)) + blur @ match.information)
     )
 
 

@@ -32,6 +32,11 @@ class Sweep:
         """Whether the lidar's motion is in the points."""
         return len(self.times_s) > 0
 
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first point to the last."""
+        return float(np.ptp(self.times_s)) if self.is_distorted else 0.0
+
     def thinned(self, voxel_m: float) -> Sweep:
         """The first point of every voxel of this size."""
         chosen = _first_per_voxel(self.points, voxel_m, 0.0, np.inf)
@@ -53,9 +58,13 @@ class Sweep:
         return points
 
 
-def sweep_of(scan: Scan, config: PreprocessConfig) -> Sweep:
-    """The scan cropped to the range that is used and thinned out, times left out where deskewing is off."""
-    chosen = _first_per_voxel(scan.points, config.map_voxel_m, config.min_range_m, config.max_range_m)
+def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
+    """The scan cropped to the range that is used and thinned out, times left out where deskewing is off.
+
+    scale : of the voxels, 1 for ``preprocess.map_voxel_m``
+    """
+    voxel_m = scale * config.map_voxel_m
+    chosen = _first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
     points = _gather(scan.points, chosen)
     if not config.deskew or not len(scan.times_s):
         return Sweep(points, np.empty(0), 0.0)

@@ -1,0 +1,38 @@
+"""How well predictions have done so far, which tells how far off the next one may be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MEMORY = 0.9  # of the squared errors, per scan
+_SUDDEN = 0.25  # share of the last squared error that counts at once
+_KNOWN = 5  # errors, before which they tell too little
+_CAUTION = 2.0  # standard deviations
+_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # no prediction is trusted more than this
+
+
+class Experience:
+    """A running mean of squared errors, one for every component of a twist."""
+
+    def __init__(self, first_sigma: NDArray[np.float64]) -> None:
+        """first_sigma : (k,) standard deviations to go by until errors are known, and the most there may be."""
+        self.first_sigma = first_sigma
+        d = 2 if len(first_sigma) == 3 else 3
+        self.least = np.array([_LEAST_M] * d + [_LEAST_RAD] * (len(first_sigma) - d)) ** 2
+        self.squares = np.zeros(len(first_sigma))
+        self.count = 0
+
+    def learn(self, error: NDArray[np.float64]) -> None:
+        """Take the error (k,) of a prediction."""
+        self.count += 1
+        gain = max(1.0 - _MEMORY, 1.0 / self.count)
+        self.squares += gain * (error**2 - self.squares)
+        self.squares = np.maximum(self.squares, _SUDDEN * error**2)
+
+    @property
+    def variances(self) -> NDArray[np.float64]:
+        """(k,) of the next prediction, on the side of caution."""
+        if self.count < _KNOWN:
+            return self.first_sigma**2
+        return np.clip(_CAUTION**2 * self.squares, self.least, self.first_sigma**2)

@@ -1,0 +1,67 @@
+"""How finely a place is looked at: voxels that follow the surroundings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.config import PreprocessConfig
+from pipeline.data import Points, Scan
+from pipeline.preprocess.sweep import Sweep, sweep_of
+
+_HYSTERESIS = 0.75  # powers of two between the present scale and the wanted one, from which on it changes
+_STEP = 2.0  # by which the voxels of matching shrink or grow from one scan to the next, at most
+_ENOUGH = 0.9  # a change to more than this share is not worth it: the choice of points would dance
+
+
+class Resolution:
+    """Chooses the sizes of voxels, scan by scan.
+
+    Attributes
+    ----------
+    scale : 1, ½, ¼ …, what all voxel sizes of the configuration are multiplied with: small in narrow places, so
+        that the median range spans about ``preprocess.range_voxels`` voxels of the local map, or more
+    match_voxel_m : what scans are thinned out with to be matched, so that about ``preprocess.match_points`` remain
+    """
+
+    def __init__(self, config: PreprocessConfig, voxel_size_m: float) -> None:
+        """voxel_size_m : of the local map, at scale 1."""
+        self.config = config
+        self.voxel_size_m = voxel_size_m
+        self.scale = 1.0
+        self.match_voxel_m = config.match_voxel_m
+        self.is_new = True
+        self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
+
+    def look(self, scan: Scan) -> tuple[Sweep, Sweep]:
+        """What goes into the map of a scan, and what of that is matched.
+
+        What is found decides about the next scan; the first one is looked at again until all fits.
+        """
+        while True:
+            sweep = sweep_of(scan, self.config, self.scale)
+            sparse = sweep.thinned(self.match_voxel_m)
+            fits = self.is_fixed or not len(sparse.points) or self._fit(sparse.points)
+            if fits or not self.is_new:
+                self.is_new = self.is_new and not len(sparse.points)
+                return sweep, sparse
+
+    def _fit(self, points: Points) -> bool:
+        """Adapt the sizes to what was matched; whether they were right."""
+        before = self.scale, self.match_voxel_m
+        self.scale = self._scale_for(float(np.median(np.linalg.norm(points, axis=1))))
+        wish_m = self.match_voxel_m * min(
+            max(math.sqrt(len(points) / self.config.match_points), 1.0 / _STEP), _STEP
+        )
+        coarse_m, fine_m = self.scale * self.config.match_voxel_m, self.scale * self.config.map_voxel_m
+        wish_m = min(max(wish_m, fine_m), coarse_m)
+        if not _ENOUGH < wish_m / self.match_voxel_m < 1.0 / _ENOUGH:
+            self.match_voxel_m = wish_m
+        return before == (self.scale, self.match_voxel_m)
+
+    def _scale_for(self, median_range_m: float) -> float:
+        wanted = math.log2(median_range_m / (self.config.range_voxels * self.voxel_size_m))
+        if abs(wanted - math.log2(self.scale)) <= _HYSTERESIS:
+            return self.scale
+        return min(max(2.0 ** round(wanted), self.config.min_scale), 1.0)
