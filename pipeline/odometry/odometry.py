@@ -20,6 +20,7 @@ from pipeline.preprocess import Resolution, Sweep
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
 _DOUBT = 2.0  # cost per point over its running mean, from which on other guesses are tried
+_ROUGH = 0.05  # share of the cost of a point without a partner, below which nothing is doubted
 _RECENT = 20  # scans that a map with other voxels starts from
 _MEMORY = 0.9  # of that running mean, per scan
 
@@ -132,8 +133,7 @@ class Odometry:
         """The alignment from the expected pose or, where that one is doubtful, the best from other guesses too."""
         wide = self.wide_scans > 0 or prediction.is_guess
         best = self.matcher.align(points, self.local_map, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        doubtful_cost = (1.0 if prediction.is_guess else _DOUBT) * self.usual_cost * len(points)
-        if best.cost > doubtful_cost > 0.0:
+        if self._is_doubtful(best.cost / len(points), prediction):
             for guess in self._guesses(scan, points, prediction):
                 other = self.matcher.align(points, self.local_map, guess, wide=True)
                 if other.cost < best.cost:
@@ -141,6 +141,14 @@ class Odometry:
         cost = best.cost / len(points)
         self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
+
+    def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
+        """Whether the cost per point is far above what it used to be, and a share of what a point costs at most."""
+        if not self.usual_cost:
+            return False
+        if prediction.is_guess:
+            return cost > self.usual_cost
+        return cost > max(_DOUBT * self.usual_cost, _ROUGH * 0.5 * self.config.matching.kernel_scale_m**2)
 
     def _guesses(self, scan: Scan, points: Points, prediction: Prediction) -> tuple[Pose, ...]:
         """Other poses to start from; in the plane also the best of a grid around the expected one."""
