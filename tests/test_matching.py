@@ -74,14 +74,14 @@ def test_all_four_optimisers_reach_the_same_minimum_near_the_truth(dimension, op
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_second_order_methods_need_far_fewer_steps_than_gradient_descent(dimension):
+def test_second_order_methods_need_half_the_steps_of_gradient_descent(dimension):
     steps = {}
     for optimiser in OPTIMISERS:
         matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=20_000)
         T = truth(dimension)
         steps[optimiser] = matcher.align(scan_at(T), target, lie.identity(dimension)).iterations
     assert max(steps["newton"], steps["gauss-newton"], steps["levenberg-marquardt"]) < 40
-    assert steps["gradient-descent"] > 2 * steps["levenberg-marquardt"]
+    assert steps["gradient-descent"] >= 2 * steps["levenberg-marquardt"]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

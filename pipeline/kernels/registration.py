@@ -16,7 +16,8 @@ from pipeline.kernels.voxels import POINT, SHAPE, Voxels
 CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # of the kernel's scale from one association to the next
-PATIENCE = 20  # associations at the last scale
+SLACK = 0.02  # voxels that points may move before they look for new partners
+PATIENCE = 20  # steps at the last scale
 COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 
@@ -86,8 +87,8 @@ def align(voxels, points, T, away, prior, terms):
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, where ξ is the twist away from the
     prediction, ``away`` (k,) for the first value: prior (k, k) is the information of the prediction times the
     variance of a residual. Twists turn about the first value's position, along the map's axes.
-    Points find new partners after every step until PATIENCE were taken with the kernel at its last scale: pairs
-    that flip to and fro would go on for ever. From then on the pairs stay.
+    Points find new partners when they have moved by more than SLACK, until PATIENCE steps were taken with the
+    kernel at its last scale: pairs that flip to and fro would go on for ever. From then on the pairs stay.
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
@@ -99,16 +100,19 @@ def align(voxels, points, T, away, prior, terms):
     trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
     now.sums[DAMPING] = _FIRST_DAMPING
-    scale_m, settled = terms.first_scale_m, 0
+    scale_m, last_scale_m, settled = terms.first_scale_m, 0.0, 0
+    moved_m, range_m = np.inf, _root_mean_square_range(points)
     pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
     while iterations < terms.max_iterations:
         iterations += 1
-        if settled < PATIENCE:
+        if settled < PATIENCE and moved_m > SLACK * voxels.size_m:
+            moved_m = 0.0
             pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, partner)
             if pairs == 0:
                 ending = NO_PARTNERS
                 break
             weigh(voxels, points, T, partner, terms.variance, trust)
+        if moved_m == 0.0 or scale_m != last_scale_m:
             _linearise(problem, scale_m, now)
         if not _descend(problem, scale_m, now, trial, x, factor):
             ending = SINGULAR
@@ -118,7 +122,8 @@ def align(voxels, points, T, away, prior, terms):
                 ending = CONVERGED
                 break
             settled += 1
-        scale_m = max(terms.scale_m, SHRINK * scale_m)
+        moved_m += _largest_move(x, range_m)
+        last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
     cost = now.sums[COST] - 0.5 * now.away @ prior @ now.away + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
     _leave_out_points(problem)
@@ -188,6 +193,28 @@ def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
         now.sums[DAMPING] *= growth
         growth *= 2.0
     return False
+
+
+@njit(cache=True, nogil=True)
+def _root_mean_square_range(points) -> float:
+    squares = 0.0
+    for i in range(points.shape[0]):
+        for axis in range(points.shape[1]):
+            squares += points[i, axis] * points[i, axis]
+    return np.sqrt(squares / max(points.shape[0], 1))
+
+
+@njit(cache=True, inline="always")
+def _largest_move(x, range_m: float) -> float:
+    """How far a step x moves a point at that range, at most; metres."""
+    d = 2 if x.shape[0] == 3 else 3
+    shift = turn = 0.0
+    for i in range(x.shape[0]):
+        if i < d:
+            shift += x[i] * x[i]
+        else:
+            turn += x[i] * x[i]
+    return np.sqrt(shift) + np.sqrt(turn) * range_m
 
 
 @njit(cache=True, inline="always")

@@ -4,7 +4,8 @@ A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σy
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
 (3), direction (3), shape, tick of the last insertion; of a line or plane in space the variance across it; and
 of a plane there its second direction (3), and how that variance carries over to the fit: at the mean, and by
-squared distance along both directions. A 2D map is the plane z = 0 of the same layout.
+squared distance along both directions; and the number of points when all this was fitted. A 2D map is the plane
+z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -18,8 +19,9 @@ from pipeline.kernels.hashing import find, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
-ACROSS, THICKNESS, MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 8, 11, 12, 13, 14
+ACROSS, THICKNESS, MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG, FITTED = 8, 11, 12, 13, 14, 15
 CELL = 16
+_GROWN = 1.3  # times the points of its last fit, from which on a voxel is fitted anew
 _BROAD = 0.125  # voxels, the least width of a plane that is fitted to a voxel's own points
 MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
 
@@ -38,7 +40,7 @@ class Voxels(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def insert(voxels, points, T, tick: float, alone: float):
-    """Add points (N, d), moved by T into the map's frame, and fit the voxels they fall into anew.
+    """Add points (N, d), moved by T into the map's frame, and fit the voxels anew that have grown by enough.
 
     alone : points from which on a voxel is fitted without its neighbours
     Room for N more voxels must be there. Returns the number of voxels touched.
@@ -55,7 +57,10 @@ def insert(voxels, points, T, tick: float, alone: float):
             touches += 1
         _accumulate(voxels, voxel, x, y, z)
     for k in range(touches):
-        _fit(voxels, touched[k], points.shape[1], alone, sums)
+        voxel = touched[k]
+        if voxels.moments[voxel, 0] >= _GROWN * voxels.cells[voxel, FITTED]:
+            _fit(voxels, voxel, points.shape[1], alone, sums)
+            voxels.cells[voxel, FITTED] = voxels.moments[voxel, 0]
     return touches
 
 

@@ -143,7 +143,7 @@ class Odometry:
         return best
 
     def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
-        """Whether the cost per point is far above what it used to be, and a share of what a point costs at most."""
+        """Whether the cost per point is far above what it used to be, and a share of the most it could be."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
