@@ -16,7 +16,11 @@ Optimiser = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-d
 
 
 class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is read from the log. Empty topics are found automatically."""
+    """What is read from the log. Empty topics are found automatically.
+
+    ``point_times`` is the unit of the per-point times, or the sense in which a lidar without any spins; it takes
+    ``revolution_s`` for a turn that begins, at the stamp, at the azimuth ``revolution_start_rad`` (π is the rear).
+    """
 
     topic: str = ""
     odometry_topic: str = ""
@@ -27,6 +31,9 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
     bad_scans: Literal["stop", "skip"] = "stop"
     min_range_m: NonNegative = 0.0
     max_range_m: Positive = float("inf")
+    point_times: Literal["auto", "none", "s", "ms", "us", "ns", "clockwise", "counterclockwise"] = "auto"
+    revolution_s: Positive = 0.1
+    revolution_start_rad: float = 3.141592653589793
     prefetch_chunks: Count = 4
 
 

@@ -21,6 +21,7 @@ from naive_logs import (
 from pipeline import lie
 from pipeline.config import LogConfig
 from pipeline.logs import open_log
+from pipeline.simulate import simulate
 
 
 def only_scan(folder, said, **config):
@@ -284,6 +285,52 @@ def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):
 
 def test_times_that_are_all_the_same_say_nothing_and_harm_nothing(tmp_path):
     assert len(times_of(tmp_path, "t", np.zeros(5), "<u4")) == 0
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_the_unit_of_times_can_be_set(tmp_path, unit, per_second):
+    rows = random_rows([*XYZ, ("t", "f8")], count=3)
+    rows["t"] = np.array([0.0, 0.002, 0.005]) * per_second
+    scan = cloud(tmp_path, rows, config={"point_times": unit})
+    np.testing.assert_allclose(scan.times_s, [0.0, 0.002, 0.005], atol=1e-7)
+
+
+def test_times_can_be_left_alone(tmp_path):
+    rows = random_rows([*XYZ, ("t", "f8")], count=3)
+    rows["t"] = [0.0, 0.05, 0.1]
+    assert len(cloud(tmp_path, rows, config={"point_times": "none"}).times_s) == 0
+
+
+@pytest.mark.parametrize(
+    ("sense", "start_rad", "expected_s"),
+    [
+        ("clockwise", np.pi, [0.1, 0.05, 0.15, 0.0]),
+        ("counterclockwise", np.pi, [0.1, 0.15, 0.05, 0.0]),
+        ("clockwise", 0.5 * np.pi, [0.05, 0.0, 0.1, 0.15]),
+    ],
+)
+def test_a_lidar_without_times_can_be_timed_by_its_azimuth(tmp_path, sense, start_rad, expected_s):
+    rows = np.array([(2, 0, 0), (0, 2, 1), (0, -2, 0), (-2, 0, 0)], dtype=XYZ)
+    config = {"point_times": sense, "revolution_s": 0.2, "revolution_start_rad": start_rad}
+    np.testing.assert_allclose(cloud(tmp_path, rows, config=config).times_s, expected_s, atol=1e-6)
+
+
+def test_the_azimuth_of_a_spinning_lidar_tells_its_times(tmp_path):
+    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
+    timed = next(iter(open_log(tmp_path / "town.mcap").scans()))
+    config = LogConfig(point_times="clockwise")
+    guessed = next(iter(open_log(tmp_path / "town.mcap", config).scans()))
+    assert np.median(np.abs(timed.times_s - guessed.times_s)) < 1e-3
+
+
+def test_what_was_assumed_of_the_times_is_told(tmp_path):
+    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
+    log = open_log(tmp_path / "town.mcap")
+    assert list(log.scans())
+    assert [note for note in log.notes if "field t (uint32) taken as ns after the stamp" in note]
+    log = open_log(tmp_path / "town.mcap", LogConfig(point_times="none"))
+    assert list(log.scans())
+    assert [note for note in log.notes if note.startswith("no point times")]
 
 
 # poses

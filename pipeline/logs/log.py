@@ -18,6 +18,7 @@ from pipeline.logs.laser_scan import LaserScanDecoder
 from pipeline.logs.limits import RangeLimits, Returns
 from pipeline.logs.mounting import find_mounting, in_plane, is_upside_down
 from pipeline.logs.point_cloud import PointCloudDecoder
+from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose, decode_odometry
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
@@ -104,8 +105,9 @@ class Log:
             ToldPoses(self.odometry_topic, self.ground_truth_topic),
             Tally(self.topic, self.odometry_topic),
         )
+        times = PointTimes(self.config)
         count, index, asked = 0, 0, perf_counter()
-        for message, T_odom_base in self._with_wheels(poses):
+        for message, T_odom_base in self._with_wheels(poses, times):
             count += 1
             if (count - 1) % self.config.every:
                 continue
@@ -122,7 +124,7 @@ class Log:
             asked = perf_counter()
         self._truth = poses.ground_truth()
         self.damage += [*tally.losses(), *poses.complaints()]
-        self.notes += tally.notes()
+        self.notes += [*([times.assumed] if self.dimension == 3 else []), *tally.notes()]
         if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
@@ -151,10 +153,10 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_wheels(self, poses: ToldPoses) -> Iterator[tuple[Decoded, Pose | None]]:
+    def _with_wheels(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the reading behind them."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        lidar = LaserScanDecoder(limits) if self.dimension == 2 else PointCloudDecoder(limits)
+        lidar = LaserScanDecoder(limits) if self.dimension == 2 else PointCloudDecoder(limits, times)
         topics = {topic for topic in (self.odometry_topic, self.ground_truth_topic) if topic}
         decoders = {self.topic: lidar.decode, **dict.fromkeys(topics, self._decode_pose)}
         waiting: deque[Decoded] = deque()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.kernels.point_cloud import keep_valid
 from pipeline.logs.cdr import CdrReader, MalformedMessageError
 from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
-from pipeline.logs.point_times import NAMES, seconds_after
+from pipeline.logs.point_times import NAMES, PointTimes
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64
@@ -73,8 +73,9 @@ class Layout(NamedTuple):
 class PointCloudDecoder:
     """Decodes clouds; the place of the fields is worked out once for each layout."""
 
-    def __init__(self, limits: RangeLimits) -> None:
+    def __init__(self, limits: RangeLimits, times: PointTimes) -> None:
         self.limits = limits
+        self.times = times
         self.layouts: dict[bytes, Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
@@ -87,7 +88,7 @@ class PointCloudDecoder:
         if layout is None:
             if len(self.layouts) >= _MOST_LAYOUTS:
                 self.layouts = {}
-            layout = self.layouts[message.described] = _layout(message)
+            layout = self.layouts[message.described] = _layout(message, self.times)
         return self._filter(message, layout, _rows(message, layout.point))
 
     def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
@@ -99,7 +100,10 @@ class PointCloudDecoder:
         times_s = NO_TIMES
         if layout.time:
             times = cloud[layout.time]
-            times_s = seconds_after(message.stamp_ns, times if count == len(cloud) else times[kept[:count]])
+            times = times if count == len(cloud) else times[kept[:count]]
+            times_s = self.times.from_field(layout.time, message.stamp_ns, times)
+        elif self.times.by_azimuth:
+            times_s = self.times.from_azimuth(points[:count])
         why = "" if count else _why_none(x, y, z)
         return Returns(message.stamp_ns, points[:count], times_s, len(cloud) - count, why)
 
@@ -112,10 +116,10 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _layout(message: PointCloudMessage) -> Layout:
+def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
     wanted: dict[str, tuple[str, int]] = {}
     for field in message.fields:
-        if field.name not in ("x", "y", "z", *NAMES):
+        if field.name not in ("x", "y", "z") and not times.wants(field.name):
             continue
         if field.datatype not in _FORMATS:
             raise MalformedMessageError(
