@@ -22,7 +22,7 @@ _ABSOLUTE_S = 3600.0  # absolute times are beyond
 class PointTimes:
     """Seconds after the stamp for the points of one scan after the other.
 
-    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that the first scan's values suggest.
+    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that the first scan suggests.
     ``assumed`` says in words what was done with the first scan that has times.
     """
 

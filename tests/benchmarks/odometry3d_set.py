@@ -33,6 +33,9 @@ from tests.benchmarks.contest import OURS, Run, default_methods, in_fresh_proces
 INDOORS = frozenset({"corridor", "staircase", "hall"})  # where others' settings for indoors are taken
 SHORT_PATH_M, LOST_SHARE, LOST_M = 20.0, 0.05, 2.0
 SEED = 1
+LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
+PLACES = [name for name, world in WORLDS.items() if world.sensor in LIDARS]
+CACHE = Path(tempfile.gettempdir()) / "scanchain_odometry3d"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,13 +148,11 @@ def _version() -> str:
 
 
 def main() -> None:
-    lidars = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
-    places = [name for name, world in WORLDS.items() if world.sensor in lidars]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", default=",".join(places), help="default: %(default)s")
-    parser.add_argument("--sensors", default=",".join(lidars), help="default: %(default)s")
+    parser.add_argument("--worlds", default=",".join(PLACES), help="default: %(default)s")
+    parser.add_argument("--sensors", default=",".join(LIDARS), help="default: %(default)s")
     parser.add_argument("--scans", type=int, default=300, help="at most, default: %(default)s")
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "scanchain_odometry3d")
+    parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--methods", help="ours first; genz-icp stands for its settings for the place")
     arguments = parser.parse_args()
     chosen = arguments.methods.split(",") if arguments.methods else default_methods(Path("log"), indoor=False)
