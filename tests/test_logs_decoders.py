@@ -5,6 +5,8 @@ import pytest
 from naive_logs import (
     SECOND,
     STAMP_NS,
+    Cdr,
+    Said,
     cloud_said,
     laser_points,
     laser_scan,
@@ -334,6 +336,24 @@ def test_what_was_assumed_of_the_times_is_told(tmp_path):
 
 
 # poses
+
+
+@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped"])
+def test_stamped_poses_lead_where_they_are_asked_for(tmp_path, kind):
+    """Of the robot's base: the static transform from base_link says where the lidar is."""
+    pose = bytes(Cdr("<").header(STAMP_NS, "map").pose(3.0, 4.0, 0.5, 6.0).put("d", *[0.0] * 36))
+    said = [
+        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1))),
+        Said("/gps", f"geometry_msgs/msg/{kind}", STAMP_NS, pose),
+        cloud_said(STAMP_NS, point_cloud(STAMP_NS, random_rows(XYZ))),
+    ]
+    path = write(tmp_path / "a.mcap", said)
+    assert open_log(path).odometry_topic == ""
+    log = open_log(path, LogConfig(odometry_topic="/gps", ground_truth_topic="/gps"))
+    (scan,) = log.scans()
+    np.testing.assert_allclose(scan.T_odom_base[:3, 3], [3.0, 4.0, 6.0])
+    np.testing.assert_allclose(log.ground_truth().poses[0], scan.T_odom_base)
+    assert log.T_base_lidar[0, 3] == 1.0 and log.T_base_lidar[1, 3] == 2.0
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -19,13 +20,13 @@ from pipeline.logs.limits import RangeLimits, Returns
 from pipeline.logs.mounting import find_mounting, in_plane, is_upside_down
 from pipeline.logs.point_cloud import PointCloudDecoder
 from pipeline.logs.point_times import PointTimes
-from pipeline.logs.poses import StampedPose, decode_odometry
+from pipeline.logs.poses import decode_odometry, decode_pose
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
-from pipeline.logs.topics import LASER_SCAN, find_ground_truth, find_lidar, find_odometry, kind
+from pipeline.logs.topics import LASER_SCAN, ODOMETRY, find_ground_truth, find_lidar, find_odometry, kind
 from pipeline.logs.wheels import WheelTrack
 
 _DEFAULTS = LogConfig()
@@ -85,6 +86,13 @@ class Log:
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.damage: list[str] = [line for index in indexes for line in index.damage]
+        self.pose_decoders: Decoders = {
+            channel.topic: partial(
+                decode_odometry if kind(channel) == ODOMETRY else decode_pose, dimension=self.dimension
+            )
+            for channel in (wheels, truth)
+            if channel is not None
+        }
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -148,7 +156,8 @@ class Log:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         if self._truth is None and self.ground_truth_topic:
             poses = ToldPoses("", self.ground_truth_topic)
-            for message in self._messages({self.ground_truth_topic: self._decode_pose}, []):
+            decoder = self.pose_decoders[self.ground_truth_topic]
+            for message in self._messages({self.ground_truth_topic: decoder}, []):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
@@ -157,8 +166,7 @@ class Log:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the reading behind them."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         lidar = LaserScanDecoder(limits) if self.dimension == 2 else PointCloudDecoder(limits, times)
-        topics = {topic for topic in (self.odometry_topic, self.ground_truth_topic) if topic}
-        decoders = {self.topic: lidar.decode, **dict.fromkeys(topics, self._decode_pose)}
+        decoders = {self.topic: lidar.decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         for message in self._messages(decoders, self.damage):
             if message.channel.topic == self.topic:
@@ -179,9 +187,6 @@ class Log:
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
         ahead = self.config.prefetch_chunks
         return decoded_messages(self.indexes, decoders, self.span, ahead=ahead, damage=damage)
-
-    def _decode_pose(self, data: memoryview) -> StampedPose:
-        return decode_odometry(data, self.dimension)
 
     def _complaint(self, message: Decoded, number: int) -> str:
         """What is wrong with a scan, empty where it is good."""

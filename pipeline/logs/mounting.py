@@ -13,7 +13,7 @@ from pipeline.logs.cdr import CdrReader, MalformedMessageError
 from pipeline.logs.counting import messages_of
 from pipeline.logs.poses import StampedPose, chain, decode_odometry, decode_transforms
 from pipeline.logs.records import Channel, FileIndex
-from pipeline.logs.topics import TRANSFORMS, is_readable, kind, topics_of
+from pipeline.logs.topics import ODOMETRY, TRANSFORMS, is_readable, kind, topics_of
 
 T = TypeVar("T")
 
@@ -28,7 +28,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         return np.eye(4)
     lidar_frame = next(_first(indexes, lidar.topic, lambda data: CdrReader(data).header()[1]), "")
     base_frame = ""
-    if wheels is not None:
+    if wheels is not None and kind(wheels) == ODOMETRY:
         base_frame = next(_first(indexes, wheels.topic, lambda data: decode_odometry(data).child), "")
     for base in (base_frame, *_BASE_FRAMES) if base_frame else _BASE_FRAMES:
         T_base_lidar = chain(transforms, base, lidar_frame)

@@ -1,4 +1,4 @@
-"""nav_msgs/Odometry and tf2_msgs/TFMessage to poses."""
+"""nav_msgs/Odometry, stamped poses and tf2_msgs/TFMessage to poses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_TRANSFORMS = 65536
 
 
 class StampedPose(NamedTuple):
-    """A pose of ``child`` in ``parent`` at an instant, (4, 4), or (3, 3) for a planar log."""
+    """A pose of ``child``, empty where it is not named, in ``parent``; (4, 4), or (3, 3) for a planar log."""
 
     stamp_ns: int
     parent: str
@@ -30,6 +30,13 @@ def decode_odometry(data: memoryview, dimension: int = 3) -> StampedPose:
     stamp_ns, parent = reader.header()
     child = reader.string()
     return StampedPose(stamp_ns, parent, child, _pose(reader, dimension))
+
+
+def decode_pose(data: memoryview, dimension: int = 3) -> StampedPose:
+    """A geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
+    reader = CdrReader(data)
+    stamp_ns, parent = reader.header()
+    return StampedPose(stamp_ns, parent, "", _pose(reader, dimension))
 
 
 def decode_transforms(data: memoryview) -> list[StampedPose]:

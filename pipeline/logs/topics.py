@@ -9,6 +9,7 @@ from pipeline.logs.records import Channel, FileIndex
 
 LASER_SCAN, POINT_CLOUD = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2"
 ODOMETRY, TRANSFORMS = "nav_msgs/Odometry", "tf2_msgs/TFMessage"
+POSES = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")  # taken where asked for by name
 
 
 def kind(channel: Channel) -> str:
@@ -58,10 +59,10 @@ def find_odometry(
     indexes: Sequence[FileIndex], wanted: str, ground_truth: str, notes: list[str]
 ) -> Channel | None:
     """The wheel odometry's channel: the topic asked for, else the only one apart from the ground truth."""
-    channels = [channel for channel in topics_of(indexes).values() if _is_odometry(channel)]
     if wanted:
-        return _chosen(indexes, channels, wanted, "log.odometry_topic")
-    found = [channel for channel in channels if channel.topic != ground_truth]
+        return _chosen(indexes, wanted, "log.odometry_topic")
+    channels = [channel for channel in topics_of(indexes).values() if kind(channel) == ODOMETRY]
+    found = [channel for channel in channels if is_readable(channel) and channel.topic != ground_truth]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
@@ -71,27 +72,29 @@ def find_odometry(
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -> Channel | None:
     """The ground truth's channel; only a topic that is not the default one must be there."""
-    channels = [channel for channel in topics_of(indexes).values() if _is_odometry(channel)]
-    if wanted == default and all(channel.topic != wanted for channel in channels):
+    if wanted == default and not any(channel.topic == wanted for channel in _with_poses(indexes)):
         return None
-    return _chosen(indexes, channels, wanted, "log.ground_truth_topic")
+    return _chosen(indexes, wanted, "log.ground_truth_topic")
 
 
-def _chosen(indexes: Sequence[FileIndex], channels: Sequence[Channel], wanted: str, key: str) -> Channel:
+def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
+    channels = _with_poses(indexes)
     for channel in channels:
         if channel.topic == wanted:
             return channel
     raise InputError(
-        f"{indexes[0].path}: {key} {wanted} is no {ODOMETRY} topic of the log; these are: {_listed(channels)}"
+        f"{indexes[0].path}: {key} {wanted} is no {ODOMETRY} topic of the log, nor one of stamped poses; "
+        f"these are: {_listed(channels)}"
     )
+
+
+def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
+    channels = topics_of(indexes).values()
+    return [channel for channel in channels if is_readable(channel) and kind(channel) in (ODOMETRY, *POSES)]
 
 
 def _is_lidar(channel: Channel) -> bool:
     return is_readable(channel) and kind(channel) in (LASER_SCAN, POINT_CLOUD)
-
-
-def _is_odometry(channel: Channel) -> bool:
-    return is_readable(channel) and kind(channel) == ODOMETRY
 
 
 def _listed(channels: Iterable[Channel]) -> str:
