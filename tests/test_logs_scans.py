@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
 from pipeline.logs.log import index_files
+from pipeline.simulate import simulate
 
 
 def read(*paths, **config):
@@ -183,6 +185,24 @@ def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
     next(iterator)
     iterator.close()
     assert 1 <= len(opened) <= 12
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux to say what is in memory")
+def test_what_has_been_read_of_a_file_does_not_stay_in_memory(tmp_path):
+    path = tmp_path / "town.mcap"
+    simulate("town", path, duration_s=2.0, sensor="os1-32")
+    log = open_log(path)
+    assert sum(1 for _ in log.scans()) == 20
+    assert resident_bytes(path) < 0.2 * path.stat().st_size
+
+
+def resident_bytes(path):
+    """Of the file's mapping into this process."""
+    lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+    for line in lines:
+        if line.endswith(str(path)):
+            return 1024 * next(int(entry.split()[1]) for entry in lines if entry.startswith("Rss:"))
+    raise AssertionError(f"{path} is not mapped")
 
 
 def test_bad_scans_are_left_out_and_counted_if_asked(tmp_path):

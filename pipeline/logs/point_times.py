@@ -20,10 +20,10 @@ _ABSOLUTE_S = 3600.0  # absolute times are beyond
 
 
 class PointTimes:
-    """Seconds after the stamp for the points of one scan after the other.
+    """Seconds after the stamp for the points of scans, in any order and from any thread.
 
-    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that the first scan suggests.
-    ``assumed`` says in words what was done with the first scan that has times.
+    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
+    ``assumed`` says in words what was done with one of the first scans that have times.
     """
 
     def __init__(self, config: LogConfig) -> None:
@@ -63,8 +63,8 @@ class PointTimes:
         span = float(raw.max() - first)
         if span == 0.0:  # as where a float32 holds an absolute time
             return NO_TIMES
-        self.unit = self.unit or _likely_unit(span, is_whole=is_whole)
-        unit_s = _UNITS_S[self.unit]
+        unit = self.unit or _likely_unit(span, is_whole=is_whole)
+        unit_s = _UNITS_S[unit]
         per_second = round(1.0 / unit_s)
         stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
         origin = "after the stamp"
@@ -73,8 +73,8 @@ class PointTimes:
         elif abs(float(first)) * unit_s > _NEAR_S:
             raw, origin = raw - first, "of another clock, counted from the first point"
         if self.assumed == _NONE:
-            taken = f"field {name} ({values.dtype.name}) taken as {self.unit} {origin}"
-            self.assumed = f"point times: {taken}, {1e3 * span * unit_s:.1f} ms a scan (log.point_times)"
+            taken = f"field {name} ({values.dtype.name}) taken as {unit} {origin}"
+            self.assumed = f"point times: {taken} (log.point_times)"
         return (raw * unit_s).astype(np.float32)
 
 

@@ -9,7 +9,7 @@ from heapq import heappop, heappush
 from itertools import pairwise
 from typing import NamedTuple
 
-from pipeline.logs.blocks import DamagedBlockError, read_block
+from pipeline.logs.blocks import DamagedBlockError, read_block, release
 from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.limits import Returns
 from pipeline.logs.poses import StampedPose
@@ -43,11 +43,13 @@ def decoded_messages(
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
         contents = read_block(indexes[block.file], block, wanted[block.file])
-        return [
+        decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message.data))
             for message in contents.messages
             if span.begin_ns <= message.log_time_ns <= span.end_ns
-        ], contents.damage
+        ]
+        release(indexes[block.file], block)
+        return decoded, contents.damage
 
     blocks = [
         block
