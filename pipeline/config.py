@@ -90,8 +90,8 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """How the motion is predicted, how far off the prediction may be, and when a keyframe is made.
 
-    ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as a
-    rule is learnt while running.
+    ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as
+    a rule is learnt while running.
     """
 
     prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
