@@ -110,11 +110,22 @@ def log(T: Pose) -> NDArray[np.float64]:
     return _log_se2(T) if T.shape[-1] == 3 else _log_se3(T)
 
 
+def twist_size(T: Pose) -> int:
+    """Entries of the twists of a pose, k: 3 in the plane, 6 in space."""
+    return 3 if T.shape[-1] == 3 else 6
+
+
+def by_component(k: int, metres: float, radians: float) -> NDArray[np.float64]:
+    """One number for every entry of a twist (k,): that of lengths, then that of angles."""
+    d = 2 if k == 3 else 3
+    return np.array([metres] * d + [radians] * (k - d))
+
+
 def adjoint(T: Pose) -> Matrix:
     """Ad with T exp(ξ) T⁻¹ = exp(Ad ξ); (..., k, k)."""
     d = T.shape[-1] - 1
     R, t = T[..., :d, :d], T[..., :d, d]
-    k = 3 if d == 2 else 6
+    k = twist_size(T)
     result = np.zeros((*T.shape[:-2], k, k))
     result[..., :d, :d] = R
     if d == 2:

@@ -216,9 +216,7 @@ def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:
 
     Residuals share the map's errors and are far from independent, so that H alone promises too much.
     """
-    d = match.T_target_source.shape[0] - 1
-    k = len(match.information)
-    floor = np.array([sigma_m**2] * d + [sigma_rad**2] * (k - d))
+    floor = lie.by_component(len(match.information), sigma_m, sigma_rad) ** 2
     covariance = np.linalg.inv(match.information + np.diag(1e-6 / floor)) + np.diag(floor)
     information = np.linalg.inv(covariance)
     return 0.5 * (information + information.T)

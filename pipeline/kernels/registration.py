@@ -25,12 +25,14 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 class Terms(NamedTuple):
     """What an alignment runs under; the kernel's scale shrinks from first_scale_m to scale_m.
 
+    range_m : root mean square of the points' ranges
     variance : of a range, σ² in m²
     """
 
     optimiser: int
     max_iterations: int
     reach: int
+    range_m: float
     max_distance_m: float
     first_scale_m: float
     scale_m: float
@@ -101,7 +103,7 @@ def align(voxels, points, T, away, prior, terms):
     x, factor = np.zeros(k), np.zeros((k, k))
     now.sums[DAMPING] = _FIRST_DAMPING
     scale_m, last_scale_m, settled = terms.first_scale_m, 0.0, 0
-    moved_m, range_m = np.inf, _root_mean_square_range(points)
+    moved_m = np.inf
     pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
     while iterations < terms.max_iterations:
         iterations += 1
@@ -122,7 +124,7 @@ def align(voxels, points, T, away, prior, terms):
                 ending = CONVERGED
                 break
             settled += 1
-        moved_m += _largest_move(x, range_m)
+        moved_m += _largest_move(x, terms.range_m)
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
     cost = now.sums[COST] - 0.5 * now.away @ prior @ now.away + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
@@ -195,30 +197,22 @@ def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
-def _root_mean_square_range(points) -> float:
-    squares = 0.0
-    for i in range(points.shape[0]):
-        for axis in range(points.shape[1]):
-            squares += points[i, axis] * points[i, axis]
-    return np.sqrt(squares / max(points.shape[0], 1))
-
-
 @njit(cache=True, inline="always")
 def _largest_move(x, range_m: float) -> float:
     """How far a step x moves a point at that range, at most; metres."""
-    d = 2 if x.shape[0] == 3 else 3
-    shift = turn = 0.0
-    for i in range(x.shape[0]):
-        if i < d:
-            shift += x[i] * x[i]
-        else:
-            turn += x[i] * x[i]
+    shift, turn = _squares(x)
     return np.sqrt(shift) + np.sqrt(turn) * range_m
 
 
 @njit(cache=True, inline="always")
 def _is_small(x, terms) -> bool:
+    shift, turn = _squares(x)
+    return shift < terms.tolerance_m**2 and turn < terms.tolerance_rad**2
+
+
+@njit(cache=True, inline="always")
+def _squares(x):
+    """Squared length of the shift and of the turn in a step x (k,)."""
     d = 2 if x.shape[0] == 3 else 3
     shift = turn = 0.0
     for i in range(x.shape[0]):
@@ -226,4 +220,4 @@ def _is_small(x, terms) -> bool:
             shift += x[i] * x[i]
         else:
             turn += x[i] * x[i]
-    return shift < terms.tolerance_m**2 and turn < terms.tolerance_rad**2
+    return shift, turn

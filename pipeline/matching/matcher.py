@@ -54,27 +54,28 @@ class PointToShapeMatcher:
         prior : what the pose is expected to be, and how surely; its doubt sets the first scale of the kernel
         wide : search far, for a first pose that is little more than a guess
         """
-        information, away, doubt_m = np.zeros((k_of(T_first),) * 2), np.zeros(k_of(T_first)), 0.0
+        k, range_m = lie.twist_size(T_first), root_mean_square_range(points)
+        information, away, doubt_m = np.zeros((k, k)), np.zeros(k), 0.0
         if prior is not None:
             information = turned(np.diag(prior.widest**-2.0), T_first) * self.config.sensor_noise_m**2
             away = twist_between(prior.T_target_source, T_first)
-            doubt_m = doubt_of(prior, points)
-        terms = terms_of(self.config, target, wide, doubt_m)
+            doubt_m = doubt_of(prior, range_m)
+        terms = terms_of(self.config, target, wide, range_m, doubt_m)
         T = T_first.copy()
         outcome = align(target.voxels, points, T, away, information, terms)
-        spectrum = spectrum_of(outcome, points)
+        spectrum = spectrum_of(outcome, range_m)
         if spectrum.values[0] < _WEAK * self.config.min_information:
             expected = information if prior is None else turned(prior.information, T_first) * terms.variance
             anchor = hold(spectrum, outcome.weights, expected, self.config.min_information)
             T = T_first.copy()
             outcome = align(target.voxels, points, T, away, information + anchor, terms)
-            spectrum = spectrum_of(outcome, points)
+            spectrum = spectrum_of(outcome, range_m)
         return judge(T, T_first, outcome, spectrum, len(points), self.config.sensor_noise_m)
 
 
-def k_of(T: Pose) -> int:
-    """Entries of a twist: 3 in the plane, 6 in space."""
-    return 3 if len(T) == 3 else 6
+def root_mean_square_range(points: Points) -> float:
+    """Of points (N, d) as the lidar sees them; metres."""
+    return math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1))
 
 
 def turned(information: Matrix, T: Pose) -> Matrix:
@@ -93,21 +94,21 @@ def twist_between(T_from: Pose, T_to: Pose) -> NDArray[np.float64]:
     return lie.log(b @ lie.inverse(a))
 
 
-def doubt_of(prior: Prior, points: Points) -> float:
-    """How far a point may be from where the prior expects it: one standard deviation, metres."""
-    d = points.shape[1]
+def doubt_of(prior: Prior, range_m: float) -> float:
+    """How far a point at that range may be from where the prior expects it: one standard deviation, metres."""
+    d = len(prior.T_target_source) - 1
     variances = prior.covariance.diagonal()
-    square_range = np.einsum("ij,ij->", points, points) / max(len(points), 1)
-    return math.sqrt(variances[:d].mean() + square_range * variances[d:].mean())
+    return math.sqrt(variances[:d].mean() + range_m * range_m * variances[d:].mean())
 
 
-def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool, doubt_m: float = 0.0) -> Terms:
+def terms_of(config: MatchingConfig, target: VoxelMap, wide: bool, range_m: float, doubt_m: float = 0.0) -> Terms:
     """The numbers a kernel runs under; doubt_m is how far off points may be, one standard deviation."""
     first_scale_m = min(max(config.kernel_scale_m, _DOUBTS * doubt_m), config.wide_kernel_scale_m)
     return Terms(
         optimiser=OPTIMISERS[config.optimiser],
         max_iterations=config.max_iterations,
         reach=config.wide_reach_voxels if wide else config.reach_voxels,
+        range_m=range_m,
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
         first_scale_m=config.wide_kernel_scale_m if wide else first_scale_m,
         scale_m=config.kernel_scale_m,
@@ -131,11 +132,11 @@ class Spectrum(NamedTuple):
     vectors: Matrix
 
 
-def spectrum_of(outcome: Outcome, points: Points) -> Spectrum:
-    """The spectrum of an outcome's information."""
-    d = points.shape[1]
-    scale = np.ones(len(outcome.H))
-    scale[d:] = 1.0 / max(math.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)), 1e-9)
+def spectrum_of(outcome: Outcome, range_m: float) -> Spectrum:
+    """The spectrum of an outcome's information, of points with this root mean square range."""
+    k = len(outcome.H)
+    scale = np.ones(k)
+    scale[2 if k == 3 else 3 :] = 1.0 / max(range_m, 1e-9)
     evened = outcome.H * (scale * scale[:, None] / max(outcome.weights, 1e-300))
     return Spectrum(scale, *np.linalg.eigh(evened))
 

@@ -12,7 +12,7 @@ from pipeline.kernels import registration
 from pipeline.kernels.association import associate
 from pipeline.kernels.cross_covariance import weighted_pairs
 from pipeline.kernels.registration import SHRINK, Outcome
-from pipeline.matching.matcher import judge, spectrum_of, terms_of
+from pipeline.matching.matcher import judge, root_mean_square_range, spectrum_of, terms_of
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.voxel_map import VoxelMap
 
@@ -31,7 +31,8 @@ class SvdMatcher:
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """
         del prior
-        terms = terms_of(self.config, target, wide)
+        range_m = root_mean_square_range(points)
+        terms = terms_of(self.config, target, wide, range_m)
         T, scale_m = T_first.copy(), terms.first_scale_m
         partner = np.empty(len(points), np.int32)
         source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
@@ -53,7 +54,7 @@ class SvdMatcher:
         outcome = self._outcome(
             T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
         )
-        return judge(T, T, outcome, spectrum_of(outcome, points), len(points), self.config.sensor_noise_m)
+        return judge(T, T, outcome, spectrum_of(outcome, range_m), len(points), self.config.sensor_noise_m)
 
     def _stands_still(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]

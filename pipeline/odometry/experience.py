@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import lie
+
 _MEMORY = 0.9  # of the squared errors, per scan
 _SUDDEN = 0.25  # share of the last squared error that counts at once
 _KNOWN = 5  # errors, before which they tell too little
@@ -18,8 +20,7 @@ class Experience:
     def __init__(self, first_sigma: NDArray[np.float64]) -> None:
         """first_sigma : (k,) standard deviations to go by until errors are known, and the most there may be."""
         self.first_sigma = first_sigma
-        d = 2 if len(first_sigma) == 3 else 3
-        self.least = np.array([_LEAST_M] * d + [_LEAST_RAD] * (len(first_sigma) - d)) ** 2
+        self.least = lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2
         self.squares = np.zeros(len(first_sigma))
         self.count = 0
 

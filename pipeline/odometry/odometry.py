@@ -48,7 +48,7 @@ class Odometry:
         started = perf_counter()
         sweep, sparse = self.resolution.look(scan)
         if self.resolution.scale != self.local_map.scale:
-            self._rescale()
+            self._remake_map()
         if not len(sparse.points) and not len(self.local_map):
             raise InputError(
                 f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
@@ -111,10 +111,9 @@ class Odometry:
         """Make the map anew of the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
         T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
         self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
-        self.local_map = VoxelMap(self.dimension, self.config.local_map, self.resolution.scale)
-        self.local_map.insert(self.first_points, lie.identity(self.dimension))
         self.recent.clear()
         self.recent.append((self.first_points, lie.identity(self.dimension)))
+        self._remake_map()
         self.predictor.place(T_odom_middle)
         return T_odom_middle
 
@@ -198,8 +197,8 @@ class Odometry:
         self.recent.append((points, T_odom_lidar))
         self.T_odom_inserted = T_odom_lidar
 
-    def _rescale(self) -> None:
-        """Make the map anew, with voxels of another size, of the last scans."""
+    def _remake_map(self) -> None:
+        """Make the map anew of the last scans, with voxels of the present size."""
         self.local_map = VoxelMap(self.dimension, self.config.local_map, self.resolution.scale)
         for points, T_odom_lidar in self.recent:
             self.local_map.insert(points, T_odom_lidar)

@@ -61,11 +61,12 @@ class Predictor:
         self.T_base_lidar = T_base_lidar
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
-        self.velocity = np.zeros(3 if len(T_base_lidar) == 3 else 6)
-        self.any_motion = np.diag(self._sigmas(config.velocity_sigma_m, config.velocity_sigma_rad) ** 2)
+        k = lie.twist_size(T_base_lidar)
+        self.velocity = np.zeros(k)
+        self.by_velocity = Experience(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
+        self.by_wheels = Experience(lie.by_component(k, config.wheel_sigma_m, config.wheel_sigma_rad))
+        self.any_motion = np.diag(self.by_velocity.first_sigma**2)
         self.motion_covariance = self.any_motion
-        self.by_velocity = Experience(self._sigmas(config.velocity_sigma_m, config.velocity_sigma_rad))
-        self.by_wheels = Experience(self._sigmas(config.wheel_sigma_m, config.wheel_sigma_rad))
         self.interval_s = 0.0
         self.usual_s = 0.0
         self.last_scan: Scan | None = None
@@ -131,11 +132,10 @@ class Predictor:
         interval_s = self.interval_to(scan)
         if interval_s <= 0.0:
             return self.velocity
-        mean = lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar) / interval_s
+        mean = self._motion_to(T_odom_lidar) / interval_s
         if not 0.0 < interval_s < _EVEN * self.interval_s < _EVEN**2 * interval_s:
             return mean
-        before = lie.log(self.T_previous_current) / self.interval_s
-        return mean + interval_s / (interval_s + self.interval_s) * (mean - before)
+        return mean + interval_s / (interval_s + self.interval_s) * (mean - self._velocity_before())
 
     def deskewing_error(self, scan: Scan, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) by how much a scan of this duration is off after deskewing at constant velocity, about.
@@ -146,9 +146,16 @@ class Predictor:
         interval_s = self.interval_to(scan)
         if interval_s <= 0.0 or self.is_new:
             return np.zeros(len(self.velocity))
-        mean = lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar) / interval_s
-        before = lie.log(self.T_previous_current) / self.interval_s
-        return (mean - before) / interval_s * duration_s**2 / 24.0
+        mean = self._motion_to(T_odom_lidar) / interval_s
+        return (mean - self._velocity_before()) / interval_s * duration_s**2 / 24.0
+
+    def _motion_to(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
+        """Twist (k,) from the last pose."""
+        return lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar)
+
+    def _velocity_before(self) -> NDArray[np.float64]:
+        """Mean twist (k,) per second between the last two poses."""
+        return lie.log(self.T_previous_current) / self.interval_s
 
     def interval_to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
@@ -191,10 +198,6 @@ class Predictor:
                 )
             return None
         return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
-
-    def _sigmas(self, sigma_m: float, sigma_rad: float) -> NDArray[np.float64]:
-        d = self.T_odom_lidar.shape[0] - 1
-        return np.array([sigma_m] * d + [sigma_rad] * (1 if d == 2 else 3))
 
 
 def _are_alike(a: float, b: float) -> bool:

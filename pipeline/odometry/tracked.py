@@ -35,7 +35,7 @@ class Tracked:
 
 def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> Match:
     """What stands for a match where there is no map yet: the frame starts at this scan."""
-    k = 3 if len(T_odom_lidar) == 3 else 6
+    k = lie.twist_size(T_odom_lidar)
     return Match(
         T_target_source=T_odom_lidar,
         information=np.diag(np.full(k, len(points) / config.sensor_noise_m**2)),

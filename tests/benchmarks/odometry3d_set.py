@@ -147,12 +147,18 @@ def _version() -> str:
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """A command line that chooses among the simulated sequences."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default=",".join(PLACES), help="default: %(default)s")
     parser.add_argument("--sensors", default=",".join(LIDARS), help="default: %(default)s")
     parser.add_argument("--scans", type=int, default=300, help="at most, default: %(default)s")
     parser.add_argument("--cache", type=Path, default=CACHE)
+    return parser
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
     parser.add_argument("--methods", help="ours first; genz-icp stands for its settings for the place")
     arguments = parser.parse_args()
     chosen = arguments.methods.split(",") if arguments.methods else default_methods(Path("log"), indoor=False)

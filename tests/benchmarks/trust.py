@@ -15,7 +15,6 @@ Worlds, sensors and cache are those of tests.benchmarks.odometry3d_set; the odom
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from pipeline.odometry import Odometry, Tracked
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import Drive, plan
 from pipeline.simulate.information import information, spectrum
-from tests.benchmarks.odometry3d_set import CACHE, LIDARS, PLACES, SEED, log_of
+from tests.benchmarks.odometry3d_set import SEED, log_of, parser_of
 
 BLIND_SHARE, SOUND_SHARE = 1e-6, 1e-3  # of the returns that speak about the worst direction
 WARM_UP_SCANS = 3
@@ -94,12 +93,7 @@ def _angle_deg(named: NDArray[np.float64], blind: Matrix, H: Matrix) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", default=",".join(PLACES), help="default: %(default)s")
-    parser.add_argument("--sensors", default=",".join(LIDARS), help="default: %(default)s")
-    parser.add_argument("--scans", type=int, default=300, help="at most, default: %(default)s")
-    parser.add_argument("--cache", type=Path, default=CACHE)
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__).parse_args()
     print(f"{'sequence':22}{'NEES/6':>8}{'blind':>8}{'flagged':>22}{'sound':>8}{'wrongly':>10}")
     for world in arguments.worlds.split(","):
         for sensor in arguments.sensors.split(","):
