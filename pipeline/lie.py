@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix, Pose
-from pipeline.kernels import pose_log
+from pipeline.kernels import pose_log, poses
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
@@ -23,14 +23,10 @@ def identity(dimension: int) -> Pose:
 
 def inverse(T: Pose) -> Pose:
     """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1]."""
+    if T.ndim == 2:
+        return poses.inverse(np.ascontiguousarray(T, np.float64))
     d = T.shape[-1] - 1
     result = np.zeros(T.shape)
-    if T.ndim == 2:
-        R_t = T[:d, :d].T
-        result[:d, :d] = R_t
-        result[:d, d] = -(R_t @ T[:d, d])
-        result[d, d] = 1.0
-        return result
     R_t = np.swapaxes(T[..., :d, :d], -1, -2)
     result[..., :d, :d] = R_t
     result[..., :d, d] = -(R_t @ T[..., :d, d, None])[..., 0]
@@ -123,6 +119,8 @@ def by_component(k: int, metres: float, radians: float) -> NDArray[np.float64]:
 
 def adjoint(T: Pose) -> Matrix:
     """Ad with T exp(ξ) T⁻¹ = exp(Ad ξ); (..., k, k)."""
+    if T.ndim == 2:
+        return poses.adjoint(np.ascontiguousarray(T, np.float64))
     d = T.shape[-1] - 1
     R, t = T[..., :d, :d], T[..., :d, d]
     k = twist_size(T)
@@ -180,6 +178,8 @@ def _exp_se2(twist: NDArray[np.float64]) -> Pose:
 
 
 def _log_se2(T: Pose) -> NDArray[np.float64]:
+    if T.ndim == 2:
+        return poses.twist_2d(np.ascontiguousarray(T, np.float64))
     theta = yaw(T)
     half = 0.5 * theta
     small = np.abs(theta) < _SMALL

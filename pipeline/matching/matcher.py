@@ -58,7 +58,8 @@ class PointToShapeMatcher:
         information, away, doubt_m = np.zeros((k, k)), np.zeros(k), 0.0
         if prior is not None:
             information = turned(np.diag(prior.widest**-2.0), T_first) * self.config.sensor_noise_m**2
-            away = twist_between(prior.T_target_source, T_first)
+            if prior.T_target_source is not T_first:
+                away = twist_between(prior.T_target_source, T_first)
             doubt_m = doubt_of(prior, range_m)
         terms = terms_of(self.config, target, wide, range_m, doubt_m)
         T = T_first.copy()

@@ -102,7 +102,7 @@ class Predictor:
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         self.motion_covariance = self.any_motion
         if state is not State.LOST:
-            self.motion_covariance = np.linalg.inv(prediction.prior.information + match.information)
+            self.motion_covariance = prediction.prior.informed(match.information)
         if state is State.OK and not prediction.is_guess and not self.is_new:
             prediction.experience.learn(lie.log(lie.inverse(prediction.T_odom_lidar) @ T_odom_lidar))
         if self.last_scan is not None:

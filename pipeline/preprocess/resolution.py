@@ -12,6 +12,7 @@ from pipeline.preprocess.sweep import Sweep, sweep_of
 
 _HYSTERESIS = 0.75  # powers of two between the present scale and the wanted one, from which on it changes
 _STEP = 2.0  # by which the voxels of matching shrink or grow from one scan to the next, at most
+_LOOKS = 8  # at the first scan, at most
 _ENOUGH = 0.9  # a change to more than this share is not worth it: the choice of points would dance
 
 
@@ -31,7 +32,7 @@ class Resolution:
         self.voxel_size_m = voxel_size_m
         self.scale = 1.0
         self.match_voxel_m = config.match_voxel_m
-        self.is_new = True
+        self.looks = _LOOKS
         self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
 
     def look(self, scan: Scan) -> tuple[Sweep, Sweep]:
@@ -39,13 +40,13 @@ class Resolution:
 
         What is found decides about the next scan; the first one is looked at again until all fits.
         """
-        while True:
-            sweep = sweep_of(scan, self.config, self.scale)
-            sparse = sweep.thinned(self.match_voxel_m)
-            fits = self.is_fixed or not len(sparse.points) or self._fit(sparse.points)
-            if fits or not self.is_new:
-                self.is_new = self.is_new and not len(sparse.points)
-                return sweep, sparse
+        sweep = sweep_of(scan, self.config, self.scale)
+        is_thin = self.match_voxel_m <= self.scale * self.config.map_voxel_m
+        sparse = sweep if is_thin else sweep.thinned(self.match_voxel_m)
+        if self.is_fixed or not len(sparse.points):
+            return sweep, sparse
+        self.looks = 0 if self._fit(sparse.points) else self.looks - 1
+        return self.look(scan) if self.looks > 0 else (sweep, sparse)
 
     def _fit(self, points: Points) -> bool:
         """Adapt the sizes to what was matched; whether they were right."""
