@@ -78,8 +78,6 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     wide_reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 2
     wide_max_distance_m: Positive = 3.0
     wide_kernel_scale_m: Positive = 2.0
-    seed_half_width_m: Positive = 0.5
-    seed_half_width_rad: Positive = 0.6
     tolerance_m: Positive = 1e-3
     tolerance_rad: Positive = 1e-4
     sensor_noise_m: Positive = 0.03
@@ -91,7 +89,8 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """How the motion is predicted, how far off the prediction may be, and when a keyframe is made.
 
     ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as
-    a rule is learnt while running.
+    a rule is learnt while running. ``max_speed`` and ``max_turn`` are how far a planar scan that fits badly is
+    looked for, per second since the last one.
     """
 
     prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
@@ -99,6 +98,8 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     wheel_sigma_rad: Positive = 0.05
     velocity_sigma_m: Positive = 0.5
     velocity_sigma_rad: Positive = 0.2
+    max_speed_m_s: Positive = 1.5
+    max_turn_rad_s: Positive = 2.0
     keyframe_distance_m: Positive = 2.0
     keyframe_angle_rad: Positive = 0.35
     edge_sigma_m: Positive = 0.02

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix, Pose
 from pipeline.kernels import pose_log, poses
+from pipeline.kernels.twist import orthonormalise
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
@@ -137,10 +138,8 @@ def adjoint(T: Pose) -> Matrix:
 
 def normalise(T: Pose) -> Pose:
     """The pose with its rotation made orthonormal again, after many products."""
-    d = T.shape[-1] - 1
-    U, _, Vt = np.linalg.svd(T[:d, :d])
-    result = T.copy()
-    result[:d, :d] = U @ Vt
+    result = np.array(T, np.float64, order="C")
+    orthonormalise(result)
     return result
 
 

@@ -154,7 +154,7 @@ class Slam:
         return distance_m > config.keyframe_distance_m or float(lie.rotation_angle(T)) > config.keyframe_angle_rad
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        closures = self.closer.close(self.keyframes, self.graph.poses)
+        closures = self.closer.close(self.keyframes, self.graph)
         config = self.config.loops
         for closure in closures:
             self.closures.append(closure)

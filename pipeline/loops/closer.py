@@ -1,4 +1,4 @@
-"""Loop closures: places seen before, nearby by position and drift, verified by matching."""
+"""Loop closures: places seen before, where they may be by position and drift, verified by matching."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import numpy as np
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Match, Matrix, Points, Pose, Verdict
+from pipeline.data import Closure, Keyframe, Match, Points, Pose, Verdict
+from pipeline.graph.pose_graph import PoseGraph
 from pipeline.kernels.association import associate
+from pipeline.loops.doubt import Doubt
+from pipeline.loops.planar_search import PlanarSearch
 from pipeline.loops.submaps import Submaps
 from pipeline.matching import PointToShapeMatcher, VoxelMap
 from pipeline.preprocess import downsample
@@ -23,52 +26,50 @@ class LoopCloser:
         self.match_voxel_m = config.preprocess.match_voxel_m
         self.matcher = PointToShapeMatcher(config.matching)
         self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map)
+        self.doubt = Doubt(config.loops.drift)
+        self.search = PlanarSearch(self.submaps) if dimension == 2 else None
 
-    def close(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to the nearest older place, accepted or not.
+    def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures of the newest keyframe to older places, accepted or not.
 
-        keyframes : all so far; T_world_keyframes : (K, d+1, d+1) their best known poses
+        keyframes : all so far; graph : their best known poses, and how they are joined
         """
-        source = keyframes[-1]
-        target = self._nearest(keyframes, T_world_keyframes)
-        if target < 0:
+        old = self._old(keyframes)
+        if not old:
             return ()
-        T_predicted = lie.inverse(T_world_keyframes[target]) @ T_world_keyframes[source.index]
-        submap = self.submaps.around(target, keyframes, self._newest_old(keyframes))
-        points = downsample(source.points, self.match_voxel_m)
-        match = self.matcher.align(points, submap, T_predicted, wide=True)
-        return (self._judge(target, source.index, match, points, submap, T_predicted),)
+        T_world, config = graph.poses, self.config
+        doubts_m = self.doubt.between(graph, len(keyframes) - 1, config.max_radius_m)[:old]
+        away_m = np.linalg.norm(T_world[:old, :-1, -1] - T_world[-1, :-1, -1], axis=1)
+        near = np.flatnonzero(away_m <= np.maximum(doubts_m, config.min_radius_m))
+        if not len(near):
+            return ()
+        target = self.submaps.anchor_of(int(near[np.argmin(away_m[near])]))
+        closure = self._measured(keyframes, old, target, lie.inverse(T_world[target]) @ T_world[-1])
+        if closure.verdict is Verdict.ACCEPTED or self.search is None:
+            return (closure,)
+        found = self.search.find(keyframes, T_world, near, doubts_m)
+        if found is None:
+            return (closure,)
+        return closure, self._measured(keyframes, old, found.anchor, found.T_anchor_source)
 
-    def _newest_old(self, keyframes: Sequence[Keyframe]) -> int:
-        """Last keyframe far enough back along the way to count as a revisit, −1 if there is none."""
+    def _old(self, keyframes: Sequence[Keyframe]) -> int:
+        """How many of the first keyframes lie far enough back along the way to count as revisited."""
         limit_m = keyframes[-1].travelled_m - self.config.min_travel_m
-        old = len(keyframes) - 1
-        while old >= 0 and keyframes[old].travelled_m > limit_m:
+        old = len(keyframes)
+        while old > 0 and keyframes[old - 1].travelled_m > limit_m:
             old -= 1
         return old
 
-    def _nearest(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> int:
-        """Anchor of the nearest old keyframe within what odometry may have drifted, −1 if there is none."""
-        old = self._newest_old(keyframes)
-        if old < 0:
-            return -1
-        positions = T_world_keyframes[:, :-1, -1]
-        distance_m = np.linalg.norm(positions[: old + 1] - positions[-1], axis=1)
-        nearest = int(np.argmin(distance_m))
-        travelled_m = keyframes[-1].travelled_m - keyframes[nearest].travelled_m
-        return self.submaps.anchor_of(nearest) if distance_m[nearest] <= self._radius_m(travelled_m) else -1
-
-    def _radius_m(self, travelled_m: float) -> float:
-        return float(np.clip(self.config.drift * travelled_m, self.config.min_radius_m, self.config.max_radius_m))
-
-    def _judge(
-        self, target: int, source: int, match: Match, points: Points, submap: VoxelMap, T_predicted: Pose
-    ) -> Closure:
+    def _measured(self, keyframes: Sequence[Keyframe], old: int, target: int, T_first: Pose) -> Closure:
+        """The closure of the newest keyframe to the submap of an anchor, from a first guess of where it lies."""
+        submap = self.submaps.around(target, keyframes, old - 1)
+        points = downsample(keyframes[-1].points, self.match_voxel_m)
+        match = self.matcher.align(points, submap, T_first, wide=True)
         overlap = _overlap(points, match.T_target_source, submap)
-        moved_m = float(np.linalg.norm((lie.inverse(T_predicted) @ match.T_target_source)[:-1, -1]))
+        moved_m = float(np.linalg.norm((lie.inverse(T_first) @ match.T_target_source)[:-1, -1]))
         problem = self._problem(match, overlap, moved_m)
         verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
-        return Closure(target, source, match, overlap, verdict, problem or "verified by matching")
+        return Closure(target, keyframes[-1].index, match, overlap, verdict, problem or "verified by matching")
 
     def _problem(self, match: Match, overlap: float, moved_m: float) -> str:
         """Why the match is no closure, empty if it is one."""

@@ -4,19 +4,20 @@ from typing import Protocol
 
 from pipeline.config import MatchingConfig
 from pipeline.data import Match, Points, Pose, Prior
-from pipeline.matching.correlative import correlative_seed
+from pipeline.matching.correlative import CorrelativeMap, Seed
 from pipeline.matching.matcher import PointToShapeMatcher
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.svd_icp import SvdMatcher
 from pipeline.matching.voxel_map import VoxelMap
 
 __all__ = [
+    "CorrelativeMap",
     "DegeneratePairsError",
     "Matcher",
     "PointToShapeMatcher",
+    "Seed",
     "SvdMatcher",
     "VoxelMap",
-    "correlative_seed",
     "create_matcher",
     "rigid_transform",
 ]

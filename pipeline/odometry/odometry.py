@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from time import perf_counter
 
@@ -12,7 +13,7 @@ from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Match, Points, Pose, Scan, State
 from pipeline.errors import InputError
-from pipeline.matching import VoxelMap, correlative_seed, create_matcher
+from pipeline.matching import CorrelativeMap, VoxelMap, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
 from pipeline.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from pipeline.preprocess import Resolution, Sweep
@@ -135,11 +136,17 @@ class Odometry:
         if self._is_doubtful(best.cost / len(points), prediction):
             for guess in self._guesses(scan, points, prediction):
                 other = self.matcher.align(points, self.local_map, guess, wide=True)
-                if other.cost < best.cost:
+                if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
         cost = best.cost / len(points)
         self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
+
+    def _cost(self, match: Match, prediction: Prediction) -> float:
+        """What speaks against a match, m²: its own cost, and how far from the expected pose it is."""
+        prior = prediction.prior
+        away = lie.log(lie.inverse(prior.T_target_source) @ match.T_target_source) / prior.widest
+        return match.cost + 0.5 * self.config.matching.sensor_noise_m**2 * float(away @ away)
 
     def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
         """Whether the cost per point is far above what it used to be, and a share of the most it could be."""
@@ -150,19 +157,17 @@ class Odometry:
         return cost > max(_DOUBT * self.usual_cost, _ROUGH * 0.5 * self.config.matching.kernel_scale_m**2)
 
     def _guesses(self, scan: Scan, points: Points, prediction: Prediction) -> tuple[Pose, ...]:
-        """Other poses to start from; in the plane also the best of a grid around the expected one."""
+        """Other poses to start from; in the plane also the best of a window around the expected one."""
         alternatives = self.predictor.alternatives(scan)
         if self.dimension == 3:
             return alternatives
-        config = self.config.matching
-        seed = correlative_seed(
-            points,
-            self.local_map,
-            prediction.T_odom_lidar,
-            half_width_m=config.seed_half_width_m,
-            half_width_rad=config.seed_half_width_rad,
+        half_width_m, half_width_rad = self.predictor.window(scan)
+        reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
+        T_expected = prediction.T_odom_lidar
+        seed = CorrelativeMap(self.local_map, T_expected, reach_m).best(
+            points, T_expected, half_width_m=half_width_m, half_width_rad=half_width_rad
         )
-        return (*alternatives, seed)
+        return (*alternatives, seed.T_target_source)
 
     def _judge(self, match: Match) -> tuple[State, str]:
         config = self.config.matching

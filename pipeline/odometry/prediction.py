@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ _GAP = 5.0  # times the usual interval, from which on scans are missing
 _ALIKE = 1.4  # ratio up to which two intervals agree
 _LONGEST = 100.0  # times the usual interval, beyond which stamps make no sense
 _MEMORY = 0.9  # of the usual interval, per scan
+_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # for stamps that lie too close
+_LARGEST_WINDOW_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,7 @@ class Predictor:
         self.motion_covariance = self.any_motion
         self.interval_s = 0.0
         self.usual_s = 0.0
+        self.lost_s = 0.0
         self.last_scan: Scan | None = None
 
     def predict(self, scan: Scan) -> Prediction:
@@ -84,7 +88,7 @@ class Predictor:
     def _prediction(
         self, motion: Pose, covariance: Matrix, experience: Experience, *, is_guess: bool = False
     ) -> Prediction:
-        prior = Prior(self.T_odom_lidar @ motion, covariance, experience.first_sigma)
+        prior = Prior(lie.normalise(self.T_odom_lidar @ motion), covariance, experience.first_sigma)
         return Prediction(prior, experience, is_guess)
 
     def alternatives(self, scan: Scan) -> tuple[Pose, ...]:
@@ -97,9 +101,18 @@ class Predictor:
         stretched = tuple(T @ self._stretched(scan, share) for share in (0.5, 1.0, 1.5))
         return T @ self.T_previous_current, *stretched, T
 
+    def window(self, scan: Scan) -> tuple[float, float]:
+        """How far from the expected pose a scan may be at the most, in the plane: metres and radians."""
+        elapsed_s = max(self.interval_to(scan), self.usual_s) + self.lost_s
+        return (
+            min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),
+            min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
+        )
+
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Take the pose that the scan turned out to have: that of its match or, where it is lost, the expected."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
+        self.lost_s = self.lost_s + self.interval_to(scan) if state is State.LOST else 0.0
         self.motion_covariance = self.any_motion
         if state is not State.LOST:
             self.motion_covariance = prediction.prior.informed(match.information)

@@ -1,0 +1,141 @@
+"""Correlative scan matching over a wide window in the plane, exact and fast, by branch and bound (Hess et al. 2016)."""
+
+import heapq
+import math
+
+import numpy as np
+from numba import njit
+
+HIT, NEAR = 2, 1  # what a point scores in a cell with a surface, and in one beside it
+APART_M, APART_RAD = 1.0, 0.1  # from which on two poses are different answers
+RIVAL = 0.8  # share of the best score, from which on another answer is told
+
+
+@njit(cache=True, nogil=True)
+def draw_hits(means, origin, resolution_m: float, grid):
+    """Score HIT where a surface point lies, NEAR in the eight cells around it.
+
+    means : (V, ≥ 2) metres; origin : (2,) corner of cell (0, 0); grid : (rows, columns) uint8, row along y
+    Every mean lies within the grid, a cell or more from its border.
+    """
+    for v in range(means.shape[0]):
+        column = int((means[v, 0] - origin[0]) / resolution_m)
+        row = int((means[v, 1] - origin[1]) / resolution_m)
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                grid[row + dr, column + dc] = max(grid[row + dr, column + dc], NEAR)
+        grid[row, column] = HIT
+
+
+@njit(cache=True, nogil=True)
+def fill_pyramid(pyramid):
+    """Fill level h of (levels, rows, columns) with the best score in the 2ʰ × 2ʰ cells that start at each cell."""
+    levels, rows, columns = pyramid.shape
+    for h in range(1, levels):
+        half = 1 << (h - 1)
+        for row in range(rows):
+            far_row = row + half
+            for column in range(columns):
+                best = pyramid[h - 1, row, column]
+                far_column = column + half
+                if far_column < columns:
+                    best = max(best, pyramid[h - 1, row, far_column])
+                if far_row < rows:
+                    best = max(best, pyramid[h - 1, far_row, column])
+                    if far_column < columns:
+                        best = max(best, pyramid[h - 1, far_row, far_column])
+                pyramid[h, row, column] = best
+
+
+@njit(cache=True, nogil=True)
+def search(pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float):
+    """The pose around T, within so many shifts of a cell and turns, whose points score best; and its rival.
+
+    A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
+    bound is split until one of a single shift comes first: nothing that is left can beat it. The search goes on
+    to the best pose elsewhere, more than APART_M or APART_RAD away, with at least RIVAL of that score.
+
+    pyramid : of ``fill_pyramid``; its first 2ᵗᵒᵖ − 1 rows and columns are empty
+    points : (N, 2) metres, lidar frame; T : (3, 3)
+    least : share of the highest score possible, below which nothing counts
+    Returns x, y (m), yaw, the share of the best pose (−1 for none) and that of its rival (0 for none).
+    """
+    full = HIT * points.shape[0]
+    cells = _cells(points, T, origin, resolution_m, turns, turn_rad)
+    heap = _roots(pyramid, cells, shifts, least * full)
+    best, best_turn, best_x, best_y = -1, 0, 0, 0
+    rival = 0
+    while len(heap):
+        negative, level, turn, dx, dy = heapq.heappop(heap)
+        if -negative < RIVAL * best:
+            break
+        if best >= 0 and abs(turn - best_turn) * turn_rad < APART_RAD:
+            size = (1 << level) - 1
+            away = max(abs(dx - best_x), abs(dx + size - best_x), abs(dy - best_y), abs(dy + size - best_y))
+            if away * resolution_m < APART_M:
+                continue
+        if level > 0:
+            _split(heap, pyramid[level - 1], cells[turn], level - 1, turn, dx, dy, shifts, least * full)
+        elif best < 0:
+            best, best_turn, best_x, best_y = -negative, turn, dx, dy
+        else:
+            rival = -negative
+            break
+    yaw = math.atan2(T[1, 0], T[0, 0]) + (best_turn - turns) * turn_rad
+    x, y = T[0, 2] + best_x * resolution_m, T[1, 2] + best_y * resolution_m
+    return x, y, yaw, best / full if best >= 0 else -1.0, rival / full
+
+
+@njit(cache=True, nogil=True)
+def _cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
+    """Column and row (2·turns + 1, N, 2) of every point under every turn of T."""
+    yaw = math.atan2(T[1, 0], T[0, 0])
+    cells = np.empty((2 * turns + 1, points.shape[0], 2), np.int32)
+    for turn in range(2 * turns + 1):
+        angle = yaw + (turn - turns) * turn_rad
+        c, s = math.cos(angle), math.sin(angle)
+        for i in range(points.shape[0]):
+            x = c * points[i, 0] - s * points[i, 1] + T[0, 2] - origin[0]
+            y = s * points[i, 0] + c * points[i, 1] + T[1, 2] - origin[1]
+            cells[turn, i, 0] = int(math.floor(x / resolution_m))
+            cells[turn, i, 1] = int(math.floor(y / resolution_m))
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def _roots(pyramid, cells, shifts: int, least: float):
+    """Heap of the largest windows: (−bound, level, turn, first shift along x, along y)."""
+    top = pyramid.shape[0] - 1
+    heap = [(0, 0, 0, 0, 0) for _ in range(0)]
+    for turn in range(cells.shape[0]):
+        for dx in range(-shifts, shifts + 1, 1 << top):
+            for dy in range(-shifts, shifts + 1, 1 << top):
+                bound = _score(pyramid[top], cells[turn], dx, dy)
+                if bound >= least:
+                    heap.append((-bound, top, turn, dx, dy))
+    heapq.heapify(heap)
+    return heap
+
+
+@njit(cache=True, nogil=True)
+def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: int, least: float):
+    """Push the four windows of the next level that make up one."""
+    half = 1 << level
+    for x in (dx, dx + half):
+        for y in (dy, dy + half):
+            if x > shifts or y > shifts:
+                continue
+            bound = _score(layer, cells, x, y)
+            if bound >= least:
+                heapq.heappush(heap, (-bound, level, turn, x, y))
+
+
+@njit(cache=True, inline="always")
+def _score(layer, cells, dx: int, dy: int) -> int:
+    """Sum of what the points, shifted by so many cells, find in a layer; cells outside hold nothing."""
+    total = 0
+    for i in range(cells.shape[0]):
+        column, row = cells[i, 0] + dx, cells[i, 1] + dy
+        if 0 <= row < layer.shape[0] and 0 <= column < layer.shape[1]:
+            total += layer[row, column]
+    return total

@@ -1,0 +1,47 @@
+"""How far the pose graph may be off between two keyframes: the drift of the shortest way that joins them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from pipeline.graph.growing_array import GrowingArray
+from pipeline.graph.pose_graph import PoseGraph
+
+_CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two places
+_LOOP_M = 1e-3  # length of such an edge
+
+
+class Doubt:
+    """The way of odometry that lies between keyframes, by loops where these are shorter.
+
+    An edge is as long as it leads or, where odometry was unsure, as long as a way on which it would have drifted so
+    far.
+    """
+
+    def __init__(self, drift: float) -> None:
+        """drift : metres a metre."""
+        self.drift = drift
+        self.lengths = GrowingArray((), np.float64)
+
+    def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
+        """Metres (K,) that each keyframe of the graph may be off as seen from one of them, at most the limit."""
+        self._learn(graph)
+        lengths = self.lengths.rows
+        joined = ~graph.is_loop | (graph.weight > _CLOSED)
+        i, j = graph.edges[joined].T
+        ways = csr_matrix((lengths[joined], (i, j)), shape=(len(graph), len(graph)))
+        metres = dijkstra(ways, directed=False, indices=keyframe, limit=limit_m / self.drift)
+        return np.minimum(self.drift * metres, limit_m)
+
+    def _learn(self, graph: PoseGraph) -> None:
+        """Measure the edges that are new."""
+        new = slice(len(self.lengths), len(graph.edges))
+        d = graph.dimension
+        ways_m = np.linalg.norm(graph.measurements[new][:, :d, d], axis=1)
+        covariances = np.linalg.inv(graph.information[new])
+        sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
+        lengths = np.where(graph.is_loop[new], _LOOP_M, np.maximum(ways_m, sigmas_m / self.drift))
+        self.lengths.extend(lengths)
