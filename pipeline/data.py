@@ -76,7 +76,7 @@ class Prior:
     def informed(self, information: Matrix) -> Matrix:
         """Covariance (k, k) after information Λ (k, k) has come in: (P⁻¹ + Λ)⁻¹ = (1 + P Λ)⁻¹ P."""
         P = self.covariance
-        return np.linalg.solve(np.eye(len(P)) + P @ information, P)
+        return np.linalg.solve(np.eye(len(P)) + P @ information, P).astype(np.float64, copy=False)
 
 
 @dataclass(frozen=True, slots=True)

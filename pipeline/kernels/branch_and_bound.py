@@ -1,4 +1,4 @@
-"""Correlative scan matching over a wide window in the plane, exact and fast, by branch and bound (Hess et al. 2016)."""
+"""Correlative scan matching in the plane, exact over a wide window, by branch and bound (Hess et al. 2016)."""
 
 import heapq
 import math
@@ -48,7 +48,9 @@ def fill_pyramid(pyramid):
 
 
 @njit(cache=True, nogil=True)
-def search(pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float):
+def search(
+    pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float
+):
     """The pose around T, within so many shifts of a cell and turns, whose points score best; and its rival.
 
     A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
@@ -97,8 +99,8 @@ def _cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
         for i in range(points.shape[0]):
             x = c * points[i, 0] - s * points[i, 1] + T[0, 2] - origin[0]
             y = s * points[i, 0] + c * points[i, 1] + T[1, 2] - origin[1]
-            cells[turn, i, 0] = int(math.floor(x / resolution_m))
-            cells[turn, i, 1] = int(math.floor(y / resolution_m))
+            cells[turn, i, 0] = math.floor(x / resolution_m)
+            cells[turn, i, 1] = math.floor(y / resolution_m)
     return cells
 
 

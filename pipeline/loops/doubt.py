@@ -17,12 +17,11 @@ _LOOP_M = 1e-3  # length of such an edge
 class Doubt:
     """The way of odometry that lies between keyframes, by loops where these are shorter.
 
-    An edge is as long as it leads or, where odometry was unsure, as long as a way on which it would have drifted so
-    far.
+    An edge is as long as it leads or, where odometry was unsure, as a way on which it would have drifted as far.
     """
 
     def __init__(self, drift: float) -> None:
-        """drift : metres a metre."""
+        """By how much odometry drifts, metres a metre."""
         self.drift = drift
         self.lengths = GrowingArray((), np.float64)
 

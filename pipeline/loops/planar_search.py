@@ -40,7 +40,11 @@ class PlanarSearch:
         self.next_m = 0.0
 
     def find(
-        self, keyframes: Sequence[Keyframe], T_world: Matrix, near: NDArray[np.int64], doubts_m: NDArray[np.float64]
+        self,
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+        near: NDArray[np.int64],
+        doubts_m: NDArray[np.float64],
     ) -> Found | None:
         """Where the newest keyframe fits best; None where nothing is like it, or two places are, or not sought.
 
@@ -53,7 +57,8 @@ class PlanarSearch:
         anchors = self._anchors(near, T_world)
         points = self._surroundings(keyframes)
         seeds = [
-            self._seed(points, anchor, keyframes, T_world, len(doubts_m), float(doubts_m[anchor])) for anchor in anchors
+            self._seed(points, anchor, keyframes, T_world, len(doubts_m), float(doubts_m[anchor]))
+            for anchor in anchors
         ]
         shares = np.array([seed.share for seed in seeds])
         best = int(np.argmax(shares))
