@@ -12,7 +12,17 @@ from io import BytesIO
 import lz4.frame
 import zstandard
 
-from pipeline.logs.records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD, SCHEMA, Block, Contents, FileIndex, Message
+from pipeline.logs.records import (
+    CHANNEL,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD,
+    SCHEMA,
+    Block,
+    Contents,
+    FileIndex,
+    Message,
+)
 
 
 class DamagedBlockError(Exception):

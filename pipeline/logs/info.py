@@ -8,10 +8,12 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
-from pipeline.logs.log import Log, index_files
+from pipeline.logs.log import Log
+from pipeline.logs.opening import index_files
+from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
-from pipeline.logs.topics import kind
+from pipeline.logs.sizes import size_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,13 @@ class LogInfo:
 
 def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
-    indexes = index_files(paths)
+    config = config or LogConfig()
+    indexes = index_files(paths, config.rate_hz)
     whole = whole_span(indexes)
-    log, problem = _open(indexes, config or LogConfig())
+    log, problem = _open(indexes, config)
     return LogInfo(
         files=tuple(str(path) for path in paths),
-        size_bytes=sum(path.stat().st_size for path in paths),
+        size_bytes=sum(size_of(path) for path in paths),
         start_ns=whole.begin_ns,
         duration_s=whole.duration_s,
         topics=_topics(indexes, whole.duration_s),

@@ -9,11 +9,20 @@ import numpy as np
 
 from pipeline import lie
 from pipeline.data import Pose
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
+from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.counting import messages_of
-from pipeline.logs.poses import StampedPose, chain, decode_odometry, decode_transforms
+from pipeline.logs.poses import StampedPose, chain
+from pipeline.logs.readers import (
+    cloud_reader,
+    has_transforms,
+    is_odometry,
+    is_scan,
+    pose_reader,
+    scan_reader,
+    transforms_reader,
+)
 from pipeline.logs.records import Channel, FileIndex
-from pipeline.logs.topics import ODOMETRY, TRANSFORMS, is_readable, kind, topics_of
+from pipeline.logs.topics import topics_of
 
 T = TypeVar("T")
 
@@ -26,10 +35,12 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     transforms = _static_transforms(indexes)
     if not transforms and wheels is None:
         return np.eye(4)
-    lidar_frame = next(_first(indexes, lidar.topic, lambda data: CdrReader(data).header()[1]), "")
+    read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
+    lidar_frame = next(_first(indexes, lidar.topic, lambda data: read(data).frame), "")
     base_frame = ""
-    if wheels is not None and kind(wheels) == ODOMETRY:
-        base_frame = next(_first(indexes, wheels.topic, lambda data: decode_odometry(data).child), "")
+    if wheels is not None and is_odometry(wheels):
+        told = next(_first(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+        base_frame = "" if told is None else told.child
     for base in (base_frame, *_BASE_FRAMES) if base_frame else _BASE_FRAMES:
         T_base_lidar = chain(transforms, base, lidar_frame)
         if T_base_lidar is not None:
@@ -60,8 +71,8 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
-        if topic.endswith("tf_static") and kind(channel) == TRANSFORMS and is_readable(channel):
-            for transforms in _first(indexes, topic, decode_transforms):
+        if topic.endswith("tf_static") and has_transforms(channel):
+            for transforms in _first(indexes, topic, transforms_reader(channel)):
                 found += transforms
     return found
 

@@ -85,7 +85,7 @@ class Block:
     @property
     def may_be_empty(self) -> bool:
         """Whether its times are those that writers give a chunk without any message."""
-        return self.start_ns == self.end_ns == 0 or self.start_ns > self.end_ns
+        return (self.start_ns == self.end_ns == 0 and not self.entries) or self.start_ns > self.end_ns
 
 
 @dataclass(slots=True)

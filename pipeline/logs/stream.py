@@ -16,7 +16,8 @@ from pipeline.logs.poses import StampedPose
 from pipeline.logs.records import Block, Channel, FileIndex
 from pipeline.logs.selection import Span
 
-Decoders = Mapping[str, Callable[[memoryview], Returns | StampedPose]]
+Value = Returns | StampedPose | bytes
+Decoders = Mapping[str, Callable[[memoryview], Value]]
 
 _THREADS = 2
 _MOST_BYTES_AHEAD = 512_000_000
@@ -27,7 +28,7 @@ class Decoded(NamedTuple):
 
     channel: Channel
     log_time_ns: int
-    value: Returns | StampedPose | MalformedMessageError
+    value: Value | MalformedMessageError
 
 
 def decoded_messages(
@@ -69,9 +70,7 @@ def decoded_messages(
             yield heappop(waiting)[-1]
 
 
-def _decode(
-    decoder: Callable[[memoryview], Returns | StampedPose], data: memoryview
-) -> Returns | StampedPose | MalformedMessageError:
+def _decode(decoder: Callable[[memoryview], Value], data: memoryview) -> Value | MalformedMessageError:
     try:
         return decoder(data)
     except MalformedMessageError as error:

@@ -25,7 +25,7 @@ class LogWriter:
     Messages are recorded at ``log_time_ns``, by default their own stamp. Poses may be SE(2) or SE(3).
     """
 
-    def __init__(self, destination: Path, *, force: bool = False) -> None:
+    def __init__(self, destination: Path, *, force: bool = False, profile: str = "ros2") -> None:
         if destination.is_dir():
             raise InputError(f"{destination}: is a directory; give the name of a file to write")
         if destination.exists() and not force:
@@ -38,7 +38,7 @@ class LogWriter:
         except OSError as error:
             raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="scanchain")
+        self._writer.start(profile=profile, library="scanchain")
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, str, bytes], int] = {}
         self._sequence = 0
@@ -117,7 +117,9 @@ class LogWriter:
         rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
         for name, (_, values) in columns.items():
             rows[name] = values
-        self._append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
+        self._append(
+            topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns
+        )
 
     def odometry(
         self,
@@ -175,4 +177,3 @@ def _whole_ns(times_s: NDArray[np.floating]) -> NDArray[np.int64]:
     if len(times_s) and times_s.min() < 0.0:
         raise InputError(f"point time {times_s.min():.6f} s is before the stamp; use time_field='time'")
     return np.rint(np.asarray(times_s, dtype=np.float64) * 1e9).astype(np.int64)
-

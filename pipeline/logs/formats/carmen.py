@@ -12,8 +12,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 from pipeline.errors import InputError
 from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
@@ -34,7 +34,9 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     index = made_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
-        raise InputError(f"{path}: has no line of {', '.join(kind.decode() for kind in KINDS)}; is it a CARMEN log?")
+        raise InputError(
+            f"{path}: has no line of {', '.join(kind.decode() for kind in KINDS)}; is it a CARMEN log?"
+        )
     return index
 
 
@@ -156,7 +158,7 @@ def _text(path: Path) -> tuple[bytes, str]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
 
 
-def _read(path: Path, stream: IO[bytes]) -> tuple[bytes, str]:
+def _read(path: Path, stream: BufferedIOBase) -> tuple[bytes, str]:
     text = bytearray()
     try:
         while piece := stream.read(_PIECE_BYTES):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
@@ -36,3 +37,8 @@ def made_block(
 def made_index(path: Path, number: int) -> FileIndex:
     """An index without channels or blocks; whoever makes it sets ``make``."""
     return FileIndex(path, number, b"", is_counted=True, profile="ros2")
+
+
+def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
+    """Sorts log_2 before log_10."""
+    return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name

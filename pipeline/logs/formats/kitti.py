@@ -1,0 +1,110 @@
+"""KITTI's folders: sweeps of the raw recordings and of the odometry benchmark, with their ground truth.
+
+Geiger, Lenz, Stiller & Urtasun 2013, "Vision meets robotics: the KITTI dataset".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.data import Matrix
+from pipeline.errors import InputError
+from pipeline.logs.formats.cloud_file import CloudFileError, read_xyzi
+from pipeline.logs.formats.kitti_truth import (
+    read_calibration,
+    read_camera_poses,
+    read_oxts,
+    read_seconds,
+    read_times,
+)
+from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
+from pipeline.logs.pack import pack_cloud, pack_odometry, place
+from pipeline.logs.records import Block, Contents, FileIndex, Message
+
+_TRUTH = -1  # the block of the ground truth
+
+
+def index_kitti_raw(folder: Path, number: int) -> FileIndex:
+    """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
+    files = _sweeps(folder / "velodyne_points" / "data")
+    times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
+    index = made_index(folder, number)
+    truth_ns, truth = [], np.empty((0, 4, 4))
+    calibration = folder.parent / "calib_imu_to_velo.txt"
+    if not (folder / "oxts").is_dir():
+        index.notes.append(f"{folder}: has no oxts folder, so no ground truth")
+    elif not calibration.is_file():
+        index.notes.append(
+            f"{calibration}: is absent, so the GPS/INS poses cannot be moved to the lidar; no truth"
+        )
+    else:
+        truth_ns = read_times(folder / "oxts" / "timestamps.txt")
+        truth = read_oxts(folder / "oxts" / "data", read_calibration(calibration))
+    return _index(index, files, times_ns, truth_ns, truth)
+
+
+def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
+    """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
+    files = _sweeps(folder / "velodyne")
+    times_ns = read_seconds(folder / "times.txt")
+    index = made_index(folder, number)
+    truth = np.empty((0, 4, 4))
+    name = folder.resolve().name
+    poses = folder.resolve().parent.parent / "poses" / f"{name}.txt"
+    if not poses.is_file():
+        index.notes.append(f"{poses}: is absent, so there is no ground truth")
+    else:
+        truth = read_camera_poses(poses, folder / "calib.txt")
+    return _index(index, files, times_ns, times_ns[: len(truth)], truth)
+
+
+def _sweeps(folder: Path) -> list[Path]:
+    files = sorted(folder.glob("*.bin"), key=natural_order)
+    if not files:
+        raise InputError(f"{folder}: has no .bin file; of the raw recordings take the synced ones (..._sync)")
+    return files
+
+
+def _index(
+    index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], truth_ns: Sequence[int], truth: Matrix
+) -> FileIndex:
+    """/velodyne_points from the files, whose names count the times, and /ground_truth."""
+    numbers = [int(file.stem) for file in files if file.stem.isdigit()]
+    if len(numbers) < len(files) or max(numbers) >= len(times_ns):
+        raise InputError(
+            f"{files[-1]}: does not fit the {len(times_ns)} timestamps; names must be numbers from 0 up"
+        )
+    lidar = made_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
+    for entry, file in enumerate(files):
+        made_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
+    channels = {lidar.key[1]}
+    count = min(len(truth_ns), len(truth))
+    if count:
+        poses = made_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
+        channels.add(poses.key[1])
+        made_block(index, _TRUTH, 720 * count, truth_ns[:count], {poses: count})
+
+    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+        number = block.entries[0].channel
+        if wanted is not None and number not in wanted:
+            return Contents([], "")
+        channel = index.channels[number]
+        if block.offset == _TRUTH:
+            told = [
+                (stamp, pack_odometry(stamp, "world", "velodyne", place(T)))
+                for stamp, T in zip(truth_ns[:count], truth[:count], strict=True)
+            ]
+            return Contents([Message(channel, stamp, memoryview(data)) for stamp, data in told], "")
+        file, stamp_ns = files[block.offset], block.start_ns
+        try:
+            data = pack_cloud(stamp_ns, "velodyne", read_xyzi(file))
+        except (CloudFileError, OSError) as error:
+            return Contents([], f"{file}: {error}; it was left out")
+        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+
+    index.make = make
+    return index
