@@ -73,6 +73,8 @@ def _file_indexer(path: Path) -> Indexer:
 
 
 def _folder_indexer(path: Path, rate_hz: float) -> Indexer:
+    if (path / "metadata.yaml").is_file():
+        return index_bag
     if (path / "velodyne_points").is_dir():
         return index_kitti_raw
     if (path / "velodyne").is_dir() and (path / "times.txt").is_file():

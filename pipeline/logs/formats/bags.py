@@ -37,11 +37,12 @@ def parts_of_bag(folder: Path) -> list[Path]:
     try:
         told = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
         parts = [folder / Path(name).name for name in told["relative_file_paths"]]
-    except (OSError, YAMLError, KeyError, TypeError) as error:
+        is_packed = str(told.get("compression_mode", "")).lower() not in ("", "none")
+    except (OSError, YAMLError, KeyError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
-    is_plain = bool(parts) and all(part.suffix == ".mcap" and part.is_file() for part in parts)
-    return parts if is_plain else [folder]
+    is_mcap = bool(parts) and all(part.suffix == ".mcap" and part.is_file() for part in parts)
+    return parts if is_mcap and not is_packed else [folder]
 
 
 class _Bag:
