@@ -91,12 +91,12 @@ def assert_clouds(scans, said=None, *, timed=True, stamps=True):
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 _CUSTOM_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-_CUSTOM = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+_CUSTOM = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
 for store in (ROS1, ROS2):
     for package in ("livox_ros_driver2", "livox_ros_driver"):
         store.register(get_types_from_msg(_CUSTOM_POINT, f"{package}/msg/CustomPoint"))
-        store.register(get_types_from_msg(_CUSTOM, f"{package}/msg/CustomMsg"))
+        store.register(get_types_from_msg(_CUSTOM + "CustomPoint[] points\n", f"{package}/msg/CustomMsg"))
 
 
 class Ros:
@@ -263,10 +263,13 @@ def foxglove_scan(scan, pose=None):
 
 def foxglove_cloud(cloud, pose=None):
     kinds = fox.PackedElementFieldNumericType
-    fields = [("x", kinds.Float32), ("y", kinds.Float32), ("z", kinds.Float32), ("t", kinds.Uint32)]
+    codes = {"x": kinds.Float32, "y": kinds.Float32, "z": kinds.Float32, "t": kinds.Uint32}
+    fields = [
+        fox.PackedElementField(name=name, offset=4 * k, type=code) for k, (name, code) in enumerate(codes.items())
+    ]
     return fox.PointCloud(
-        timestamp=_fox_time(cloud.stamp_ns), frame_id="lidar", pose=pose, point_stride=16, data=cloud.rows.tobytes(),
-        fields=[fox.PackedElementField(name=name, offset=4 * k, type=kind) for k, (name, kind) in enumerate(fields)],
+        timestamp=_fox_time(cloud.stamp_ns), frame_id="lidar", pose=pose, point_stride=16, fields=fields,
+        data=cloud.rows.tobytes(),
     )  # fmt: skip
 
 

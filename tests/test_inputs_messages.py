@@ -88,7 +88,9 @@ def test_foxglove_clouds_are_the_same_in_protobuf_and_json(tmp_path):
 
 def test_a_foxglove_cloud_is_moved_to_where_its_pose_says(tmp_path):
     half = np.sqrt(0.5)
-    pose = fox.Pose(position=fox.Vector3(x=1.0, y=2.0, z=3.0), orientation=fox.Quaternion(x=0, y=0, z=half, w=half))
+    pose = fox.Pose(
+        position=fox.Vector3(x=1.0, y=2.0, z=3.0), orientation=fox.Quaternion(x=0, y=0, z=half, w=half)
+    )
     _, scans = read(recorders.foxglove_protobuf(tmp_path / "a.mcap", recorders.clouds(), pose))
     for scan, cloud in zip(scans, recorders.clouds(), strict=True):
         rows = cloud.rows[1:]

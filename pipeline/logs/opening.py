@@ -9,7 +9,7 @@ from pipeline.errors import InputError
 from pipeline.logs.counting import complete
 from pipeline.logs.formats.bags import index_bag, parts_of_bag
 from pipeline.logs.formats.carmen import index_carmen
-from pipeline.logs.formats.cloud_folder import SUFFIXES as CLOUD_SUFFIXES
+from pipeline.logs.formats.cloud_file import SUFFIXES
 from pipeline.logs.formats.cloud_folder import index_clouds
 from pipeline.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from pipeline.logs.formats.made import natural_order
@@ -79,7 +79,7 @@ def _folder_indexer(path: Path, rate_hz: float) -> Indexer:
         return index_kitti_raw
     if (path / "velodyne").is_dir() and (path / "times.txt").is_file():
         return index_kitti_odometry
-    if any(entry.suffix.lower() in CLOUD_SUFFIXES for entry in path.iterdir()):
+    if any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir()):
         return lambda folder, number: index_clouds(folder, number, rate_hz)
     raise InputError(f"{path}: is a folder of no log that is known; give {_KNOWN}")
 

@@ -8,12 +8,12 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.logs.formats.cloud_file import CloudFileError, read_cloud_file
+from pipeline.logs.formats.cloud_file import SUFFIXES, read_cloud_file
 from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
+from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import pack_cloud
 from pipeline.logs.records import Block, Contents, FileIndex, Message
 
-SUFFIXES = (".pcd", ".ply", ".bin")
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
 _NS = 1_000_000_000
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
-from pipeline.logs.formats.cloud_file import CloudFileError, read_xyzi
+from pipeline.logs.formats.cloud_file import read_xyzi
 from pipeline.logs.formats.kitti_truth import (
     read_calibration,
     read_camera_poses,
@@ -22,6 +22,7 @@ from pipeline.logs.formats.kitti_truth import (
     read_times,
 )
 from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
+from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import pack_cloud, pack_odometry, place
 from pipeline.logs.records import Block, Contents, FileIndex, Message
 
