@@ -44,6 +44,7 @@ class LogInfo:
     dimension: int
     scans: int
     odometry: str
+    point_times: str
     T_base_lidar: tuple[tuple[float, ...], ...]
     notes: tuple[str, ...]
     damage: tuple[str, ...]
@@ -66,6 +67,7 @@ def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
         dimension=0 if log is None else log.dimension,
         scans=0 if log is None else log.scan_count,
         odometry="" if log is None else log.odometry_topic,
+        point_times="" if log is None else log.assumed_point_times(),
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         notes=() if log is None else tuple(log.notes),
         damage=tuple(line for index in indexes for line in index.damage),

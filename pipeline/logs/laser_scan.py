@@ -81,14 +81,17 @@ class LaserScanDecoder:
         self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
 
     def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's beams."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: LaserScanMessage) -> Returns:
         """Points of the beams that came back: finite, at least range_min, below range_max.
 
         Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
         not positive are taken as unknown. Negative angle increments are as good as positive ones.
         """
-        message = self.read(data)
         ranges_m = message.ranges_m
-        low_m, high_m = self._limits(message)
+        low_m, high_m = self.limits_of(message)
         geometry = self._geometry(message)
         valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
         if len(valid) == len(ranges_m):
@@ -101,7 +104,8 @@ class LaserScanDecoder:
         why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
 
-    def _limits(self, message: LaserScanMessage) -> tuple[float, float]:
+    def limits_of(self, message: LaserScanMessage) -> tuple[float, float]:
+        """The least range that counts, and the one from which on none does."""
         low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
         high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
         return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)

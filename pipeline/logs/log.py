@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
+from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
 from pipeline.logs.limits import RangeLimits, Returns
 from pipeline.logs.mounting import find_mounting, in_plane, is_upside_down
@@ -139,6 +140,14 @@ class Log:
             waited_s=waited_s,
         )
 
+    def assumed_point_times(self) -> str:
+        """What a run assumes about per-point times, by the first scan that has returns; empty for a planar log."""
+        times = PointTimes(self.config)
+        if self.dimension == 3:
+            returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
+            next((each for each in returns if len(each.points)), None)
+        return times.assumed if self.dimension == 3 else ""
+
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         if self._truth is None and self.ground_truth_topic:
@@ -151,7 +160,7 @@ class Log:
 
     def _with_wheels(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the reading behind them."""
-        decoders = {self.topic: self._decoder(times).decode, **self.pose_decoders}
+        decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         for message in self._messages(decoders, self.damage):
             if message.channel.topic == self.topic:
@@ -163,7 +172,8 @@ class Log:
         while waiting:
             yield waiting[0], poses.wheels_at(waiting.popleft())
 
-    def _decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
+    def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
+        """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if self.dimension == 2:
             return LaserScanDecoder(limits, scan_reader(self.lidar))

@@ -72,6 +72,21 @@ def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> Poi
 ReadPointCloud = Callable[[memoryview], PointCloudMessage]
 
 
+def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
+    """One field of all points (N,), None where the cloud does not have it."""
+    for field in message.fields:
+        if field.name == name and field.datatype in _FORMATS:
+            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+            point = np.dtype({
+                "names": [name],
+                "formats": [number.str],
+                "offsets": [field.offset],
+                "itemsize": message.point_step,
+            })  # fmt: skip
+            return _rows(message, point)[name]
+    return None
+
+
 class Layout(NamedTuple):
     """Where a channel keeps its fields: a structured type, and the name of the time field, if any."""
 
@@ -89,11 +104,14 @@ class PointCloudDecoder:
         self.layouts: dict[bytes, Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's points."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: PointCloudMessage) -> Returns:
         """Points that came back: finite, not the origin, within the limits; their times with them.
 
         Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
         """
-        message = self.read(data)
         layout = self.layouts.get(message.described)
         if layout is None:
             if len(self.layouts) >= _MOST_LAYOUTS:

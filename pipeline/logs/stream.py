@@ -11,24 +11,21 @@ from typing import NamedTuple
 
 from pipeline.logs.blocks import DamagedBlockError, read_block, release
 from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.limits import Returns
-from pipeline.logs.poses import StampedPose
 from pipeline.logs.records import Block, Channel, FileIndex
 from pipeline.logs.selection import Span
 
-Value = Returns | StampedPose | bytes
-Decoders = Mapping[str, Callable[[memoryview], Value]]
+Decoders = Mapping[str, Callable[[memoryview], object]]
 
 _THREADS = 2
 _MOST_BYTES_AHEAD = 512_000_000
 
 
 class Decoded(NamedTuple):
-    """A message as its decoder understood it, or the decoder's complaint."""
+    """A message as its decoder understood it, or the decoder's complaint, a MalformedMessageError."""
 
     channel: Channel
     log_time_ns: int
-    value: Value | MalformedMessageError
+    value: object
 
 
 def decoded_messages(
@@ -70,7 +67,7 @@ def decoded_messages(
             yield heappop(waiting)[-1]
 
 
-def _decode(decoder: Callable[[memoryview], Value], data: memoryview) -> Value | MalformedMessageError:
+def _decode(decoder: Callable[[memoryview], object], data: memoryview) -> object:
     try:
         return decoder(data)
     except MalformedMessageError as error:
