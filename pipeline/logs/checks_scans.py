@@ -7,17 +7,16 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.config import PreprocessConfig
 from pipeline.logs.finding import Finding, Severity
+from pipeline.logs.rest import LEAST_S, Rest
 from pipeline.logs.survey import Survey
 
 _MANY_LOST = 0.5
 _STUCK_SHARE = 0.01  # of beams, all at the farthest range
-_STILL_M = 0.01  # a smaller change of the outline is noise
-_STILL_S = 5.0
-_WHEELS_MOVE_M = 0.002  # between two readings
+_LONG_REST_S = 5.0
+_WHEELS_MOVE = 0.02  # metres, or the sine of a turn
 _FEW_POINTS = 50
 
 
@@ -68,6 +67,7 @@ def _no_return(seen: Survey) -> Finding:
     """Whether many beams tell one farthest range, as scanners do that write a number for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
     farthest_m = max(values, default=0.0)
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
     told_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
@@ -78,7 +78,7 @@ def _no_return(seen: Survey) -> Finding:
     if farthest_m >= limit_m:
         return Finding("no return", Severity.OK, f"{found}; range limits take it out")
     effect = "it stands for no return, but is taken for a wall that moves along"
-    return Finding("no return", Severity.PROBLEM, found, effect, f"--log.max_range_m {farthest_m:.6g}")
+    return Finding("no return", Severity.PROBLEM, found, effect, f"--log.max_range_m {below_m:g}")
 
 
 def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
@@ -123,34 +123,34 @@ def _duplicates(seen: Survey) -> Finding:
 
 
 def _rest(seen: Survey) -> Finding:
-    """How long the surroundings do not change, and the wheels, where there are any, do not move."""
-    still = seen.changes_m < _STILL_M
-    if len(seen.wheels) > 1:
-        still &= ~_wheels_move(seen)
-    steps_s = np.diff(seen.log_ns) * 1e-9
-    still_s = float(steps_s[still].sum())
-    moving = np.flatnonzero(~still)
-    first_s = float(steps_s[: moving[0]].sum()) if len(moving) else still_s
-    total_s = float(steps_s.sum())
-    found = f"{still_s:.1f} of {total_s:.1f} s look the same from scan to scan, {first_s:.1f} s of it at the start"
-    if len(still) and not len(moving):
+    """How long the surroundings do not change and the wheels, where there are any, do not move."""
+    rests = [_until_wheels_move(seen, rest) for rest in seen.rests]
+    rests = [rest for rest in rests if rest.duration_s >= LEAST_S]
+    still_s = sum(rest.duration_s for rest in rests)
+    first_s = rests[0].duration_s if rests and rests[0].first == 0 else 0.0
+    total_s = float(seen.log_ns[-1] - seen.log_ns[0]) * 1e-9
+    found = (
+        f"{still_s:.1f} of {total_s:.1f} s nothing changes from scan to scan, {first_s:.1f} s of it at the start"
+    )
+    if rests and rests[0].last - rests[0].first == len(seen.scans) - 1:
         effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
         return Finding("rest", Severity.WARNING, found, effect)
-    if first_s > _STILL_S:
+    if first_s > _LONG_REST_S:
         effect = "it does no harm, but takes time"
         return Finding("rest", Severity.NOTE, found, effect, f"--start {np.floor(first_s):g}")
     return Finding("rest", Severity.OK, found)
 
 
-def _wheels_move(seen: Survey) -> NDArray[np.bool_]:
-    """(N-1,) whether the wheels tell a motion from each scan to the next."""
-    stamps_ns = np.array([pose.stamp_ns for pose in seen.wheels], np.int64)
-    order = np.argsort(stamps_ns, kind="stable")
-    place = np.clip(np.searchsorted(stamps_ns[order], seen.stamps_ns), 0, len(order) - 1)
-    poses = np.array([pose.T_parent_child for pose in seen.wheels])[order][place]
-    moved_m = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
-    turned = np.linalg.norm(np.diff(poses[:, :-1, :-1], axis=0), axis=(1, 2))
-    return (moved_m > _WHEELS_MOVE_M) | (turned > _WHEELS_MOVE_M)
+def _until_wheels_move(seen: Survey, rest: Rest) -> Rest:
+    """The rest up to where the wheels tell a motion."""
+    begin_ns, end_ns = seen.stamps_ns[rest.first], seen.stamps_ns[rest.last]
+    poses = [pose for pose in seen.wheels if begin_ns <= pose.stamp_ns <= end_ns]
+    for pose in poses:
+        if np.abs(pose.T_parent_child - poses[0].T_parent_child).max() > _WHEELS_MOVE:
+            stamps_ns = seen.stamps_ns[rest.first : rest.last + 1]
+            last = rest.first + max(int(np.count_nonzero(stamps_ns <= pose.stamp_ns)) - 1, 0)
+            return rest._replace(last=last, end_ns=int(seen.log_ns[last]))
+    return rest
 
 
 def _mounting(seen: Survey) -> Finding:

@@ -77,6 +77,8 @@ def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
     for field in message.fields:
         if field.name == name and field.datatype in _FORMATS:
             number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+            if field.offset + number.itemsize > message.point_step:
+                return None
             point = np.dtype({
                 "names": [name],
                 "formats": [number.str],

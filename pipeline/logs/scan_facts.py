@@ -15,7 +15,8 @@ from pipeline.logs.limits import Returns
 from pipeline.logs.point_cloud import PointCloudDecoder, PointCloudMessage, column
 
 RING_FIELDS = ("ring", "line", "channel")
-_BINS = 72  # of azimuth, in an outline
+_AZIMUTHS, _ELEVATIONS = 72, 64  # cells of an outline
+_STEEPEST = 0.7  # sine of the elevation of the uppermost cells
 _OUTLINE_POINTS = 8192
 
 
@@ -32,7 +33,7 @@ class ScanFacts(NamedTuple):
     time_span_s, first_time_s : of the per-point times, NaN where there are none
     rings : rings with returns, 0 where points do not tell
     digest : of the measurements, equal for equal ones
-    outline : (B,) metres, mean distance by azimuth, NaN where nothing was seen
+    outline : (C,) metres, mean distance in each cell of direction, NaN where nothing was seen
     """
 
     stamp_ns: int
@@ -110,10 +111,19 @@ def _facts(
 
 
 def _outline(points: RawPoints) -> NDArray[np.float64]:
-    """Mean horizontal distance by azimuth, of every so-many-th point."""
+    """Mean distance by direction, of every so-many-th point."""
     some = points[:: max(1, len(points) // _OUTLINE_POINTS)].astype(np.float64)
-    turn = (np.arctan2(some[:, 1], some[:, 0]) / (2.0 * np.pi) + 0.5) * _BINS
-    place = np.minimum(turn.astype(np.int64), _BINS - 1)
-    counts = np.bincount(place, minlength=_BINS)
-    total_m = np.bincount(place, np.hypot(some[:, 0], some[:, 1]), minlength=_BINS)
-    return np.where(counts > 0, total_m / np.maximum(counts, 1), np.nan)
+    ranges_m = np.sqrt(np.sum(np.square(some), axis=1))
+    cell = _cell(np.arctan2(some[:, 1], some[:, 0]) / np.pi, _AZIMUTHS)
+    count = _AZIMUTHS
+    if points.shape[1] == 3:
+        cell = cell * _ELEVATIONS + _cell(some[:, 2] / np.maximum(ranges_m, 1e-9) / _STEEPEST, _ELEVATIONS)
+        count *= _ELEVATIONS
+    seen = np.bincount(cell, minlength=count)
+    total_m = np.bincount(cell, ranges_m, minlength=count)
+    return np.where(seen > 0, total_m / np.maximum(seen, 1), np.nan)
+
+
+def _cell(place: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Which of ``count`` equal parts of [-1, 1] a number lies in."""
+    return np.clip((0.5 * (place + 1.0) * count).astype(np.int64), 0, count - 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,11 @@ from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.log import Log
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
+from pipeline.logs.rest import Rest, RestWatch
 from pipeline.logs.scan_facts import ScanFacts, facts_of
 from pipeline.logs.stream import decoded_messages
+
+_FORGOTTEN = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +26,9 @@ class Survey:
 
     Attributes
     ----------
-    scans : facts of each readable scan, in the order of log time
+    scans : facts of each readable scan, in the order of log time, their outlines left out
     log_ns, stamps_ns : (N,) int64 log times and header stamps of those scans
+    rests : when the surroundings stayed as they were, for a second or more
     wheels : poses of the wheels, in the order of log time; empty where there are none
     malformed : what is wrong with each message that is not readable
     point_times : what a run assumes about per-point times
@@ -36,6 +39,7 @@ class Survey:
     scans: tuple[ScanFacts, ...]
     log_ns: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
+    rests: tuple[Rest, ...]
     wheels: tuple[StampedPose, ...]
     malformed: tuple[str, ...]
     point_times: str
@@ -49,16 +53,6 @@ class Survey:
             if len(steps_s) and np.median(steps_s) > 0.0:
                 return float(np.median(steps_s))
         return 0.0
-
-    @property
-    def changes_m(self) -> NDArray[np.float64]:
-        """(N-1,) median change of distance by azimuth from each scan to the next, inf where nothing compares."""
-        changes_m = np.full(max(len(self.scans) - 1, 0), np.inf)
-        for place, (before, after) in enumerate(pairwise(self.scans)):
-            both = np.isfinite(before.outline) & np.isfinite(after.outline)
-            if both.any():
-                changes_m[place] = np.median(np.abs(after.outline[both] - before.outline[both]))
-        return changes_m
 
     def share(self, part: Callable[[ScanFacts], int]) -> float:
         """A count of beams over all beams of all scans."""
@@ -74,12 +68,14 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     log_ns: list[int] = []
     wheels: list[StampedPose] = []
     malformed: list[str] = []
+    watch = RestWatch(log.dimension)
     for message in decoded_messages(
         log.indexes, decoders, log.span, ahead=log.config.prefetch_chunks, damage=damage
     ):
         match message.value:
             case ScanFacts() as facts:
-                scans.append(facts)
+                scans.append(facts._replace(outline=_FORGOTTEN))
+                watch.take(facts.outline, message.log_time_ns)
                 log_ns.append(message.log_time_ns)
                 if progress is not None:
                     progress(len(scans), log.scan_count)
@@ -87,18 +83,20 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
                 wheels.append(pose)
             case MalformedMessageError() as error if message.channel.topic == log.topic:
                 malformed.append(str(error))
+    watch.close()
     if not scans:
         reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
         raise InputError(f"{log.paths[0]}: no scan of {log.topic} could be read: {reasons}")
     stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
     assumed = times.assumed if log.dimension == 3 else ""
     return Survey(
-        log,
-        tuple(scans),
-        np.array(log_ns, np.int64),
-        stamps_ns,
-        tuple(wheels),
-        tuple(malformed),
-        assumed,
-        tuple(damage),
+        log=log,
+        scans=tuple(scans),
+        log_ns=np.array(log_ns, np.int64),
+        stamps_ns=stamps_ns,
+        rests=tuple(watch.rests),
+        wheels=tuple(wheels),
+        malformed=tuple(malformed),
+        point_times=assumed,
+        damage=tuple(damage),
     )
