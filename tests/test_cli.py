@@ -267,7 +267,10 @@ def test_a_file_named_twice_is_refused(refused, tmp_path, office):
         (["simulate", "office", "x.mcap", "--duration", "long"], ["--duration", "simulate --help"]),
         (["simulate", "office", "x.tum"], ["x.tum", "x.mcap"]),
         (["sequence", "get", "mars"], ["'mars'", "demo-office"]),
-        (["sequence", "get", "intel", "--out", "logs"], ["intel.mcap", "download", "as MCAP"]),
+        (
+            ["sequence", "get", "mulran", "--out", "logs"],
+            ["mulran.mcap", "ask for a sequence", "scanchain convert"],
+        ),
         (["info", "absent.mcap"], ["absent.mcap", "check the path"]),
         (["evaluate", "absent.tum"], ["GT.tum", "--relations"]),
         (["evaluate", "absent.tum", "absent.tum"], ["absent.tum", "check the path"]),

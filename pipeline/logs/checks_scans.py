@@ -77,8 +77,8 @@ def _no_return(seen: Survey) -> Finding:
     found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"
     if farthest_m >= limit_m:
         return Finding("no return", Severity.OK, f"{found}; range limits take it out")
-    effect = "it stands for no return, but is taken for a wall that moves along"
-    return Finding("no return", Severity.PROBLEM, found, effect, f"--log.max_range_m {below_m:g}")
+    effect = "if it stands for no return, it is taken for a wall that moves along"
+    return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
 
 
 def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
