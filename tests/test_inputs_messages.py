@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import recorders
+from foxglove import Channel, Schema
 from foxglove import messages as fox
+from foxglove.channels import FrameTransformsChannel, PoseInFrameChannel
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros1.decoder import DecoderFactory
@@ -100,6 +102,45 @@ def test_a_foxglove_cloud_is_moved_to_where_its_pose_says(tmp_path):
     _, plain = read(recorders.foxglove_protobuf(tmp_path / "c.mcap", recorders.planar()))
     expected = np.column_stack([1.0 - plain[0].points[:, 1], 2.0 + plain[0].points[:, 0]])
     np.testing.assert_allclose(scans[0].points, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["protobuf", "json"])
+def test_foxglove_poses_and_transforms_are_wheels_and_mounting(tmp_path, form):
+    path = tmp_path / "a.mcap"
+    half = np.sin(0.25), np.cos(0.25)
+    place, turn = {"x": 0.25, "y": 0.0, "z": 0.0}, {"x": 0.0, "y": 0.0, "z": half[0], "w": half[1]}
+    context = recorders.Context()
+    with recorders.open_mcap(path, context=context):
+        recorders.LaserScanChannel("/lidar", context=context).log(
+            recorders.foxglove_scan(recorders.planar(1)[0]), log_time=STAMP_NS
+        )
+        if form == "protobuf":
+            position, orientation = fox.Vector3(**place), fox.Quaternion(**turn)
+            pose = fox.Pose(position=position, orientation=orientation)
+            stamp = fox.Timestamp(sec=STAMP_NS // SECOND, nsec=0)
+            wheels = fox.PoseInFrame(timestamp=stamp, frame_id="odom", pose=pose)
+            PoseInFrameChannel("/wheels", context=context).log(wheels, log_time=STAMP_NS)
+            transform = fox.FrameTransform(
+                timestamp=stamp, parent_frame_id="base_link", child_frame_id="laser",
+                translation=position, rotation=orientation,
+            )  # fmt: skip
+            tree = fox.FrameTransforms(transforms=[transform])
+            FrameTransformsChannel("/tf_static", context=context).log(tree, log_time=STAMP_NS)
+        else:
+            stamp = {"sec": STAMP_NS // SECOND, "nsec": 0}
+            told = {"timestamp": stamp, "frame_id": "odom", "pose": {"position": place, "orientation": turn}}
+            json_channel("foxglove.PoseInFrame", "/wheels", context).log(told, log_time=STAMP_NS)
+            told = {"timestamp": stamp, "parent_frame_id": "base_link", "child_frame_id": "laser"}
+            told |= {"translation": place, "rotation": turn}
+            json_channel("foxglove.FrameTransform", "/tf_static", context).log(told, log_time=STAMP_NS)
+    log, (scan,) = read(path, odometry_topic="/wheels")
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+    np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+
+
+def json_channel(name, topic, context):
+    schema = Schema(name=name, encoding="jsonschema", data=b'{"type": "object"}')
+    return Channel(topic, schema=schema, message_encoding="json", context=context)
 
 
 def test_every_foxglove_number_type_has_its_own_code(tmp_path):

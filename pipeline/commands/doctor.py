@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def doctor(ctx: click.Context, logs: tuple[Path, ...], topic: str | None, as_json: bool) -> None:
     """Look at every scan of a log: what is wrong, what it does to the result, and the flag that mends it.
 
-    Takes the same flags as a run, so that you can try whether one mends what was found.
+    Takes any key of the configuration as a run does, so that you can try whether a flag mends what was found.
 
     \b
     Examples:

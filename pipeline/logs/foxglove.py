@@ -85,7 +85,8 @@ class ToldTransforms(Protocol):
 
 def laser_scan(told: ToldScan) -> LaserScanMessage:
     """The scan, without range limits and times, which Foxglove does not tell."""
-    ranges_m = np.array(told.ranges, np.float32)
+    with np.errstate(over="ignore"):
+        ranges_m = np.array(told.ranges, np.float64).astype(np.float32)
     step_rad = (told.end_angle - told.start_angle) / max(len(ranges_m) - 1, 1)
     return LaserScanMessage(
         stamp_ns=_stamp_ns(told.timestamp),

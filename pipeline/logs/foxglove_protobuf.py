@@ -19,7 +19,7 @@ def parser(channel: Channel) -> Callable[[memoryview], Any]:
     schema = Schema(data=channel.definition, encoding="protobuf", id=1, name=channel.type_name)
     try:
         decode = DecoderFactory().decoder_for("protobuf", schema)
-    except (McapError, DecodeError, TypeError) as error:
+    except (McapError, DecodeError, TypeError, KeyError, RecursionError) as error:
         reason = f"its schema {channel.type_name} is broken: {' '.join(str(error).split())}"
         return lambda _: _complain(reason)
     assert decode is not None

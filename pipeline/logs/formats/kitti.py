@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data import Matrix
+from pipeline.data import Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.logs.formats.cloud_file import read_xyzi
 from pipeline.logs.formats.kitti_truth import (
@@ -24,9 +24,10 @@ from pipeline.logs.formats.kitti_truth import (
 from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
 from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import pack_cloud, pack_odometry, place
-from pipeline.logs.records import Block, Contents, FileIndex, Message
+from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 
 _TRUTH = -1  # the block of the ground truth
+_POSE_BYTES = 720
 
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
@@ -82,30 +83,34 @@ def _index(
     lidar = made_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
     for entry, file in enumerate(files):
         made_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
-    channels = {lidar.key[1]}
-    count = min(len(truth_ns), len(truth))
-    if count:
+    told = list(zip(truth_ns, truth, strict=False))
+    if told:
         poses = made_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-        channels.add(poses.key[1])
-        made_block(index, _TRUTH, 720 * count, truth_ns[:count], {poses: count})
+        made_block(index, _TRUTH, _POSE_BYTES * len(told), [stamp_ns for stamp_ns, _ in told], {poses: len(told)})
 
     def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        number = block.entries[0].channel
-        if wanted is not None and number not in wanted:
+        channel = index.channels[block.entries[0].channel]
+        if wanted is not None and channel.key[1] not in wanted:
             return Contents([], "")
-        channel = index.channels[number]
         if block.offset == _TRUTH:
-            told = [
-                (stamp, pack_odometry(stamp, "world", "velodyne", place(T)))
-                for stamp, T in zip(truth_ns[:count], truth[:count], strict=True)
-            ]
-            return Contents([Message(channel, stamp, memoryview(data)) for stamp, data in told], "")
-        file, stamp_ns = files[block.offset], block.start_ns
-        try:
-            data = pack_cloud(stamp_ns, "velodyne", read_xyzi(file))
-        except (CloudFileError, OSError) as error:
-            return Contents([], f"{file}: {error}; it was left out")
-        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+            return _truth(channel, told)
+        return _sweep(channel, files[block.offset], block.start_ns)
 
     index.make = make
     return index
+
+
+def _sweep(channel: Channel, file: Path, stamp_ns: int) -> Contents:
+    try:
+        data = pack_cloud(stamp_ns, "velodyne", read_xyzi(file))
+    except (CloudFileError, OSError) as error:
+        return Contents([], f"{file}: {error}; it was left out")
+    return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+
+
+def _truth(channel: Channel, told: Sequence[tuple[int, Pose]]) -> Contents:
+    messages = []
+    for stamp_ns, T_world_lidar in told:
+        data = pack_odometry(stamp_ns, "world", "velodyne", place(T_world_lidar))
+        messages.append(Message(channel, stamp_ns, memoryview(data)))
+    return Contents(messages, "")
