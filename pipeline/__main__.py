@@ -10,6 +10,8 @@ from pathlib import Path
 import click
 
 from pipeline.commands.config import config
+from pipeline.commands.convert import convert
+from pipeline.commands.doctor import doctor
 from pipeline.commands.evaluate import evaluate
 from pipeline.commands.info import info
 from pipeline.commands.run import run
@@ -36,7 +38,7 @@ def scanchain() -> None:
     """
 
 
-for _command in (run, view, info, simulate, evaluate, config, sequence):
+for _command in (run, view, info, doctor, convert, simulate, evaluate, config, sequence):
     scanchain.add_command(_command)
 
 

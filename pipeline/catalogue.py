@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
 
+from pipeline.download import fetch
 from pipeline.errors import InputError
+from pipeline.logs.convert import convert
 from pipeline.simulate import simulate
 
 Sha256 = Annotated[str, Meta(pattern="^([0-9a-f]{64}|unknown)$")]
@@ -29,11 +33,27 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind
 
 
 class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="download"):
-    """A recording that others publish; ``reference_url`` is what it is judged by, empty if there is nothing."""
+    """A recording that others publish, in a form that ``scanchain convert`` takes.
 
+    ``page`` is where its authors describe it. ``reference_url`` is what it is judged by, or calibrated with, empty
+    if there is nothing. Of an archive ``converts`` is the folder in it that becomes the log.
+    """
+
+    page: str
     url: str
     sha256: Sha256
     reference_url: str = ""
+    converts: str = ""
+
+
+class Page(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="page"):
+    """A recording that only a person can fetch, because it asks for an account or its files have no fixed address.
+
+    ``steps`` says what to fetch there and how it becomes MCAP.
+    """
+
+    page: str
+    steps: str
 
 
 class Local(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="file"):
@@ -52,7 +72,7 @@ class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     conversion: str
     ground_truth: str
     licence: str
-    source: Simulated | Download | Local
+    source: Simulated | Download | Page | Local
 
 
 def names() -> tuple[str, ...]:
@@ -78,7 +98,10 @@ def read(file: Path) -> Sequence:
 def prepare(
     name: str, folder: Path, *, force: bool = False, progress: Callable[[int, int], None] | None = None
 ) -> Path:
-    """The path of the sequence's log in ``folder``; a simulated one is made unless it is there already."""
+    """The path of the sequence's log in ``folder``; made, or fetched and converted, unless it is there already.
+
+    progress : told of scans made, or of MiB fetched, so many of all
+    """
     source = load(name).source
     destination = folder / f"{name}.mcap"
     if destination.exists() and not force:
@@ -98,12 +121,40 @@ def prepare(
                 progress=progress,
             )
         case Download():
-            raise InputError(
-                f"{destination}: {name} is not fetched by itself; download {source.url} and put it there as MCAP"
-            )
+            convert([_download(name, source, folder, progress)], destination, force=True)
+        case Page():
+            raise InputError(f"{destination}: {name} cannot be fetched by itself; {source.page}: {source.steps}")
         case Local():
             raise InputError(f"{destination}: absent; put {source.path} there as MCAP")
     return destination
+
+
+def _download(name: str, source: Download, folder: Path, progress: Callable[[int, int], None] | None) -> Path:
+    """Fetch the recording and what belongs to it; the file or folder that is to be converted."""
+    sha256 = "" if source.sha256 == "unknown" else source.sha256
+    recording = folder / _file_name(source.url)
+    fetch(source.url, recording, sha256=sha256, progress=progress)
+    if source.reference_url:
+        fetch(source.reference_url, folder / _file_name(source.reference_url))
+    if not source.converts:
+        return recording
+    unpacked = folder / f"{name}-unpacked"
+    for url in filter(None, (source.url, source.reference_url)):
+        _unpack(folder / _file_name(url), unpacked)
+    return unpacked / source.converts
+
+
+def _unpack(archive: Path, destination: Path) -> None:
+    """The files of a ZIP archive; whatever their names, they stay below the destination."""
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            packed.extractall(destination)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise InputError(f"{archive}: does not unpack ({error}); delete it and call again") from error
+
+
+def _file_name(url: str) -> str:
+    return Path(urlsplit(url).path).name
 
 
 def _folder() -> Path:

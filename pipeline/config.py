@@ -18,6 +18,7 @@ Optimiser = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-d
 class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """What is read from the log. Empty topics are found automatically.
 
+    ``rate_hz`` is how often the scans of a folder come whose files are not named by their stamps.
     ``point_times`` is the unit of the per-point times, or the sense in which a lidar without any spins; it takes
     ``revolution_s`` for a turn that begins, at the stamp, at the azimuth ``revolution_start_rad`` (π is the rear).
     """
@@ -28,6 +29,7 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
     start_s: NonNegative = 0.0
     end_s: Positive = float("inf")
     every: Count = 1
+    rate_hz: NonNegative = 0.0
     bad_scans: Literal["stop", "skip"] = "stop"
     min_range_m: NonNegative = 0.0
     max_range_m: Positive = float("inf")

@@ -126,7 +126,7 @@ def test_no_such_file(refused, tmp_path):
 
 
 def test_a_directory(refused, tmp_path):
-    says(refused("run", tmp_path, "--out", tmp_path / "a"), tmp_path, "name the .mcap files in it")
+    says(refused("run", tmp_path, "--out", tmp_path / "a"), tmp_path, "is a folder of no log that is known")
 
 
 def test_an_empty_file(refused, tmp_path):
@@ -134,10 +134,10 @@ def test_an_empty_file(refused, tmp_path):
     says(refused("run", tmp_path / "x.mcap", "--out", tmp_path / "a"), tmp_path / "x.mcap", "copy it again")
 
 
-def test_not_an_mcap(refused, tmp_path):
+def test_a_bag_that_is_none(refused, tmp_path):
     (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n" * 9)
     text = refused("run", tmp_path / "x.bag", "--out", tmp_path / "a")
-    says(text, tmp_path / "x.bag", "not an MCAP", "convert it to MCAP")
+    says(text, tmp_path / "x.bag", "cannot be read as a ROS bag", "reindex")
 
 
 def test_a_log_without_a_lidar_lists_what_it_holds(refused, tmp_path):
@@ -267,7 +267,10 @@ def test_a_file_named_twice_is_refused(refused, tmp_path, office):
         (["simulate", "office", "x.mcap", "--duration", "long"], ["--duration", "simulate --help"]),
         (["simulate", "office", "x.tum"], ["x.tum", "x.mcap"]),
         (["sequence", "get", "mars"], ["'mars'", "demo-office"]),
-        (["sequence", "get", "intel", "--out", "logs"], ["intel.mcap", "download", "as MCAP"]),
+        (
+            ["sequence", "get", "mulran", "--out", "logs"],
+            ["mulran.mcap", "ask for a sequence", "scanchain convert"],
+        ),
         (["info", "absent.mcap"], ["absent.mcap", "check the path"]),
         (["evaluate", "absent.tum"], ["GT.tum", "--relations"]),
         (["evaluate", "absent.tum", "absent.tum"], ["absent.tum", "check the path"]),
@@ -288,7 +291,7 @@ def test_a_time_difference_that_is_none_is_refused(refused, office, limit):
 
 
 def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, office):
-    def broken(paths):
+    def broken(*_):
         raise RuntimeError("two\nlines")
 
     monkeypatch.setattr("pipeline.logs.info.describe", broken)
@@ -302,7 +305,7 @@ def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, of
 
 
 def test_ctrl_c_is_one_line_with_exit_code_1(call, monkeypatch, office):
-    def interrupted(paths):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pipeline.logs.info.describe", interrupted)

@@ -47,7 +47,7 @@ def test_no_such_file(tmp_path):
 
 
 def test_a_directory(tmp_path):
-    says(complaint(tmp_path), "directory", ".mcap")
+    says(complaint(tmp_path), "is a folder of no log", "give MCAP")
 
 
 def test_an_empty_file(tmp_path):
@@ -55,12 +55,16 @@ def test_an_empty_file(tmp_path):
     says(complaint(tmp_path / "a.mcap"), "empty")
 
 
-@pytest.mark.parametrize(
-    "content", [b"#ROSBAG V2.0\n" * 10, b"x", b"\x89MCAP", b"\x89MCAP0\r", b"SQLite format 3\0"]
-)
-def test_a_file_that_is_no_mcap(tmp_path, content):
+@pytest.mark.parametrize("content", [b"x", b"\x89MCAP", b"\x89MCAP0\r", b"{}", b"\0" * 100])
+def test_a_file_that_is_no_log(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
-    says(complaint(tmp_path / "a.mcap"), "not an MCAP", "convert it")
+    says(complaint(tmp_path / "a.mcap"), "is no log that is known", repr(content[:8]), "give MCAP")
+
+
+@pytest.mark.parametrize("content", [b"#ROSBAG V2.0\n" * 10, b"#ROSBAG V1.2\n", b"SQLite format 3\0"])
+def test_a_bag_that_is_none(tmp_path, content):
+    (tmp_path / "a.mcap").write_bytes(content)
+    says(complaint(tmp_path / "a.mcap"), "cannot be read as a ROS bag", "reindex")
 
 
 def test_the_magic_and_nothing_else(tmp_path):
@@ -124,8 +128,8 @@ def test_an_odometry_topic_that_is_absent_is_named(tmp_path):
 
 
 def test_a_scan_of_another_encoding_is_no_lidar(tmp_path):
-    path = write(tmp_path / "a.mcap", office(2), message_encoding="ros1", encoding="ros1msg")
-    says(complaint(path), "lidar", "/scan", "ros1")
+    path = write(tmp_path / "a.mcap", office(2), message_encoding="cbor", encoding="ros2msg")
+    says(complaint(path), "lidar", "/scan", "cbor", "sensor_msgs/LaserScan")
 
 
 def test_a_part_of_the_log_without_scans_says_so(tmp_path):

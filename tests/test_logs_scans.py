@@ -30,7 +30,7 @@ from pipeline import lie
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
-from pipeline.logs.log import index_files
+from pipeline.logs.opening import index_files
 from pipeline.simulate import simulate
 
 

@@ -604,11 +604,6 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
     assert catalogue.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
 
 
-def test_a_recording_of_others_says_where_to_get_it(tmp_path):
-    with pytest.raises(InputError, match=r"download http.*intel\.clf and put it there as MCAP"):
-        catalogue.prepare("intel", tmp_path)
-
-
 def test_an_unknown_sequence_names_the_known_ones():
     with pytest.raises(InputError, match="demo-office, demo-town"):
         catalogue.load("mars")

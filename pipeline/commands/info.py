@@ -10,24 +10,29 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.settings import load_settings
+
 if TYPE_CHECKING:
     from pipeline.logs.info import LogInfo
 
 
-@click.command()
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def info(logs: tuple[Path, ...], as_json: bool) -> None:
-    """Print what is in a log: topics, types, rates, and what a run would use.
+@click.pass_context
+def info(ctx: click.Context, logs: tuple[Path, ...], as_json: bool) -> None:
+    """Print what is in a log: topics, types, rates, and what a run with the same flags would use.
 
     \b
     Examples:
       scanchain info log.mcap
       scanchain info part_0.mcap part_1.mcap --json
+      scanchain info drive.bag --log.topic /lidar_front/points
     """
     from pipeline.logs.info import describe
 
-    description = describe(logs)
+    description = describe(logs, load_settings(overrides=overrides(ctx)).config.log)
     click.echo(json.dumps(asdict(description), indent=2) if as_json else _text(description))
 
 
@@ -47,6 +52,7 @@ def _text(log: LogInfo) -> str:
             f"lidar     {log.lidar}: {log.dimension}D, {log.scans:,} scans",
             f"mounting  at x {x:.3f} m, y {y:.3f} m on the base",
             f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
+            *([f"times     {log.point_times.removeprefix('point times: ')}"] if log.point_times else []),
         ]
     lines += [f"note      {note}" for note in log.notes]
     lines += [f"damage    {line}" for line in log.damage]

@@ -56,13 +56,15 @@ def run(
 ) -> None:
     """Make a trajectory, a map and a recording of a log.
 
-    LOG is an MCAP file; several are read as one log. Any key of the configuration is a flag, see scanchain config
-    show.
+    LOG is an MCAP file, or anything that scanchain convert takes; several are read as one log. Any key of the
+    configuration is a flag, see scanchain config show.
 
     \b
     Examples:
       scanchain run log.mcap --out runs/log
       scanchain run log.mcap --out runs/log --rerun save,spawn
+      scanchain run intel.clf.bz2 --out runs/intel
+      scanchain run scans/ --out runs/scans --log.rate_hz 10
       scanchain run part_0.mcap part_1.mcap --out runs/log --topic /lidar_front/points
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json

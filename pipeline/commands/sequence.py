@@ -56,16 +56,20 @@ def list_sequences(as_json: bool) -> None:
 @click.option("--force", is_flag=True, help="Make it again even if it is there.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
-    """Make a log of the catalogue, unless it is there already, and print where it lies.
+    """Make a log of the catalogue, or fetch and convert it, unless it is there, and print where it lies.
+
+    A download that was broken off goes on where it was. Of recordings that ask for an account it says what to do.
 
     \b
     Examples:
       scanchain sequence get demo-office
       scanchain sequence get demo-town --out logs --force
+      scanchain sequence get intel
     """
     from pipeline import catalogue
     from pipeline.commands.terminal import Terminal
 
-    with Terminal("scans") as terminal:
+    unit = "MiB" if isinstance(catalogue.load(name).source, catalogue.Download) else "scans"
+    with Terminal(unit) as terminal:
         path = catalogue.prepare(name, out, force=force, progress=terminal.count)
     click.echo(json.dumps({"name": name, "path": str(path)}) if as_json else path)

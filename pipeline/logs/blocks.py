@@ -8,31 +8,25 @@ import zlib
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from io import BytesIO
-from typing import NamedTuple
 
 import lz4.frame
 import zstandard
 
-from pipeline.logs.records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD, SCHEMA, Block, Channel, FileIndex
+from pipeline.logs.records import (
+    CHANNEL,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD,
+    SCHEMA,
+    Block,
+    Contents,
+    FileIndex,
+    Message,
+)
 
 
 class DamagedBlockError(Exception):
     """A block whose contents cannot be trusted; the message says which and why."""
-
-
-class Message(NamedTuple):
-    """One message: its channel, when it was logged, and its bytes."""
-
-    channel: Channel
-    log_time_ns: int
-    data: memoryview
-
-
-class Contents(NamedTuple):
-    """The messages of a block in the order of the file; ``damage`` says what is missing behind them."""
-
-    messages: list[Message]
-    damage: str
 
 
 def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
@@ -40,6 +34,8 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
     Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
+    if index.make is not None:
+        return index.make(block, wanted)
     payload = memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
     messages: list[Message] = []
     strangers = 0
@@ -64,7 +60,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
 def release(index: FileIndex, block: Block) -> None:
     """Let go of a block's bytes of the file, so that memory does not grow with what has been read."""
-    if hasattr(index.data, "madvise"):
+    if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
         begin = block.offset - block.offset % mmap.PAGESIZE
         index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
 

@@ -46,13 +46,17 @@ class CdrReader:
         count = self.integer()
         kind = _FLOATS[self.order]
         if count:
-            self.offset += (4 - self.offset) % kind.itemsize
+            self.align(kind.itemsize)
         end = self.offset + kind.itemsize * count
         if end > len(self.data):
             self._complain(end)
         values = np.frombuffer(self.data, kind, count, self.offset)
         self.offset = end
         return values
+
+    def align(self, size: int) -> None:
+        """Go on to the next multiple of ``size``."""
+        self.offset += (4 - self.offset) % size
 
     def octets(self) -> memoryview:
         """A string's or byte sequence's contents, a string's final zero included."""

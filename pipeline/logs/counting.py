@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.blocks import DamagedBlockError, Message, read_block
-from pipeline.logs.records import Block, FileIndex
+from pipeline.logs.blocks import DamagedBlockError, read_block
+from pipeline.logs.records import Block, FileIndex, Message
 
 
 def complete(index: FileIndex) -> None:
@@ -46,6 +46,8 @@ def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64
     for entry in block.entries:
         if entry.channel == channel and entry.offset >= 0:
             return np.frombuffer(index.data, "<u8", 2 * entry.messages, entry.offset)[::2]
+        if entry.channel == channel and index.make is not None and block.start_ns == block.end_ns:
+            return np.full(entry.messages, block.start_ns, np.uint64)
     if block.entries and all(entry.channel != channel for entry in block.entries):
         return np.empty(0, np.uint64)
     messages = messages_of(index, block)

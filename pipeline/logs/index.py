@@ -179,7 +179,7 @@ class _Walk:
         self.index.is_counted = True
 
 
-def _known_record(data: mmap.mmap, offset: int) -> int:
+def _known_record(data: mmap.mmap | bytes, offset: int) -> int:
     """The byte of the first record behind ``offset`` that the summary vouches for; 0 where there is no summary."""
     tail = RECORD.size + _FOOTER.size + len(MAGIC)
     if data[-len(MAGIC) :] != MAGIC or len(data) < tail + len(MAGIC):
@@ -198,8 +198,6 @@ def _known_record(data: mmap.mmap, offset: int) -> int:
 
 
 def _map(path: Path) -> mmap.mmap:
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; name the .mcap files in it")
     try:
         with path.open("rb") as file:
             if path.stat().st_size == 0:
@@ -211,8 +209,5 @@ def _map(path: Path) -> mmap.mmap:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be read ({reason}); check its permissions") from error
     if data[: len(MAGIC)] != MAGIC:
-        raise InputError(
-            f"{path}: is not an MCAP file (starts with {data[:8]!r}); "
-            "convert it to MCAP, ROS bags with: mcap convert or rosbags-convert"
-        )
+        raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     return data

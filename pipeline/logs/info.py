@@ -8,10 +8,12 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
-from pipeline.logs.log import Log, index_files
+from pipeline.logs.log import Log
+from pipeline.logs.opening import index_files
+from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
-from pipeline.logs.topics import kind
+from pipeline.logs.sizes import size_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,7 @@ class LogInfo:
     dimension: int
     scans: int
     odometry: str
+    point_times: str
     T_base_lidar: tuple[tuple[float, ...], ...]
     notes: tuple[str, ...]
     damage: tuple[str, ...]
@@ -50,12 +53,13 @@ class LogInfo:
 
 def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
-    indexes = index_files(paths)
+    config = config or LogConfig()
+    indexes = index_files(paths, config.rate_hz)
     whole = whole_span(indexes)
-    log, problem = _open(indexes, config or LogConfig())
+    log, problem = _open(indexes, config)
     return LogInfo(
         files=tuple(str(path) for path in paths),
-        size_bytes=sum(path.stat().st_size for path in paths),
+        size_bytes=sum(size_of(path) for path in paths),
         start_ns=whole.begin_ns,
         duration_s=whole.duration_s,
         topics=_topics(indexes, whole.duration_s),
@@ -63,6 +67,7 @@ def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
         dimension=0 if log is None else log.dimension,
         scans=0 if log is None else log.scan_count,
         odometry="" if log is None else log.odometry_topic,
+        point_times="" if log is None else log.assumed_point_times(),
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         notes=() if log is None else tuple(log.notes),
         damage=tuple(line for index in indexes for line in index.damage),

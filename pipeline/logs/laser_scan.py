@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.cdr import CdrReader
-from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
+from pipeline.data import Pose
+from pipeline.logs.cdr import CdrReader, MalformedMessageError
+from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns, moved
 
 _MOST_GEOMETRIES = 16
 _NEAREST_M = float(np.finfo(np.float32).tiny)
@@ -16,7 +18,10 @@ _FARTHEST_M = float(np.finfo(np.float32).max)
 
 
 class LaserScanMessage(NamedTuple):
-    """A sensor_msgs/LaserScan as it is: radians, seconds, metres; intensities are passed over."""
+    """A sensor_msgs/LaserScan as it is: radians, seconds, metres; intensities are passed over.
+
+    ``T_frame_scan`` (4, 4) is where the scan lies in its frame, None where that is its origin.
+    """
 
     stamp_ns: int
     frame: str
@@ -28,17 +33,36 @@ class LaserScanMessage(NamedTuple):
     range_min_m: float
     range_max_m: float
     ranges_m: NDArray[np.float32]
+    T_frame_scan: Pose | None = None
 
 
-def read_laser_scan(data: memoryview) -> LaserScanMessage:
+def read_laser_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
     """Take a message apart; the ranges are a view of it."""
-    reader = CdrReader(data)
+    reader = form(data)
     stamp_ns, frame = reader.header()
     first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
     ranges_m = reader.floats()
     return LaserScanMessage(
         stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
     )
+
+
+def read_multi_echo_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
+    """A sensor_msgs/MultiEchoLaserScan as the scan of each beam's first echo, inf where there is none."""
+    reader = form(data)
+    stamp_ns, frame = reader.header()
+    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
+    ranges_m = np.full(_believed(reader.integer(), len(data)), np.inf, np.float32)
+    for beam in range(len(ranges_m)):
+        echoes_m = reader.floats()
+        if len(echoes_m):
+            ranges_m[beam] = echoes_m[0]
+    return LaserScanMessage(
+        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
+    )
+
+
+ReadLaserScan = Callable[[memoryview], LaserScanMessage]
 
 
 class Geometry(NamedTuple):
@@ -51,19 +75,23 @@ class Geometry(NamedTuple):
 class LaserScanDecoder:
     """Decodes scans; directions are computed once for each geometry and shared, also between threads."""
 
-    def __init__(self, limits: RangeLimits) -> None:
+    def __init__(self, limits: RangeLimits, read: ReadLaserScan = read_laser_scan) -> None:
         self.limits = limits
+        self.read = read
         self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
 
     def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's beams."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: LaserScanMessage) -> Returns:
         """Points of the beams that came back: finite, at least range_min, below range_max.
 
         Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
         not positive are taken as unknown. Negative angle increments are as good as positive ones.
         """
-        message = read_laser_scan(data)
         ranges_m = message.ranges_m
-        low_m, high_m = self._limits(message)
+        low_m, high_m = self.limits_of(message)
         geometry = self._geometry(message)
         valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
         if len(valid) == len(ranges_m):
@@ -72,11 +100,12 @@ class LaserScanDecoder:
         else:
             points = geometry.directions[valid] * ranges_m[valid, None]
             times_s = geometry.times_s[valid] if len(geometry.times_s) else NO_TIMES
-        points = points.astype(np.float32, copy=False)
+        points = moved(points, message.T_frame_scan).astype(np.float32, copy=False)
         why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
 
-    def _limits(self, message: LaserScanMessage) -> tuple[float, float]:
+    def limits_of(self, message: LaserScanMessage) -> tuple[float, float]:
+        """The least range that counts, and the one from which on none does."""
         low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
         high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
         return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)
@@ -89,6 +118,12 @@ class LaserScanDecoder:
                 self.geometries = {}
             geometry = self.geometries[key] = _geometry(*key)
         return geometry
+
+
+def _believed(beams: int, size: int) -> int:
+    if 4 * beams > size:
+        raise MalformedMessageError(f"it claims {beams} beams, more than its {size} bytes can hold")
+    return beams
 
 
 def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:

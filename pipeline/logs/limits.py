@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import RawPoints
+from pipeline.data import Pose, RawPoints
 
 
 class RangeLimits(NamedTuple):
@@ -33,3 +33,11 @@ class Returns(NamedTuple):
 
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
+
+
+def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
+    """Points (N, d) in the frame in which they were told to lie; None stands for its origin."""
+    if T_frame_cloud is None:
+        return points
+    d = points.shape[1]
+    return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)

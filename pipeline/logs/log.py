@@ -1,10 +1,9 @@
-"""A log: one or several MCAP files, read as a stream of scans."""
+"""A log: files or folders of any format that is known, read as a stream of scans."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -13,20 +12,20 @@ import numpy as np
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
-from pipeline.logs.counting import complete
-from pipeline.logs.index import index_file
+from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
 from pipeline.logs.limits import RangeLimits, Returns
 from pipeline.logs.mounting import find_mounting, in_plane, is_upside_down
+from pipeline.logs.opening import index_files
 from pipeline.logs.point_cloud import PointCloudDecoder
 from pipeline.logs.point_times import PointTimes
-from pipeline.logs.poses import decode_odometry, decode_pose
+from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
-from pipeline.logs.topics import LASER_SCAN, ODOMETRY, find_ground_truth, find_lidar, find_odometry, kind
+from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
 from pipeline.logs.wheels import WheelTrack
 
 _DEFAULTS = LogConfig()
@@ -36,19 +35,9 @@ _REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --t
 
 
 def open_log(paths: Path | str | Sequence[Path | str], config: LogConfig = _DEFAULTS) -> Log:
-    """One file, or several as one log, topics chosen. Raises InputError for what cannot be read or chosen."""
+    """A file or folder, or several as one log, topics chosen. Raises InputError for what cannot be read."""
     named = [paths] if isinstance(paths, Path | str) else paths
-    return Log(index_files([Path(path) for path in named]), config)
-
-
-def index_files(paths: Sequence[Path]) -> list[FileIndex]:
-    """What lies where in the files, every channel known and counted. Raises InputError."""
-    if not paths:
-        raise InputError("no log was named; give at least one .mcap file")
-    indexes = [index_file(path, number) for number, path in enumerate(paths)]
-    for index in indexes:
-        complete(index)
-    return indexes
+    return Log(index_files([Path(path) for path in named], config.rate_hz), config)
 
 
 class Log:
@@ -57,7 +46,7 @@ class Log:
     Attributes
     ----------
     paths : its files
-    topic, dimension : the lidar's topic; 2 for LaserScan, 3 for PointCloud2
+    topic, dimension : the lidar's topic; 2 for laser scans, 3 for clouds
     T_base_lidar : (d+1, d+1) mounting from /tf_static, the identity where the log does not say
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
@@ -70,14 +59,15 @@ class Log:
         self.config = config
         self.indexes = indexes
         self.paths = tuple(index.path for index in indexes)
-        self.notes: list[str] = []
+        self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self.dimension = 2 if kind(lidar) == LASER_SCAN else 3
+        self.lidar = lidar
+        self.dimension = 2 if is_scan(lidar) else 3
         whole = whole_span(indexes)
         self.duration_s = whole.duration_s
         self.span = chosen_span(whole, config)
@@ -87,9 +77,7 @@ class Log:
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.damage: list[str] = [line for index in indexes for line in index.damage]
         self.pose_decoders: Decoders = {
-            channel.topic: partial(
-                decode_odometry if kind(channel) == ODOMETRY else decode_pose, dimension=self.dimension
-            )
+            channel.topic: pose_reader(channel, self.dimension)
             for channel in (wheels, truth)
             if channel is not None
         }
@@ -152,6 +140,14 @@ class Log:
             waited_s=waited_s,
         )
 
+    def assumed_point_times(self) -> str:
+        """What a run assumes about per-point times, by the first scan that has returns; empty for a planar log."""
+        times = PointTimes(self.config)
+        if self.dimension == 3:
+            returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
+            next((each for each in returns if len(each.points)), None)
+        return times.assumed if self.dimension == 3 else ""
+
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         if self._truth is None and self.ground_truth_topic:
@@ -164,9 +160,7 @@ class Log:
 
     def _with_wheels(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the reading behind them."""
-        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        lidar = LaserScanDecoder(limits) if self.dimension == 2 else PointCloudDecoder(limits, times)
-        decoders = {self.topic: lidar.decode, **self.pose_decoders}
+        decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         for message in self._messages(decoders, self.damage):
             if message.channel.topic == self.topic:
@@ -177,6 +171,13 @@ class Log:
                 yield waiting[0], poses.wheels_at(waiting.popleft())
         while waiting:
             yield waiting[0], poses.wheels_at(waiting.popleft())
+
+    def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
+        """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
+        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
+        if self.dimension == 2:
+            return LaserScanDecoder(limits, scan_reader(self.lidar))
+        return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
 
     def _may_go(self, waiting: deque[Decoded], now_ns: int, wheels: WheelTrack) -> bool:
         first = waiting[0].value

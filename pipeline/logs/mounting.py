@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline import lie
 from pipeline.data import Pose
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.counting import messages_of
-from pipeline.logs.poses import StampedPose, chain, decode_odometry, decode_transforms
+from pipeline.logs.first_messages import first_messages
+from pipeline.logs.poses import StampedPose, chain
+from pipeline.logs.readers import (
+    cloud_reader,
+    has_transforms,
+    is_odometry,
+    is_scan,
+    pose_reader,
+    scan_reader,
+    transforms_reader,
+)
 from pipeline.logs.records import Channel, FileIndex
-from pipeline.logs.topics import ODOMETRY, TRANSFORMS, is_readable, kind, topics_of
-
-T = TypeVar("T")
+from pipeline.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_BLOCKS = 8  # of a topic, from the first on, that are searched
 
 
 def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, notes: list[str]) -> Pose:
@@ -26,10 +30,12 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     transforms = _static_transforms(indexes)
     if not transforms and wheels is None:
         return np.eye(4)
-    lidar_frame = next(_first(indexes, lidar.topic, lambda data: CdrReader(data).header()[1]), "")
+    read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
+    lidar_frame = next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "")
     base_frame = ""
-    if wheels is not None and kind(wheels) == ODOMETRY:
-        base_frame = next(_first(indexes, wheels.topic, lambda data: decode_odometry(data).child), "")
+    if wheels is not None and is_odometry(wheels):
+        told = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+        base_frame = "" if told is None else told.child
     for base in (base_frame, *_BASE_FRAMES) if base_frame else _BASE_FRAMES:
         T_base_lidar = chain(transforms, base, lidar_frame)
         if T_base_lidar is not None:
@@ -60,25 +66,7 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
-        if topic.endswith("tf_static") and kind(channel) == TRANSFORMS and is_readable(channel):
-            for transforms in _first(indexes, topic, decode_transforms):
+        if topic.endswith("tf_static") and has_transforms(channel):
+            for transforms in first_messages(indexes, topic, transforms_reader(channel)):
                 found += transforms
     return found
-
-
-def _first(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
-    """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
-    channels = {channel.key for index in indexes for channel in index.channels.values() if channel.topic == topic}
-    blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if not block.entries or any((block.file, entry.channel) in channels for entry in block.entries)
-    ]
-    for block in sorted(blocks, key=lambda block: block.start_ns)[:_BLOCKS]:
-        for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic:
-                try:
-                    yield decode(message.data)
-                except MalformedMessageError:
-                    continue

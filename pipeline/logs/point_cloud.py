@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import Pose
 from pipeline.kernels.point_cloud import keep_valid
 from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns
+from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns, moved
 from pipeline.logs.point_times import NAMES, PointTimes
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -28,7 +30,10 @@ class PointField(NamedTuple):
 
 
 class PointCloudMessage(NamedTuple):
-    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes that say how a point is laid out."""
+    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes that say how a point is laid out.
+
+    ``T_frame_cloud`` (4, 4) is where the cloud lies in its frame, None where that is its origin.
+    """
 
     stamp_ns: int
     frame: str
@@ -40,11 +45,12 @@ class PointCloudMessage(NamedTuple):
     row_step: int
     data: memoryview
     described: bytes
+    T_frame_cloud: Pose | None = None
 
 
-def read_point_cloud(data: memoryview) -> PointCloudMessage:
+def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
     """Take a message apart; the points are a view of it."""
-    reader = CdrReader(data)
+    reader = form(data)
     stamp_ns, frame = reader.header()
     height, width = reader.integer(), reader.integer()
     begin = reader.offset
@@ -63,6 +69,26 @@ def read_point_cloud(data: memoryview) -> PointCloudMessage:
     )
 
 
+ReadPointCloud = Callable[[memoryview], PointCloudMessage]
+
+
+def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
+    """One field of all points (N,), None where the cloud does not have it."""
+    for field in message.fields:
+        if field.name == name and field.datatype in _FORMATS:
+            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+            if field.offset + number.itemsize > message.point_step:
+                return None
+            point = np.dtype({
+                "names": [name],
+                "formats": [number.str],
+                "offsets": [field.offset],
+                "itemsize": message.point_step,
+            })  # fmt: skip
+            return _rows(message, point)[name]
+    return None
+
+
 class Layout(NamedTuple):
     """Where a channel keeps its fields: a structured type, and the name of the time field, if any."""
 
@@ -73,17 +99,21 @@ class Layout(NamedTuple):
 class PointCloudDecoder:
     """Decodes clouds; the place of the fields is worked out once for each layout."""
 
-    def __init__(self, limits: RangeLimits, times: PointTimes) -> None:
+    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud = read_point_cloud) -> None:
+        self.read = read
         self.limits = limits
         self.times = times
         self.layouts: dict[bytes, Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's points."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: PointCloudMessage) -> Returns:
         """Points that came back: finite, not the origin, within the limits; their times with them.
 
         Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
         """
-        message = read_point_cloud(data)
         layout = self.layouts.get(message.described)
         if layout is None:
             if len(self.layouts) >= _MOST_LAYOUTS:
@@ -105,7 +135,8 @@ class PointCloudDecoder:
         elif self.times.by_azimuth:
             times_s = self.times.from_azimuth(points[:count])
         why = "" if count else _why_none(x, y, z)
-        return Returns(message.stamp_ns, points[:count], times_s, len(cloud) - count, why)
+        kept_points = moved(points[:count], message.T_frame_cloud)
+        return Returns(message.stamp_ns, kept_points, times_s, len(cloud) - count, why)
 
 
 def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from math import isfinite, sqrt
 from typing import NamedTuple
 
@@ -24,24 +25,24 @@ class StampedPose(NamedTuple):
     T_parent_child: Pose
 
 
-def decode_odometry(data: memoryview, dimension: int = 3) -> StampedPose:
+def decode_odometry(data: memoryview, dimension: int = 3, form: type[CdrReader] = CdrReader) -> StampedPose:
     """The pose of a nav_msgs/Odometry, flattened for dimension 2; twist and covariances are passed over."""
-    reader = CdrReader(data)
+    reader = form(data)
     stamp_ns, parent = reader.header()
     child = reader.string()
     return StampedPose(stamp_ns, parent, child, _pose(reader, dimension))
 
 
-def decode_pose(data: memoryview, dimension: int = 3) -> StampedPose:
+def decode_pose(data: memoryview, dimension: int = 3, form: type[CdrReader] = CdrReader) -> StampedPose:
     """A geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
-    reader = CdrReader(data)
+    reader = form(data)
     stamp_ns, parent = reader.header()
     return StampedPose(stamp_ns, parent, "", _pose(reader, dimension))
 
 
-def decode_transforms(data: memoryview) -> list[StampedPose]:
+def decode_transforms(data: memoryview, form: type[CdrReader] = CdrReader) -> list[StampedPose]:
     """All transforms of a tf2_msgs/TFMessage."""
-    reader = CdrReader(data)
+    reader = form(data)
     transforms = []
     count = reader.integer()
     if count > _MOST_TRANSFORMS:
@@ -75,7 +76,12 @@ def chain(transforms: list[StampedPose], target: str, source: str) -> Pose | Non
 
 
 def _pose(reader: CdrReader, dimension: int) -> Pose:
-    x_m, y_m, z_m, x, y, z, w = reader.numbers("d", 7)
+    return pose_matrix(reader.numbers("d", 7), dimension)
+
+
+def pose_matrix(numbers: Sequence[float], dimension: int) -> Pose:
+    """A pose of position and quaternion xyzw, of any length but zero; flattened for dimension 2."""
+    x_m, y_m, z_m, x, y, z, w = numbers
     square = x * x + y * y + z * z + w * w
     if not (isfinite(x_m + y_m + z_m) and isfinite(square) and square > 1e-12):
         raise MalformedMessageError("its pose is not finite, or the quaternion is zero")

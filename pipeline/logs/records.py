@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import mmap
 import struct
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +21,10 @@ _LONGEST_STRING = 1 << 16  # bytes; a longer name is damage
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none."""
+    """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
+
+    ``definition`` says what the type looks like, in the language ``schema_encoding``.
+    """
 
     key: tuple[int, int]
     topic: str
@@ -27,6 +32,22 @@ class Channel:
     schema: int
     type_name: str
     schema_encoding: str
+    definition: bytes = b""
+
+
+class Message(NamedTuple):
+    """One message: its channel, when it was logged, and its bytes."""
+
+    channel: Channel
+    log_time_ns: int
+    data: memoryview
+
+
+class Contents(NamedTuple):
+    """The messages of a block in the order of the file; ``damage`` says what is missing behind them."""
+
+    messages: list[Message]
+    damage: str
 
 
 class Entry(NamedTuple):
@@ -64,48 +85,52 @@ class Block:
     @property
     def may_be_empty(self) -> bool:
         """Whether its times are those that writers give a chunk without any message."""
-        return self.start_ns == self.end_ns == 0 or self.start_ns > self.end_ns
+        return (self.start_ns == self.end_ns == 0 and not self.entries) or self.start_ns > self.end_ns
 
 
 @dataclass(slots=True)
 class FileIndex:
-    """Everything that the walk found in one file.
+    """Everything that is known of one file before its messages are read.
 
     Attributes
     ----------
     number : its place among the files of the log
+    data : the bytes of an MCAP file; of another format ``make`` makes the contents of a block, of all channels or
+        of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
     """
 
     path: Path
     number: int
-    data: mmap.mmap
+    data: mmap.mmap | bytes
+    make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
     profile: str = ""
     library: str = ""
     blocks: list[Block] = field(default_factory=list)
-    schemas: dict[int, tuple[str, str]] = field(default_factory=dict)
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
     has_summary: bool = False
     damage: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
-    def add_schema(self, body: memoryview | mmap.mmap, offset: int) -> None:
+    def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
         """Take in the schema record whose body starts at the offset."""
         (number,) = struct.unpack_from("<H", body, offset)
         name, offset = read_string(body, offset + 2)
-        encoding, _ = read_string(body, offset)
-        self.schemas[number] = (name, encoding)
+        encoding, offset = read_string(body, offset)
+        self.schemas[number] = (name, encoding, _read_octets(body, offset))
 
-    def add_channel(self, body: memoryview | mmap.mmap, offset: int) -> None:
+    def add_channel(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
         """Take in the channel record whose body starts at the offset; one that is fully known stays."""
         number, schema = struct.unpack_from("<HH", body, offset)
         if self.knows(number):
             return
         topic, offset = read_string(body, offset + 4)
         encoding, _ = read_string(body, offset)
-        type_name, schema_encoding = self.schemas.get(schema, ("", ""))
-        self.channels[number] = Channel((self.number, number), topic, encoding, schema, type_name, schema_encoding)
+        known = self.schemas.get(schema, ("", "", b""))
+        self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
 
     def note_damage(self, line: str) -> None:
         """Note a line once, however often the damage is met."""
@@ -118,10 +143,18 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def read_string(data: memoryview | mmap.mmap, offset: int) -> tuple[str, int]:
+def read_string(data: memoryview | mmap.mmap | bytes, offset: int) -> tuple[str, int]:
     """A string with its length before it, and the byte behind it."""
     (length,) = struct.unpack_from("<I", data, offset)
     end = offset + 4 + length
     if end > len(data) or length > _LONGEST_STRING:
         raise struct.error("string beyond the end")
     return bytes(data[offset + 4 : end]).decode(), end
+
+
+def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
+    (length,) = struct.unpack_from("<I", data, offset)
+    end = offset + 4 + length
+    if end > len(data):
+        raise struct.error("bytes beyond the end")
+    return bytes(data[offset + 4 : end])

@@ -11,23 +11,21 @@ from typing import NamedTuple
 
 from pipeline.logs.blocks import DamagedBlockError, read_block, release
 from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.limits import Returns
-from pipeline.logs.poses import StampedPose
 from pipeline.logs.records import Block, Channel, FileIndex
 from pipeline.logs.selection import Span
 
-Decoders = Mapping[str, Callable[[memoryview], Returns | StampedPose]]
+Decoders = Mapping[str, Callable[[memoryview], object]]
 
 _THREADS = 2
 _MOST_BYTES_AHEAD = 512_000_000
 
 
 class Decoded(NamedTuple):
-    """A message as its decoder understood it, or the decoder's complaint."""
+    """A message as its decoder understood it, or the decoder's complaint, a MalformedMessageError."""
 
     channel: Channel
     log_time_ns: int
-    value: Returns | StampedPose | MalformedMessageError
+    value: object
 
 
 def decoded_messages(
@@ -69,9 +67,7 @@ def decoded_messages(
             yield heappop(waiting)[-1]
 
 
-def _decode(
-    decoder: Callable[[memoryview], Returns | StampedPose], data: memoryview
-) -> Returns | StampedPose | MalformedMessageError:
+def _decode(decoder: Callable[[memoryview], object], data: memoryview) -> object:
     try:
         return decoder(data)
     except MalformedMessageError as error:

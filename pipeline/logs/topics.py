@@ -5,21 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pipeline.errors import InputError
+from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan
 from pipeline.logs.records import Channel, FileIndex
 
-LASER_SCAN, POINT_CLOUD = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2"
-ODOMETRY, TRANSFORMS = "nav_msgs/Odometry", "tf2_msgs/TFMessage"
-POSES = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")  # taken where asked for by name
-
-
-def kind(channel: Channel) -> str:
-    """The message type as package/Type, whatever form the schema's name has."""
-    return channel.type_name.replace("/msg/", "/").replace("::msg::dds_::", "/").rstrip("_")
-
-
-def is_readable(channel: Channel) -> bool:
-    """Whether its messages are ROS 2's, in CDR."""
-    return channel.encoding == "cdr" and channel.schema_encoding in ("ros2msg", "ros2idl")
+_UNDERSTOOD = ", ".join(LIDAR_TYPES)
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -39,7 +28,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
         raise InputError(f"{path}: has no topic {wanted}; choose --topic from: {_listed(channels.values())}")
     if wanted and not _is_lidar(channels[wanted]):
         raise InputError(
-            f"{path}: topic {_listed([channels[wanted]])} is no {LASER_SCAN} or {POINT_CLOUD} of ROS 2 in CDR; "
+            f"{path}: topic {_listed([channels[wanted]])} is of no type that is understood ({_UNDERSTOOD}); "
             f"choose --topic from: {_listed(channels.values())}"
         )
     if wanted:
@@ -47,7 +36,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     lidars = [channel for channel in channels.values() if _is_lidar(channel)]
     if not lidars:
         raise InputError(
-            f"{path}: has no lidar topic ({LASER_SCAN} or {POINT_CLOUD} of ROS 2 in CDR); "
+            f"{path}: has no lidar topic of a type that is understood ({_UNDERSTOOD}); "
             f"it holds: {_listed(channels.values())}"
         )
     if len(lidars) > 1:
@@ -61,8 +50,8 @@ def find_odometry(
     """The wheel odometry's channel: the topic asked for, else the only one apart from the ground truth."""
     if wanted:
         return _chosen(indexes, wanted, "log.odometry_topic")
-    channels = [channel for channel in topics_of(indexes).values() if kind(channel) == ODOMETRY]
-    found = [channel for channel in channels if is_readable(channel) and channel.topic != ground_truth]
+    channels = topics_of(indexes).values()
+    found = [channel for channel in channels if is_odometry(channel) and channel.topic != ground_truth]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
@@ -83,23 +72,22 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
         if channel.topic == wanted:
             return channel
     raise InputError(
-        f"{indexes[0].path}: {key} {wanted} is no {ODOMETRY} topic of the log, nor one of stamped poses; "
+        f"{indexes[0].path}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
         f"these are: {_listed(channels)}"
     )
 
 
 def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
-    channels = topics_of(indexes).values()
-    return [channel for channel in channels if is_readable(channel) and kind(channel) in (ODOMETRY, *POSES)]
+    return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
 
 
 def _is_lidar(channel: Channel) -> bool:
-    return is_readable(channel) and kind(channel) in (LASER_SCAN, POINT_CLOUD)
+    return is_scan(channel) or is_cloud(channel)
 
 
 def _listed(channels: Iterable[Channel]) -> str:
     names = []
     for channel in channels:
-        unusual = "" if is_readable(channel) else f" in {channel.encoding or 'an unnamed encoding'}"
+        unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual})")
     return ", ".join(names) or "none"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Literal, Self
@@ -11,13 +10,13 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from pipeline import lie
 from pipeline.data import Matrix, Pose
 from pipeline.errors import InputError
+from pipeline.logs.pack import pack_cloud, pack_laser_scan, pack_odometry, pack_transform, place
+from pipeline.logs.records import Channel
 from pipeline.logs.ros2_definitions import schema_text
 
 CHUNK_BYTES = 4 * 1024 * 1024
-_FIELD_TYPES = {"<f4": 7, "<u4": 6, "<u2": 4}  # sensor_msgs/PointField
 
 
 class LogWriter:
@@ -26,7 +25,7 @@ class LogWriter:
     Messages are recorded at ``log_time_ns``, by default their own stamp. Poses may be SE(2) or SE(3).
     """
 
-    def __init__(self, destination: Path, *, force: bool = False) -> None:
+    def __init__(self, destination: Path, *, force: bool = False, profile: str = "ros2") -> None:
         if destination.is_dir():
             raise InputError(f"{destination}: is a directory; give the name of a file to write")
         if destination.exists() and not force:
@@ -39,9 +38,9 @@ class LogWriter:
         except OSError as error:
             raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="scanchain")
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str], int] = {}
+        self._writer.start(profile=profile, library="scanchain")
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[str, str, str, bytes], int] = {}
         self._sequence = 0
 
     def __enter__(self) -> Self:
@@ -74,15 +73,18 @@ class LogWriter:
         log_time_ns: int | None = None,
     ) -> None:
         """Append a sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
-        angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
-        cdr = _Cdr()
-        cdr.header(stamp_ns, frame)
-        cdr.numbers("f", angle_min_rad, angle_max_rad, angle_increment_rad, time_increment_s, scan_time_s)
-        cdr.numbers("f", range_min_m, range_max_m)
-        cdr.numbers("I", len(ranges_m))
-        cdr.data += np.ascontiguousarray(ranges_m, dtype="<f4").tobytes()
-        cdr.numbers("I", 0)  # intensities
-        self._append(topic, "sensor_msgs/msg/LaserScan", cdr, stamp_ns, log_time_ns)
+        data = pack_laser_scan(
+            stamp_ns,
+            frame,
+            angle_min_rad,
+            angle_increment_rad,
+            ranges_m,
+            range_min_m=range_min_m,
+            range_max_m=range_max_m,
+            time_increment_s=time_increment_s,
+            scan_time_s=scan_time_s,
+        )
+        self._append(topic, "sensor_msgs/msg/LaserScan", data, stamp_ns, log_time_ns)
 
     def point_cloud(
         self,
@@ -115,7 +117,9 @@ class LogWriter:
         rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
         for name, (_, values) in columns.items():
             rows[name] = values
-        self._append(topic, "sensor_msgs/msg/PointCloud2", _cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
+        self._append(
+            topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns
+        )
 
     def odometry(
         self,
@@ -129,87 +133,47 @@ class LogWriter:
         log_time_ns: int | None = None,
     ) -> None:
         """Append a nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
-        cdr = _Cdr()
-        cdr.header(stamp_ns, frame)
-        cdr.string(child_frame)
-        cdr.numbers("d", *_position_and_quaternion(T))
-        cdr.data += (np.zeros((6, 6)) if covariance is None else covariance.astype("<f8")).tobytes()
-        cdr.numbers("d", *([0.0] * 42))
-        self._append(topic, "nav_msgs/msg/Odometry", cdr, stamp_ns, log_time_ns)
+        data = pack_odometry(stamp_ns, frame, child_frame, place(T), covariance)
+        self._append(topic, "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
 
     def static_transform(
         self, stamp_ns: int, parent: str, child: str, T: Pose, *, log_time_ns: int | None = None
     ) -> None:
         """Append a tf2_msgs/TFMessage to /tf_static: pose of ``child`` in ``parent``."""
-        cdr = _Cdr()
-        cdr.numbers("I", 1)
-        cdr.header(stamp_ns, parent)
-        cdr.string(child)
-        cdr.numbers("d", *_position_and_quaternion(T))
-        self._append("/tf_static", "tf2_msgs/msg/TFMessage", cdr, stamp_ns, log_time_ns)
+        data = pack_transform(stamp_ns, parent, child, place(T))
+        self._append("/tf_static", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
 
-    def _append(self, topic: str, schema: str, cdr: _Cdr, stamp_ns: int, log_time_ns: int | None) -> None:
+    def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
+        """Append a message of another log as it is, with its topic, type, encoding and definition."""
+        key = (channel.topic, channel.encoding, channel.type_name, channel.definition)
+        if key not in self._channels:
+            number = self._schema(channel.type_name, channel.schema_encoding, channel.definition)
+            self._channels[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
+        self._add(self._channels[key], log_time_ns, data)
+
+    def _append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None) -> None:
         time_ns = stamp_ns if log_time_ns is None else log_time_ns
-        self._writer.add_message(self._channel(topic, schema), time_ns, bytes(cdr.data), time_ns, self._sequence)
+        key = (topic, "cdr", schema, b"")
+        if key not in self._channels:
+            number = self._schema(schema, "ros2msg", schema_text(schema))
+            self._channels[key] = self._writer.register_channel(topic, "cdr", number)
+        self._add(self._channels[key], time_ns, data)
+
+    def _add(self, channel: int, log_time_ns: int, data: bytes) -> None:
+        self._writer.add_message(channel, log_time_ns, data, log_time_ns, self._sequence)
         self._sequence += 1
 
-    def _channel(self, topic: str, schema: str) -> int:
-        key = (topic, schema)
-        if key not in self._channels:
-            if schema not in self._schemas:
-                self._schemas[schema] = self._writer.register_schema(schema, "ros2msg", schema_text(schema))
-            self._channels[key] = self._writer.register_channel(topic, "cdr", self._schemas[schema])
-        return self._channels[key]
-
-
-class _Cdr:
-    """A message in ROS 2's CDR, little endian: numbers lie at multiples of their size, counted from byte 4."""
-
-    __slots__ = ("data",)
-
-    def __init__(self) -> None:
-        self.data = bytearray(b"\x00\x01\x00\x00")
-
-    def numbers(self, code: str, *values: float) -> None:
-        size = struct.calcsize(f"<{code}")
-        self.data += bytes(-(len(self.data) - 4) % size)
-        self.data += struct.pack(f"<{len(values)}{code}", *values)
-
-    def string(self, text: str) -> None:
-        encoded = text.encode() + b"\x00"
-        self.numbers("I", len(encoded))
-        self.data += encoded
-
-    def header(self, stamp_ns: int, frame: str) -> None:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        self.numbers("i", seconds)
-        self.numbers("I", nanoseconds)
-        self.string(frame)
-
-
-def _cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> _Cdr:
-    fields = rows.dtype.fields or {}
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.numbers("I", 1, len(rows), len(fields))
-    for name, field in fields.items():
-        cdr.string(name)
-        cdr.numbers("I", field[1])
-        cdr.numbers("B", _FIELD_TYPES[field[0].str])
-        cdr.numbers("I", 1)
-    cdr.numbers("B", 0)  # little endian
-    cdr.numbers("I", rows.itemsize, rows.nbytes, rows.nbytes)
-    cdr.data += rows.tobytes()
-    cdr.numbers("B", 1)  # dense
-    return cdr
+    def _schema(self, name: str, encoding: str, definition: bytes) -> int:
+        """The id of a schema; 0 stands for none."""
+        key = (name, encoding, definition)
+        if not name and not definition:
+            return 0
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(name, encoding, definition)
+        return self._schemas[key]
 
 
 def _whole_ns(times_s: NDArray[np.floating]) -> NDArray[np.int64]:
     if len(times_s) and times_s.min() < 0.0:
         raise InputError(f"point time {times_s.min():.6f} s is before the stamp; use time_field='time'")
     return np.rint(np.asarray(times_s, dtype=np.float64) * 1e9).astype(np.int64)
-
-
-def _position_and_quaternion(T: Pose) -> tuple[float, ...]:
-    lifted = lie.lift(np.asarray(T, dtype=np.float64))
-    return (*lifted[:3, 3].tolist(), *lie.to_quaternion(lifted[:3, :3]).tolist())

@@ -14,12 +14,17 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from pipeline.logs.sizes import files_of, size_of
+
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22
 
 
 class LogFile(Struct, frozen=True):
-    """A file that was read; ``sha256`` is empty until it is known."""
+    """A file or folder that was read; ``sha256`` is empty until it is known.
+
+    That of a folder is taken over its files in the order of their names, each as its name and its contents.
+    """
 
     path: str
     size_bytes: int
@@ -54,7 +59,7 @@ def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: 
         command=list(command),
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         duration_s=0.0,
-        logs=[LogFile(str(path.resolve()), path.stat().st_size, "") for path in logs],
+        logs=[LogFile(str(path.resolve()), size_of(path), "") for path in logs],
         configuration=configuration,
         python=platform.python_version(),
         platform=platform.platform(),
@@ -89,14 +94,20 @@ class Hashing:
         for path in self._paths:
             digest = hashlib.sha256()
             try:
-                with path.open("rb") as file:
-                    while block := file.read(_BLOCK):
-                        if self._cancelled.is_set():
-                            return
-                        digest.update(block)
+                for file in files_of(path):
+                    if path.is_dir():
+                        digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+                    self._feed(digest, file)
             except OSError:
                 continue
+            if self._cancelled.is_set():
+                return
             self._digests[path] = digest.hexdigest()
+
+    def _feed(self, digest: hashlib._Hash, path: Path) -> None:
+        with path.open("rb") as file:
+            while (block := file.read(_BLOCK)) and not self._cancelled.is_set():
+                digest.update(block)
 
 
 def _version(package: str) -> str:

@@ -1,0 +1,57 @@
+"""``scanchain doctor``: what is wrong with a log."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.settings import Override, load_settings
+
+if TYPE_CHECKING:
+    from pipeline.logs.doctor import Diagnosis
+
+
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.pass_context
+def doctor(ctx: click.Context, logs: tuple[Path, ...], topic: str | None, as_json: bool) -> None:
+    """Look at every scan of a log: what is wrong, what it does to the result, and the flag that mends it.
+
+    Takes any key of the configuration as a run does, so that you can try whether a flag mends what was found.
+
+    \b
+    Examples:
+      scanchain doctor log.mcap
+      scanchain doctor drive.bag --topic /lidar_front/points --json
+      scanchain doctor log.mcap --log.point_times ms
+    """
+    from pipeline.commands.terminal import Terminal
+    from pipeline.logs.doctor import examine
+
+    chosen = (*([Override("log.topic", topic, "--topic")] if topic else []), *overrides(ctx))
+    early = load_settings(overrides=chosen).config
+
+    with Terminal("scans") as terminal:
+        found = examine(
+            logs, lambda dimension: load_settings(dimension, overrides=chosen).config, early.log, terminal.count
+        )
+    click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
+
+
+def _text(found: Diagnosis) -> str:
+    lines = [f"{', '.join(found.files)} {found.topic} ({found.dimension}D)"]
+    for finding in found.findings:
+        lines.append(f"{finding.severity:<8} {finding.check:<12} {finding.found}")
+        lines += [f"{'':<21} {line}" for line in (finding.effect, _remedy(finding.remedy)) if line]
+    return "\n".join([*lines, *(f"{'note':<21} {note}" for note in found.notes)])
+
+
+def _remedy(remedy: str) -> str:
+    return f"→ {remedy}" if remedy else ""

@@ -1,0 +1,113 @@
+"""Fetching a file by HTTP: goes on where it was broken off, and is complete and verified or absent."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from pipeline.errors import InputError, ScanchainError
+
+Progress = Callable[[int, int], None]
+
+_PIECE_BYTES = 1 << 18
+_MIB = 1 << 20
+_TIMEOUT_S = 30.0
+_ATTEMPTS = 4
+_BROKEN = (http.client.HTTPException, ConnectionError, TimeoutError, urllib.error.URLError)
+
+
+class DownloadError(ScanchainError):
+    """A file that could not be fetched; what there is of it is kept for the next try."""
+
+
+def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> str:
+    """Fetch a file unless it is there; its SHA-256. What is there of an earlier try is gone on with.
+
+    sha256 : what it must be, empty where nobody knows. Raises InputError where it is not, and for what is no
+        HTTP address; DownloadError where the server does not answer as it should.
+    progress : told how many MiB of how many are there, 0 where the server does not say
+    """
+    if urlsplit(url).scheme not in ("http", "https"):
+        raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")
+    if not destination.exists():
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        part = _Part(url, destination.with_name(f".{destination.name}.part"))
+        part.complete(progress)
+        _verify(part.path, sha256, url)
+        part.path.replace(destination)
+        part.validator_path.unlink(missing_ok=True)
+    return _verify(destination, sha256, url)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """As much of a file as has come. Beside it lies what tells whether the server still has the same one."""
+
+    url: str
+    path: Path
+
+    @property
+    def validator_path(self) -> Path:
+        """Holds the ETag, or the time of the last change, that came with the first byte."""
+        return self.path.with_name(f"{self.path.name}.etag")
+
+    def complete(self, progress: Progress | None) -> None:
+        """Fetch what is missing, asking again where the line breaks."""
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                if self._more(progress):
+                    return
+                reason = "the server ended too early"
+            except urllib.error.HTTPError as error:
+                if error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+                    if error.headers.get("Content-Range", "") == f"bytes */{self.path.stat().st_size}":
+                        return
+                    self.path.unlink()  # the file on the server is another, and shorter
+                    continue
+                raise DownloadError(
+                    f"{self.url}: {error.code} {error.reason}; see whether its page moved"
+                ) from error
+            except _BROKEN as error:
+                reason = str(getattr(error, "reason", error)) or type(error).__name__
+            if attempt == _ATTEMPTS:
+                have = self.path.stat().st_size if self.path.exists() else 0
+                raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to go on")
+
+    def _more(self, progress: Progress | None) -> bool:
+        """One request from the first missing byte on; whether the file is complete."""
+        have = self.path.stat().st_size if self.path.exists() else 0
+        validator = self.validator_path.read_text() if have and self.validator_path.exists() else ""
+        have = have if validator else 0
+        asked = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
+        with urllib.request.urlopen(urllib.request.Request(self.url, headers=asked), timeout=_TIMEOUT_S) as answer:
+            is_rest = answer.status == http.client.PARTIAL_CONTENT
+            have = have if is_rest else 0
+            length = answer.headers.get("Content-Length")
+            total = have + int(length) if length is not None else 0
+            self.validator_path.write_text(answer.headers.get("ETag") or answer.headers.get("Last-Modified") or "")
+            with self.path.open("ab" if is_rest else "wb") as file:
+                while piece := answer.read(_PIECE_BYTES):
+                    file.write(piece)
+                    have += len(piece)
+                    if progress is not None:
+                        progress(have // _MIB, total // _MIB)
+        return not total or have == total
+
+
+def _verify(path: Path, sha256: str, url: str) -> str:
+    """The SHA-256 of a file; one that is not what it must be is deleted."""
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if sha256 and found != sha256:
+        path.unlink()
+        raise InputError(
+            f"{url}: has SHA-256 {found}, not {sha256} as the catalogue says; it was deleted, call it again, or "
+            "see whether its page announces a new version"
+        )
+    return found

@@ -1,0 +1,172 @@
+"""The doctor's checks of the scans themselves: returns, ranges, rings, repetitions, rest, mounting, damage."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.config import PreprocessConfig
+from pipeline.logs.finding import Finding, Severity
+from pipeline.logs.rest import LEAST_S, Rest
+from pipeline.logs.survey import Survey
+
+_MANY_LOST = 0.5
+_STUCK_SHARE = 0.01  # of beams, all at the farthest range
+_LONG_REST_S = 5.0
+_WHEELS_MOVE = 0.02  # metres, or the sine of a turn
+_FEW_POINTS = 50
+
+
+def check_scans(seen: Survey, preprocess: PreprocessConfig) -> Iterator[Finding]:
+    """Every finding about the scans. ``preprocess`` is what a run of this log would use."""
+    yield _damage(seen)
+    yield _returns(seen)
+    yield _no_return(seen)
+    yield _ranges(seen, preprocess)
+    if seen.log.dimension == 3:
+        yield _rings(seen)
+    yield _duplicates(seen)
+    yield _rest(seen)
+    yield _mounting(seen)
+
+
+def _damage(seen: Survey) -> Finding:
+    empty = sum(scan.kept == 0 for scan in seen.scans)
+    bad = len(seen.malformed) + empty
+    lines = list(seen.damage)
+    if seen.malformed:
+        lines.append(f"{len(seen.malformed)} malformed scans (the first: {seen.malformed[0]})")
+    if empty:
+        lines.append(f"{empty} scans without a valid point")
+    if not lines:
+        return Finding("damage", Severity.OK, "every scan is readable and has points")
+    if bad:
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), "a run stops there", "--log.bad_scans skip")
+    effect = "what was damaged is left out, the rest is used"
+    return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
+
+
+def _returns(seen: Survey) -> Finding:
+    undefined, zero = seen.share(lambda scan: scan.undefined), seen.share(lambda scan: scan.zero)
+    kept = [scan.kept for scan in seen.scans]
+    median = int(np.median(kept))
+    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, {median:,} valid a scan (median)"
+    few = int(np.count_nonzero(np.array(kept) < _FEW_POINTS))
+    if few:
+        effect = f"{few} scans have fewer than {_FEW_POINTS} returns: their matches are weak or lost"
+        return Finding("returns", Severity.WARNING, found, effect, "--start or --end, where they are at an end")
+    if undefined + zero > _MANY_LOST:
+        return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
+    return Finding("returns", Severity.OK, found)
+
+
+def _no_return(seen: Survey) -> Finding:
+    """Whether many beams tell one farthest range, as scanners do that write a number for no return."""
+    values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
+    farthest_m = max(values, default=0.0)
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
+    stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
+    share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
+    told_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
+    limit_m = min(told_m, seen.log.config.max_range_m)
+    if share < _STUCK_SHARE:
+        return Finding("no return", Severity.OK, "no range is told so often that it must stand for no return")
+    found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"
+    if farthest_m >= limit_m:
+        return Finding("no return", Severity.OK, f"{found}; range limits take it out")
+    effect = "if it stands for no return, it is taken for a wall that moves along"
+    return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
+
+
+def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    near_m = float(np.nanmedian([scan.nearest_m for scan in seen.scans]))
+    far_m = float(np.nanmedian([scan.far_m for scan in seen.scans]))
+    found = f"98 % of the returns lie between {near_m:.3g} and {far_m:.4g} m (medians)"
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    if far_m > high_m:
+        effect = f"returns beyond {high_m:g} m are not used"
+        return Finding("ranges", Severity.NOTE, found, effect, f"--preprocess.max_range_m {np.ceil(far_m):g}")
+    if near_m < low_m:
+        effect = (
+            f"returns nearer than {low_m:g} m are not used, which is as it should be if they are the robot itself"
+        )
+        return Finding(
+            "ranges", Severity.NOTE, found, effect, f"--preprocess.min_range_m {near_m:.2g}, to use them"
+        )
+    return Finding("ranges", Severity.OK, found)
+
+
+def _rings(seen: Survey) -> Finding:
+    rings = [scan.rings for scan in seen.scans]
+    if not any(rings):
+        return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
+    most, least = max(rings), min(rings)
+    found = f"{most} rings" if most == least else f"{least} to {most} rings"
+    if least < most:
+        return Finding("rings", Severity.NOTE, found, "scans without some of their rings are sparser, no more")
+    return Finding("rings", Severity.OK, found)
+
+
+def _duplicates(seen: Survey) -> Finding:
+    digests = [scan.digest for scan in seen.scans]
+    same = sum(before == after for before, after in pairwise(digests))
+    if not same:
+        return Finding("duplicates", Severity.OK, "no scan is the one before once more")
+    found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
+    effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
+    every = round(len(digests) / (len(digests) - same))
+    remedy = f"--every {every}" if every > 1 else ""
+    return Finding("duplicates", Severity.WARNING, found, effect, remedy)
+
+
+def _rest(seen: Survey) -> Finding:
+    """How long the surroundings do not change and the wheels, where there are any, do not move."""
+    rests = [_until_wheels_move(seen, rest) for rest in seen.rests]
+    rests = [rest for rest in rests if rest.duration_s >= LEAST_S]
+    still_s = sum(rest.duration_s for rest in rests)
+    first_s = rests[0].duration_s if rests and rests[0].first == 0 else 0.0
+    total_s = float(seen.log_ns[-1] - seen.log_ns[0]) * 1e-9
+    found = (
+        f"{still_s:.1f} of {total_s:.1f} s nothing changes from scan to scan, {first_s:.1f} s of it at the start"
+    )
+    if rests and rests[0].last - rests[0].first == len(seen.scans) - 1:
+        effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
+        return Finding("rest", Severity.WARNING, found, effect)
+    if first_s > _LONG_REST_S:
+        effect = "it does no harm, but takes time"
+        return Finding("rest", Severity.NOTE, found, effect, f"--start {np.floor(first_s):g}")
+    return Finding("rest", Severity.OK, found)
+
+
+def _until_wheels_move(seen: Survey, rest: Rest) -> Rest:
+    """The rest up to where the wheels tell a motion."""
+    begin_ns, end_ns = seen.stamps_ns[rest.first], seen.stamps_ns[rest.last]
+    poses = [pose for pose in seen.wheels if begin_ns <= pose.stamp_ns <= end_ns]
+    for pose in poses:
+        if np.abs(pose.T_parent_child - poses[0].T_parent_child).max() > _WHEELS_MOVE:
+            stamps_ns = seen.stamps_ns[rest.first : rest.last + 1]
+            last = rest.first + max(int(np.count_nonzero(stamps_ns <= pose.stamp_ns)) - 1, 0)
+            return rest._replace(last=last, end_ns=int(seen.log_ns[last]))
+    return rest
+
+
+def _mounting(seen: Survey) -> Finding:
+    frame = seen.scans[0].frame or "without a name"
+    frames = {scan.frame for scan in seen.scans}
+    if len(frames) > 1:
+        effect = "only the first frame's mounting is used; scans of the others are taken to sit there, too"
+        return Finding(
+            "mounting", Severity.PROBLEM, f"scans in several frames: {', '.join(sorted(frames))}", effect
+        )
+    told = next((note for note in seen.log.notes if note.startswith("no static transform")), "")
+    if told:
+        effect = "trajectories are the lidar's; the wheels' turns are taken about the lidar instead of the robot"
+        remedy = "record /tf_static, or --odometry.prior constant-velocity"
+        return Finding("mounting", Severity.WARNING, told, effect, remedy)
+    place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
+    if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
+        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not told")
+    return Finding("mounting", Severity.OK, f"lidar frame {frame}: at {place} m of the base, by static transforms")

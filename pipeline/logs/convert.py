@@ -1,0 +1,73 @@
+"""A log of any format that is known as one MCAP file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.logs.opening import index_files, is_mcap
+from pipeline.logs.records import FileIndex
+from pipeline.logs.selection import EVERYTHING
+from pipeline.logs.stream import decoded_messages
+from pipeline.logs.topics import topics_of
+from pipeline.logs.write import LogWriter
+
+_AHEAD = 4  # blocks
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """What came of a conversion: messages by topic, what was left out by choice, what could not be read."""
+
+    path: Path
+    messages: dict[str, int]
+    notes: tuple[str, ...]
+    damage: tuple[str, ...]
+
+
+def convert(
+    sources: Sequence[Path],
+    destination: Path,
+    *,
+    rate_hz: float = 0.0,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Converted:
+    """Write every message of the sources, one log, by log time. ROS messages stay as they are, byte by byte.
+
+    rate_hz : as for ``index_files``. Raises InputError for what cannot be read or written.
+    """
+    _check(sources, destination)
+    indexes = index_files(sources, rate_hz)
+    total = sum(sum(index.counts.values()) for index in indexes)
+    counts = dict.fromkeys(topics_of(indexes), 0)
+    damage = [line for index in indexes for line in index.damage]
+    with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
+        decoders = dict.fromkeys(counts, bytes)
+        for message in decoded_messages(indexes, decoders, EVERYTHING, ahead=_AHEAD, damage=damage):
+            assert isinstance(message.value, bytes)
+            log.copy(message.channel, message.log_time_ns, message.value)
+            counts[message.channel.topic] += 1
+            if progress is not None:
+                progress(sum(counts.values()), total)
+        if not sum(counts.values()):
+            raise InputError(
+                f"{sources[0]}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+            )
+    notes = tuple(line for index in indexes for line in index.notes)
+    return Converted(destination, counts, notes, tuple(damage))
+
+
+def _check(sources: Sequence[Path], destination: Path) -> None:
+    if destination.suffix != ".mcap":
+        raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
+    if len(sources) == 1 and is_mcap(sources[0]):
+        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
+
+
+def _profile(indexes: Sequence[FileIndex]) -> str:
+    """The convention that all channels keep, empty where they differ."""
+    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
+    return {frozenset({"cdr"}): "ros2", frozenset({"ros1"}): "ros1"}.get(frozenset(encodings), "")

@@ -1,0 +1,45 @@
+"""What is wrong with a log, what that does to the result, and the flag that mends it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.config import Config, LogConfig
+from pipeline.logs.checks_scans import check_scans
+from pipeline.logs.checks_time import check_time
+from pipeline.logs.finding import Finding, Severity
+from pipeline.logs.log import open_log
+from pipeline.logs.survey import survey
+
+_ORDER = tuple(reversed(Severity))
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The findings about a log, the gravest first; ``notes`` are what opening it assumed."""
+
+    files: tuple[str, ...]
+    topic: str
+    dimension: int
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+
+
+def examine(
+    paths: Sequence[Path],
+    config_of: Callable[[int], Config],
+    log_config: LogConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Diagnosis:
+    """Look at every scan of a log. Raises InputError where a run could not open it either.
+
+    config_of : what a run would use for a log of this dimension
+    """
+    log = open_log(paths, log_config)
+    notes = tuple(log.notes)
+    seen = survey(log, progress)
+    findings = [*check_time(seen), *check_scans(seen, config_of(log.dimension).preprocess)]
+    ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
+    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes)

@@ -1,0 +1,34 @@
+"""What the doctor says of a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Severity(StrEnum):
+    """How much a finding matters to a run."""
+
+    OK = "ok"
+    NOTE = "note"
+    WARNING = "warning"
+    PROBLEM = "problem"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes
+    ----------
+    check : what was looked at, one word or two
+    found : what was measured, with units
+    effect : what it does to the result, empty where it does nothing
+    remedy : the flag of ``scanchain run`` that mends it, or what to do before, empty where nothing is to be done
+    """
+
+    check: str
+    severity: Severity
+    found: str
+    effect: str = ""
+    remedy: str = ""

@@ -1,0 +1,81 @@
+"""A folder of PCD, PLY or raw float32 files, one a scan; stamps are in their names, or come at a rate."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.logs.formats.cloud_file import SUFFIXES, read_cloud_file
+from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
+from pipeline.logs.formats.point_rows import CloudFileError
+from pipeline.logs.pack import pack_cloud
+from pipeline.logs.records import Block, Contents, FileIndex, Message
+
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
+_NS = 1_000_000_000
+
+
+def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
+    """The files of a folder as the scans of /points.
+
+    rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names. Raises InputError where
+        those are none.
+    """
+    files = _files(folder)
+    stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
+    index = made_index(folder, number)
+    channel = made_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
+    for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
+        made_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
+
+    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+        file, stamp_ns = files[block.offset], stamps_ns[block.offset]
+        if wanted is not None and channel.key[1] not in wanted:
+            return Contents([], "")
+        try:
+            data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file))
+        except (CloudFileError, OSError) as error:
+            return Contents([], f"{file}: {error}; it was left out")
+        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+
+    index.make = make
+    return index
+
+
+def stamp_of_name(stem: str) -> int | None:
+    """The stamp in nanoseconds that a file's name tells, None where it tells none.
+
+    Understood are nanoseconds, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a
+    fraction (``12.375``), and seconds and nanoseconds apart (``cloud_1583836591_182590976``).
+    """
+    if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):
+        return int(match[1]) * _NS + int(match[2].ljust(9, "0"))
+    if match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
+        return int(match[1]) * _NS + int(match[2])
+    match = re.search(r"(?<!\d)(\d+)$", stem)
+    if match and len(match[1]) in _UNITS_NS and not match[1].startswith("0"):
+        return int(match[1]) * _UNITS_NS[len(match[1])]
+    return None
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of the first kind that the folder has."""
+    found = [file for file in folder.iterdir() if file.is_file()]
+    for suffix in SUFFIXES:
+        files = sorted((file for file in found if file.suffix.lower() == suffix), key=natural_order)
+        if files:
+            return files
+    raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
+
+
+def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
+    stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
+    if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
+        raise InputError(
+            f"{folder}: names such as {files[0].name} tell no stamp of their own; say how often the scans come, "
+            "as in --log.rate_hz 10 (scanchain convert: --rate 10)"
+        )
+    return stamps_ns

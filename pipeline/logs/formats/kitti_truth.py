@@ -1,0 +1,109 @@
+"""The text files beside KITTI's sweeps: times, calibration, GPS/INS and camera poses."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.data import Matrix, Pose
+from pipeline.errors import InputError
+
+_EARTH_M = 6378137.0
+_NS = 1_000_000_000
+
+
+def read_times(file: Path) -> list[int]:
+    """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
+    return [_parsed(file, number, line) for number, line in enumerate(_lines(file), start=1)]
+
+
+def read_seconds(file: Path) -> list[int]:
+    """Nanoseconds of each line that is a number of seconds."""
+    return [round(float(seconds) * _NS) for seconds in _table(file, 1)[:, 0]]
+
+
+def read_calibration(file: Path) -> Pose:
+    """The (4, 4) transform of a ``calib_*_to_*.txt`` with its lines ``R:`` and ``T:``."""
+    told = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
+    try:
+        T = np.eye(4)
+        T[:3, :3] = np.array(told["R"].split(), np.float64).reshape(3, 3)
+        T[:3, 3] = np.array(told["T"].split(), np.float64)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); fetch it again") from error
+    return T
+
+
+def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
+    """T_world_lidar (N, 4, 4) of the GPS/INS readings, from the first lidar pose on.
+
+    Latitude and longitude are laid out by the Mercator projection at the first latitude; R = Rz(yaw) Ry(pitch)
+    Rx(roll), as KITTI's development kit defines them.
+    """
+    rows = np.vstack([_table(file, 6)[:1] for file in sorted(folder.glob("*.txt"))] or [np.empty((0, 6))])
+    if not len(rows):
+        return np.empty((0, 4, 4))
+    latitude, longitude, up_m, roll, pitch, yaw = rows[:, :6].T
+    scale = np.cos(np.radians(latitude[0]))
+    T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_imu[:, 0, 3] = scale * _EARTH_M * np.radians(longitude)
+    T_world_imu[:, 1, 3] = scale * _EARTH_M * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
+    T_world_imu[:, 2, 3] = up_m
+    T_world_imu[:, :3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0)
+    T_world_lidar = T_world_imu @ lie.inverse(T_lidar_imu)
+    return lie.inverse(T_world_lidar[0]) @ T_world_lidar
+
+
+def read_camera_poses(file: Path, calibration: Path) -> Matrix:
+    """T_world_lidar (N, 4, 4) of the odometry benchmark's camera poses, from the first lidar pose on."""
+    rows = _table(file, 12)
+    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_camera[:, :3] = rows[:, :12].reshape(-1, 3, 4)
+    told = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
+    try:
+        T_camera_lidar = np.vstack([np.array(told["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); fetch it again") from error
+    T_world_lidar = T_world_camera @ T_camera_lidar
+    return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
+
+
+def _turn(angles_rad: Matrix, axis: int) -> Matrix:
+    """Rotations (N, 3, 3) about one axis."""
+    a, b = [(1, 2), (2, 0), (0, 1)][axis]
+    R = np.tile(np.eye(3), (len(angles_rad), 1, 1))
+    R[:, a, a] = R[:, b, b] = np.cos(angles_rad)
+    R[:, b, a] = np.sin(angles_rad)
+    R[:, a, b] = -R[:, b, a]
+    return R
+
+
+def _parsed(file: Path, number: int, line: str) -> int:
+    whole, _, fraction = line.strip().partition(".")
+    try:
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        return int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
+    except ValueError as error:
+        raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); fetch it again") from error
+
+
+def _table(file: Path, columns: int) -> Matrix:
+    try:
+        rows = np.loadtxt(file, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{file}: is no table of numbers ({error}); fetch it again") from error
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error}); fetch it again") from error
+    if rows.size and rows.shape[1] < columns:
+        raise InputError(f"{file}: has {rows.shape[1]} columns, {columns} are needed; fetch it again")
+    return rows
+
+
+def _lines(file: Path) -> list[str]:
+    try:
+        return [line for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); fetch it again") from error

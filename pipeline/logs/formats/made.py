@@ -1,0 +1,44 @@
+"""An index of a log that is no MCAP: its channels, and blocks of messages in ROS 2's CDR."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+from pipeline.logs.records import Block, Channel, Contents, Entry, FileIndex
+from pipeline.logs.ros2_definitions import schema_text
+
+Maker = Callable[[Block, AbstractSet[int] | None], Contents]
+
+
+def made_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
+    """A new channel of the index, its messages in CDR; ``type_name`` is package/msg/Type."""
+    number = len(index.channels) + 1
+    definition = schema_text(type_name)
+    channel = Channel((index.number, number), topic, "cdr", number, type_name, "ros2msg", definition)
+    index.channels[number] = channel
+    return channel
+
+
+def made_block(
+    index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
+) -> None:
+    """Append a block: ``offset`` is whatever its maker finds it by, ``size`` about the bytes it will take."""
+    entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
+    index.blocks.append(
+        Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
+    )
+    for entry in entries:
+        index.counts[entry.channel] = index.counts.get(entry.channel, 0) + entry.messages
+
+
+def made_index(path: Path, number: int) -> FileIndex:
+    """An index without channels or blocks; whoever makes it sets ``make``."""
+    return FileIndex(path, number, b"", is_counted=True, profile="ros2")
+
+
+def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
+    """Sorts log_2 before log_10."""
+    return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name

@@ -1,0 +1,98 @@
+"""What lies at a path, and its index: MCAP, ROS bags, CARMEN text, folders of sweeps or of the parts of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.logs.counting import complete
+from pipeline.logs.formats.bags import index_bag, parts_of_bag
+from pipeline.logs.formats.carmen import index_carmen
+from pipeline.logs.formats.cloud_file import SUFFIXES
+from pipeline.logs.formats.cloud_folder import index_clouds
+from pipeline.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
+from pipeline.logs.formats.made import natural_order
+from pipeline.logs.index import index_file
+from pipeline.logs.records import MAGIC, FileIndex
+
+Indexer = Callable[[Path, int], FileIndex]
+
+_PART_SUFFIXES = (".mcap", ".bag", ".db3")
+_KNOWN = (
+    "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "
+    "of KITTI raw or odometry, or of PCD or PLY files"
+)
+
+
+def index_files(paths: Sequence[Path], rate_hz: float = 0.0) -> list[FileIndex]:
+    """What lies where in a log's files and folders, every channel known and counted. Raises InputError.
+
+    rate_hz : at which the files of a folder come whose names tell no time; 0 where that is not known
+    """
+    if not paths:
+        raise InputError("no log was named; give at least one file or folder")
+    files = [part for path in paths for part in _parts(path)]
+    indexes = [_indexer(path, rate_hz)(path, number) for number, path in enumerate(files)]
+    for index in indexes:
+        complete(index)
+    return indexes
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins as MCAP does."""
+    return path.is_file() and _head(path).startswith(MAGIC)
+
+
+def _parts(path: Path) -> list[Path]:
+    """The files of a folder that holds the parts of a log, in the order of their names; else the path itself."""
+    if not path.is_dir():
+        return [path]
+    if (path / "metadata.yaml").is_file():
+        return parts_of_bag(path)
+    for suffix in _PART_SUFFIXES:
+        parts = sorted(path.glob(f"*{suffix}"), key=natural_order)
+        if parts:
+            return parts
+    return [path]
+
+
+def _indexer(path: Path, rate_hz: float) -> Indexer:
+    return _folder_indexer(path, rate_hz) if path.is_dir() else _file_indexer(path)
+
+
+def _file_indexer(path: Path) -> Indexer:
+    head = _head(path) if path.is_file() else b""
+    if head.startswith(b"#ROSBAG") or head.startswith(b"SQLite format 3\0"):
+        return index_bag
+    if head.startswith((b"BZh", b"\x1f\x8b")) or _looks_like_carmen(head):
+        return index_carmen
+    if head and not head.startswith(MAGIC):
+        raise InputError(f"{path}: is no log that is known (starts with {head[:8]!r}); give {_KNOWN}")
+    return index_file
+
+
+def _folder_indexer(path: Path, rate_hz: float) -> Indexer:
+    if (path / "metadata.yaml").is_file():
+        return index_bag
+    if (path / "velodyne_points").is_dir():
+        return index_kitti_raw
+    if (path / "velodyne").is_dir() and (path / "times.txt").is_file():
+        return index_kitti_odometry
+    if any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir()):
+        return lambda folder, number: index_clouds(folder, number, rate_hz)
+    raise InputError(f"{path}: is a folder of no log that is known; give {_KNOWN}")
+
+
+def _looks_like_carmen(head: bytes) -> bool:
+    """Whether the first line is a comment or begins with a word in capitals and digits, as CARMEN's do."""
+    word = head.lstrip().split(maxsplit=1)[0] if head.strip() else b""
+    return word.startswith(b"#") or (word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper())
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(64)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error

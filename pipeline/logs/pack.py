@@ -1,0 +1,125 @@
+"""ROS 2 messages packed in CDR, as a log holds them."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Matrix, Pose
+
+_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
+
+
+class Place(NamedTuple):
+    """A pose as messages tell it: metres and a unit quaternion."""
+
+    x: float
+    y: float
+    z: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+
+
+ORIGIN = Place(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def place(T: Pose) -> Place:
+    """An SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
+    lifted = lie.lift(np.asarray(T, dtype=np.float64))
+    return Place(*lifted[:3, 3].tolist(), *lie.to_quaternion(lifted[:3, :3]).tolist())
+
+
+def pack_laser_scan(
+    stamp_ns: int,
+    frame: str,
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    ranges_m: NDArray[np.floating],
+    *,
+    range_min_m: float,
+    range_max_m: float,
+    time_increment_s: float = 0.0,
+    scan_time_s: float = 0.0,
+) -> bytes:
+    """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
+    angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
+    cdr = _Cdr()
+    cdr.header(stamp_ns, frame)
+    cdr.numbers("f", angle_min_rad, angle_max_rad, angle_increment_rad, time_increment_s, scan_time_s)
+    cdr.numbers("f", range_min_m, range_max_m)
+    cdr.numbers("I", len(ranges_m))
+    cdr.data += np.ascontiguousarray(ranges_m, dtype="<f4").tobytes()
+    cdr.numbers("I", 0)  # intensities
+    return bytes(cdr.data)
+
+
+def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
+    """A sensor_msgs/PointCloud2 of one row: the fields of a structured array (N,), little endian."""
+    fields = rows.dtype.fields or {}
+    cdr = _Cdr()
+    cdr.header(stamp_ns, frame)
+    cdr.numbers("I", 1, len(rows), len(fields))
+    for name, field in fields.items():
+        cdr.string(name)
+        cdr.numbers("I", field[1])
+        cdr.numbers("B", _FIELD_TYPES[field[0].str[1:]])
+        cdr.numbers("I", 1)
+    cdr.numbers("B", 0)  # little endian
+    cdr.numbers("I", rows.itemsize, rows.nbytes, rows.nbytes)
+    cdr.data += rows.tobytes()
+    cdr.numbers("B", 1)  # dense
+    return bytes(cdr.data)
+
+
+def pack_odometry(
+    stamp_ns: int, frame: str, child_frame: str, pose: Place, covariance: Matrix | None = None
+) -> bytes:
+    """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
+    cdr = _Cdr()
+    cdr.header(stamp_ns, frame)
+    cdr.string(child_frame)
+    cdr.numbers("d", *pose)
+    cdr.data += (np.zeros((6, 6)) if covariance is None else covariance.astype("<f8")).tobytes()
+    cdr.numbers("d", *([0.0] * 42))
+    return bytes(cdr.data)
+
+
+def pack_transform(stamp_ns: int, parent: str, child: str, pose: Place) -> bytes:
+    """A tf2_msgs/TFMessage of one transform: pose of ``child`` in ``parent``."""
+    cdr = _Cdr()
+    cdr.numbers("I", 1)
+    cdr.header(stamp_ns, parent)
+    cdr.string(child)
+    cdr.numbers("d", *pose)
+    return bytes(cdr.data)
+
+
+class _Cdr:
+    """A message in ROS 2's CDR, little endian: numbers lie at multiples of their size, counted from byte 4."""
+
+    __slots__ = ("data",)
+
+    def __init__(self) -> None:
+        self.data = bytearray(b"\x00\x01\x00\x00")
+
+    def numbers(self, code: str, *values: float) -> None:
+        size = struct.calcsize(f"<{code}")
+        self.data += bytes(-(len(self.data) - 4) % size)
+        self.data += struct.pack(f"<{len(values)}{code}", *values)
+
+    def string(self, text: str) -> None:
+        encoded = text.encode() + b"\x00"
+        self.numbers("I", len(encoded))
+        self.data += encoded
+
+    def header(self, stamp_ns: int, frame: str) -> None:
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        self.numbers("i", seconds)
+        self.numbers("I", nanoseconds)
+        self.string(frame)

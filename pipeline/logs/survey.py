@@ -1,0 +1,102 @@
+"""All scans of a log, looked at once, as the doctor's checks need them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.logs.cdr import MalformedMessageError
+from pipeline.logs.log import Log
+from pipeline.logs.point_times import PointTimes
+from pipeline.logs.poses import StampedPose
+from pipeline.logs.rest import Rest, RestWatch
+from pipeline.logs.scan_facts import ScanFacts, facts_of
+from pipeline.logs.stream import decoded_messages
+
+_FORGOTTEN = np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What a log's scans and wheels show.
+
+    Attributes
+    ----------
+    scans : facts of each readable scan, in the order of log time, their outlines left out
+    log_ns, stamps_ns : (N,) int64 log times and header stamps of those scans
+    rests : when the surroundings stayed as they were, for a second or more
+    wheels : poses of the wheels, in the order of log time; empty where there are none
+    malformed : what is wrong with each message that is not readable
+    point_times : what a run assumes about per-point times
+    damage : what of the files could not be read
+    """
+
+    log: Log
+    scans: tuple[ScanFacts, ...]
+    log_ns: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    rests: tuple[Rest, ...]
+    wheels: tuple[StampedPose, ...]
+    malformed: tuple[str, ...]
+    point_times: str
+    damage: tuple[str, ...]
+
+    @property
+    def period_s(self) -> float:
+        """Median time between two scans, by their stamps or, where those do not move, by log time; 0 if alone."""
+        for times_ns in (self.stamps_ns, self.log_ns):
+            steps_s = np.diff(times_ns) * 1e-9
+            if len(steps_s) and np.median(steps_s) > 0.0:
+                return float(np.median(steps_s))
+        return 0.0
+
+    def share(self, part: Callable[[ScanFacts], int]) -> float:
+        """A count of beams over all beams of all scans."""
+        return sum(part(scan) for scan in self.scans) / max(sum(scan.beams for scan in self.scans), 1)
+
+
+def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Survey:
+    """Look at every scan of the chosen part. Raises InputError where none is readable."""
+    times = PointTimes(log.config)
+    decoders = {log.topic: facts_of(log.decoder(times)), **log.pose_decoders}
+    damage = list(log.damage)
+    scans: list[ScanFacts] = []
+    log_ns: list[int] = []
+    wheels: list[StampedPose] = []
+    malformed: list[str] = []
+    watch = RestWatch(log.dimension)
+    for message in decoded_messages(
+        log.indexes, decoders, log.span, ahead=log.config.prefetch_chunks, damage=damage
+    ):
+        match message.value:
+            case ScanFacts() as facts:
+                scans.append(facts._replace(outline=_FORGOTTEN))
+                watch.take(facts.outline, message.log_time_ns)
+                log_ns.append(message.log_time_ns)
+                if progress is not None:
+                    progress(len(scans), log.scan_count)
+            case StampedPose() as pose if message.channel.topic == log.odometry_topic:
+                wheels.append(pose)
+            case MalformedMessageError() as error if message.channel.topic == log.topic:
+                malformed.append(str(error))
+    watch.close()
+    if not scans:
+        reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
+        raise InputError(f"{log.paths[0]}: no scan of {log.topic} could be read: {reasons}")
+    stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
+    assumed = times.assumed if log.dimension == 3 else ""
+    return Survey(
+        log=log,
+        scans=tuple(scans),
+        log_ns=np.array(log_ns, np.int64),
+        stamps_ns=stamps_ns,
+        rests=tuple(watch.rests),
+        wheels=tuple(wheels),
+        malformed=tuple(malformed),
+        point_times=assumed,
+        damage=tuple(damage),
+    )

@@ -1,0 +1,307 @@
+"""The doctor: each defect of a log is found, measured and mended by the flag it names."""
+
+import json
+
+import numpy as np
+import pytest
+from naive_logs import (
+    SECOND,
+    STAMP_NS,
+    cloud_said,
+    laser_scan,
+    odometry,
+    odometry_said,
+    point_cloud,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
+from scenes import shared_data
+
+from pipeline.__main__ import main
+from pipeline.config import Config, LogConfig
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+from pipeline.logs.doctor import examine
+from pipeline.simulate import simulate
+
+STEP_NS = SECOND // 10
+CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]
+CHECKS += ["ranges", "duplicates", "rest", "mounting"]
+
+
+def diagnose(*paths, **config):
+    found = examine(list(paths), lambda _: Config(), LogConfig(**config))
+    checks = [finding.check for finding in found.findings]
+    assert len(set(checks)) == len(checks)
+    return {finding.check: finding for finding in found.findings}
+
+
+def room(k):
+    """Ranges in a room that the robot crosses at 0.1 m a scan."""
+    angles = -1.0 + 0.02 * np.arange(100)
+    return np.minimum((8.0 - 0.1 * k) / np.maximum(np.cos(angles), 0.1), 3.0 / np.abs(np.sin(angles) + 1e-9))
+
+
+def drive(count=40, *, stamp=lambda k: 0, log=lambda k: 0, ranges=room, wheels=False, mounted=True, **options):
+    """Scans every 100 ms; ``stamp`` and ``log`` shift the times of scan k by nanoseconds."""
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))] if mounted else []
+    for k in range(count):
+        time_ns = STAMP_NS + k * STEP_NS
+        if wheels:
+            said.append(odometry_said(time_ns, odometry(time_ns, 0.1 * k, 0.0)))
+        data = laser_scan(time_ns + stamp(k), ranges(k), first=-1.0, step=0.02, high=0.0, **options)
+        said.append(scan_said(time_ns + log(k), data))
+    return said
+
+
+def saved(folder, said, **options):
+    return write(folder / "a.mcap", said, **options)
+
+
+def test_a_healthy_log_is_all_well(tmp_path):
+    found = diagnose(saved(tmp_path, drive(wheels=True)))
+    assert sorted(found) == sorted(CHECKS)
+    assert {finding.severity for finding in found.values()} == {"ok"}
+    assert "10 Hz" in found["rate"].found and "40 readings, 0 of 40" in found["wheels"].found
+    assert "0.200, 0.100" in found["mounting"].found
+
+
+def test_a_slow_log_without_wheels_is_noted(tmp_path):
+    slow = {"stamp": lambda k: 9 * k * STEP_NS, "log": lambda k: 9 * k * STEP_NS}
+    assert diagnose(saved(tmp_path, drive(**slow)))["rate"].severity == "note"
+
+
+def test_a_gap_is_found_where_it_is(tmp_path):
+    def hole(k):
+        return 2 * SECOND if k >= 20 else 0
+
+    finding = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)))["gaps"]
+    assert (
+        finding.severity == "warning" and finding.found == "1 gaps, the longest 2.1 s, 1.9 s after the first scan"
+    )
+    assert "--start" in finding.remedy
+
+
+def test_jitter_is_measured_against_the_period(tmp_path):
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0.0, 0.02, 400) * SECOND
+    finding = diagnose(saved(tmp_path, drive(400, stamp=lambda k: int(shifts[k]))))["jitter"]
+    assert finding.severity == "note"
+    told = float(finding.found.split("(")[1].split(" %")[0])
+    assert told == pytest.approx(100 * 0.02 * np.sqrt(2) / 0.1, rel=0.15)
+
+
+def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
+    assert finding["stamp order"].severity == "warning"
+    assert finding["stamp order"].found == "2 header stamps step back, 1 repeat the one before"
+
+
+def test_stamps_that_were_never_set_are_a_problem(tmp_path):
+    found = diagnose(saved(tmp_path, drive(stamp=lambda k: -STAMP_NS - k * STEP_NS)))
+    assert found["stamp order"].severity == "problem" and found["clock"].severity == "warning"
+    assert "10 Hz" in found["rate"].found  # by log time
+
+
+def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
+    found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
+    assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
+    assert "40 of 40 scans have none" in found["wheels"].found
+    assert "constant-velocity" in found["wheels"].remedy
+
+
+def test_scans_that_were_logged_late_are_noted(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(log=lambda k: 3 * STEP_NS if k == 30 else 0)))["clock"]
+    assert finding.severity == "note" and "from 0 to 0.3 s" in finding.found
+
+
+def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_path):
+    def ranges(k):
+        values = room(k)
+        values[::7] = 29.99
+        return values
+
+    path = saved(tmp_path, drive(ranges=ranges))
+    finding = diagnose(path)["no return"]
+    assert finding.severity == "warning" and "15 % of the beams tell exactly 29.99 m" in finding.found
+    flag, value = finding.remedy.split()
+    assert flag == "--log.max_range_m" and 29.98 < float(value) < np.float32(29.99)
+    assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"
+
+
+def test_nan_and_zero_shares_are_measured(tmp_path):
+    def ranges(k):
+        values = room(k)
+        values[:30], values[30:80] = np.nan, 0.0
+        return values
+
+    finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
+    assert finding.found == "30 % NaN or infinite, 50 % zero, 20 valid a scan (median)"
+    assert finding.severity == "warning" and "40 scans have fewer than 50 returns" in finding.effect
+
+
+def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
+    said = drive()
+    said[5].data = said[5].data[:50]
+    said[9] = scan_said(said[9].log_ns, laser_scan(said[9].log_ns, np.full(100, np.nan)))
+    finding = diagnose(saved(tmp_path, said))["damage"]
+    assert finding.severity == "problem" and finding.remedy == "--log.bad_scans skip"
+    assert "1 malformed scans" in finding.found and "1 scans without a valid point" in finding.found
+
+
+def test_a_log_that_was_cut_off_is_told(tmp_path):
+    path = saved(tmp_path, drive())
+    path.write_bytes(path.read_bytes()[:-1500])
+    finding = diagnose(path)["damage"]
+    assert finding.severity == "warning" and "cut off" in finding.found
+
+
+def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(k // 2))))["duplicates"]
+    assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
+
+
+def test_a_rest_at_the_start_is_measured_and_may_be_skipped(tmp_path):
+    rng = np.random.default_rng(0)
+
+    def ranges(k):
+        return room(max(0, k - 80)) + rng.normal(0.0, 0.002, 100)
+
+    finding = diagnose(saved(tmp_path, drive(120, ranges=ranges)))["rest"]
+    assert finding.severity == "note" and finding.remedy in ("--start 7", "--start 8")
+    assert "of 11.9 s" in finding.found
+
+
+def test_wheels_that_move_tell_a_corridor_from_a_rest(tmp_path):
+    still = {"ranges": lambda k: room(0) + 1e-4 * k}
+    assert diagnose(saved(tmp_path, drive(**still)))["rest"].severity == "warning"
+    found = diagnose(saved(tmp_path, drive(wheels=True, **still)))["rest"]
+    assert found.severity == "ok" and found.found.startswith("0.0 of 3.9 s")
+
+
+def test_wheels_without_a_mounting_are_told(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["mounting"]
+    assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
+
+
+def test_scans_of_several_frames_on_one_topic_are_a_problem(tmp_path):
+    said = [*drive(20, frame="left"), *drive(20, frame="right", mounted=False)]
+    finding = diagnose(saved(tmp_path, said))["mounting"]
+    assert finding.severity == "problem" and "left, right" in finding.found
+
+
+# Clouds
+
+ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4"), ("ring", "<u2")])
+
+
+def sweep(k, *, span=0.095, rings=16, fields=ROW):
+    rng = np.random.default_rng(3)
+    rows = np.zeros(640, fields)
+    for name, reach in zip("xyz", (20.0, 20.0, 2.0), strict=True):
+        rows[name] = rng.uniform(1.0, reach, 640)
+    rows["x"] -= 0.3 * k
+    if "time" in fields.names:
+        rows["time"] = np.linspace(0.0, span, 640)
+    if "ring" in fields.names:
+        rows["ring"] = np.arange(640) % rings
+    return rows
+
+
+def sweeps(count=20, **options):
+    stamps_ns = [STAMP_NS + k * STEP_NS for k in range(count)]
+    return [cloud_said(stamp, point_cloud(stamp, sweep(k, **options))) for k, stamp in enumerate(stamps_ns)]
+
+
+def test_rings_and_point_times_of_a_healthy_cloud_are_told(tmp_path):
+    found = diagnose(saved(tmp_path, sweeps()))
+    assert sorted(found) == sorted([*CHECKS, "rings", "point times"])
+    assert found["rings"].found == "16 rings"
+    assert "field time (float32) taken as s" in found["point times"].found
+    assert "lasts 95 ms" in found["point times"].found and found["point times"].severity == "ok"
+
+
+def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
+    path = saved(tmp_path, sweeps(span=9.5))  # in hundredths of a second: no unit that is guessed fits
+    finding = diagnose(path)["point times"]
+    assert finding.severity == "warning" and "95 of the period" in finding.found
+    assert "--log.point_times" in finding.remedy
+    path = saved(tmp_path, sweeps(span=0.095))
+    assert diagnose(path, point_times="ms")["point times"].severity == "warning"
+    assert diagnose(path, point_times="s")["point times"].severity == "ok"
+
+
+def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
+    path = saved(tmp_path, sweeps(fields=np.dtype([(name, "<f4") for name in "xyz"])))
+    finding = diagnose(path)["point times"]
+    assert finding.severity == "note" and "--log.point_times clockwise --log.revolution_s 0.1" in finding.remedy
+    assert diagnose(path, point_times="clockwise")["point times"].severity == "ok"
+
+
+def test_rings_that_come_and_go_are_noted(tmp_path):
+    said = [*sweeps(10), *sweeps(20, rings=12)[10:]]
+    finding = diagnose(saved(tmp_path, said))["rings"]
+    assert finding.severity == "note" and finding.found == "12 to 16 rings"
+
+
+def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
+    def far(k):
+        rows = sweep(k)
+        rows["y"] += 150.0
+        return rows
+
+    said = [cloud_said(STAMP_NS + k * STEP_NS, point_cloud(STAMP_NS + k * STEP_NS, far(k))) for k in range(5)]
+    finding = diagnose(saved(tmp_path, said))["ranges"]
+    assert finding.severity == "note" and finding.remedy.startswith("--preprocess.max_range_m 17")
+
+
+def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
+    path = tmp_path / "hall.mcap"
+    simulate("hall", path, seed=1, duration_s=4.0)
+    truth = open_log(path).ground_truth()
+    moved_m = np.linalg.norm(truth.poses[:, :3, 3] - truth.poses[0, :3, 3], axis=1)
+    until_s = (truth.stamps_ns[np.flatnonzero(moved_m > 0.02)[0]] - truth.stamps_ns[0]) * 1e-9
+    found = diagnose(path)["rest"].found
+    still_s, first_s = float(found.split()[0]), float(found.split(", ")[1].split()[0])
+    assert 2.0 < until_s < 3.5
+    assert still_s == first_s == pytest.approx(until_s, abs=0.15)
+
+
+# The whole
+
+
+def test_the_intel_log_is_known_for_its_stamps():
+    found = diagnose(shared_data("2d/intel.mcap"))
+    assert found["stamp order"].found == "631 header stamps step back, 0 repeat the one before"
+    assert "81.83 m" in found["no return"].found and found["no return"].severity == "ok"
+    assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found
+
+
+def test_the_command_prints_the_gravest_first_and_json_says_the_same(tmp_path, capfd):
+    path = saved(tmp_path, drive(stamp=lambda k: -37 * SECOND if k == 3 else 0))
+    assert main(["doctor", str(path)]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[0] == f"{path} /scan (2D)" and lines[1].startswith("warning  stamp order")
+    assert main(["doctor", str(path), "--json"]) == 0
+    said = json.loads(capfd.readouterr().out)
+    grades = [finding["severity"] for finding in said["findings"]]
+    assert grades == sorted(grades, key=["problem", "warning", "note", "ok"].index)
+    assert said["topic"] == "/scan" and {"check", "severity", "found", "effect", "remedy"} == set(
+        said["findings"][0]
+    )
+
+
+def test_every_finding_that_is_not_ok_says_what_it_does():
+    for name in ("2d/intel.mcap", "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"):
+        for finding in diagnose(shared_data(name)).values():
+            assert finding.severity == "ok" or finding.effect, finding
+
+
+def test_a_log_that_a_run_could_not_open_is_refused_in_the_same_words(tmp_path, capfd):
+    path = saved(tmp_path, [odometry_said(STAMP_NS, odometry(STAMP_NS, 0, 0))])
+    assert main(["doctor", str(path)]) == 2
+    assert "has no lidar topic" in capfd.readouterr().err
+    with pytest.raises(InputError, match="could be read"):
+        diagnose(saved(tmp_path, [scan_said(STAMP_NS, b"\0\1\0\0")]))

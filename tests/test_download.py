@@ -1,0 +1,266 @@
+"""Downloads from a local server that understands ranges, and the catalogue's recordings by way of it."""
+
+import hashlib
+import http.server
+import io
+import json
+import re
+import threading
+import zipfile
+
+import msgspec
+import numpy as np
+import pytest
+import recorders
+from test_inputs_carmen import flaser, save
+from test_inputs_folders import kitti_raw
+
+from pipeline import catalogue
+from pipeline.__main__ import main
+from pipeline.download import DownloadError, fetch
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+
+CONTENT = np.random.default_rng(0).bytes(3_000_000)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+class Site:
+    """Files to serve; ``cuts`` are the numbers of bytes after which the next answers break off."""
+
+    def __init__(self):
+        self.files = {"/file.bin": CONTENT}
+        self.etag = '"one"'
+        self.has_ranges = self.tells_length = True
+        self.cuts = []
+        self.asked = []
+        self.sent = 0
+
+    def answer(self, handler):
+        body = self.files.get(handler.path)
+        wanted = handler.headers.get("Range")
+        self.asked.append(wanted)
+        if body is None:
+            return handler.send_error(404)
+        begin = 0
+        is_same = handler.headers.get("If-Range") in (None, self.etag)
+        if wanted and self.has_ranges and is_same:
+            begin = int(re.fullmatch(r"bytes=(\d+)-", wanted)[1])
+            if begin >= len(body):
+                handler.send_response(416)
+                handler.send_header("Content-Range", f"bytes */{len(body)}")
+                return handler.end_headers()
+            handler.send_response(206)
+            handler.send_header("Content-Range", f"bytes {begin}-{len(body) - 1}/{len(body)}")
+        else:
+            handler.send_response(200)
+        if self.etag:
+            handler.send_header("ETag", self.etag)
+        if self.tells_length:
+            handler.send_header("Content-Length", str(len(body) - begin))
+        handler.end_headers()
+        end = begin + self.cuts.pop(0) if self.cuts else len(body)
+        handler.wfile.write(body[begin:end])
+        self.sent += len(body[begin:end])
+        return None
+
+
+@pytest.fixture
+def site():
+    """A server; ``site.url`` is its address."""
+    served = Site()
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            served.answer(self)
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    served.url = f"http://127.0.0.1:{server.server_address[1]}"
+    yield served
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def left(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_comes_whole_verified_and_with_progress(site, tmp_path):
+    told = []
+    found = fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256, progress=lambda *now: told.append(now))
+    assert found == SHA256 and (tmp_path / "a").read_bytes() == CONTENT and left(tmp_path) == ["a"]
+    assert told == sorted(told) and told[-1] == (2, 2)
+
+
+def test_what_is_there_is_not_fetched_again_but_verified(site, tmp_path):
+    (tmp_path / "a").write_bytes(CONTENT)
+    assert fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256) == SHA256
+    assert site.asked == []
+
+
+def test_a_line_that_breaks_is_gone_on_with_and_nothing_comes_twice(site, tmp_path):
+    site.cuts = [1_000_000, 500_000]
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert (tmp_path / "a").read_bytes() == CONTENT and site.sent == len(CONTENT)
+    assert site.asked == [None, "bytes=1000000-", "bytes=1500000-"]
+
+
+def test_a_download_that_was_given_up_is_resumed_by_the_next_call(site, tmp_path):
+    site.cuts = [700_000, 0, 0, 0]
+    with pytest.raises(DownloadError, match="700,000 bytes are kept"):
+        fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert left(tmp_path) == [".a.part", ".a.part.etag"]
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert left(tmp_path) == ["a"] and site.asked[-1] == "bytes=700000-" and site.sent == len(CONTENT)
+
+
+def test_a_file_that_changed_meanwhile_is_fetched_anew(site, tmp_path):
+    site.cuts = [700_000, 0, 0, 0]
+    with pytest.raises(DownloadError):
+        fetch(f"{site.url}/file.bin", tmp_path / "a")
+    site.files["/file.bin"], site.etag = CONTENT[::-1], '"two"'
+    fetch(f"{site.url}/file.bin", tmp_path / "a")
+    assert (tmp_path / "a").read_bytes() == CONTENT[::-1]
+
+
+@pytest.mark.parametrize("lack", ["ranges", "etag"])
+def test_a_server_that_cannot_resume_starts_anew(site, tmp_path, lack):
+    site.cuts = [700_000]
+    site.has_ranges = lack != "ranges"
+    site.etag = "" if lack == "etag" else site.etag
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert (tmp_path / "a").read_bytes() == CONTENT and site.sent == 700_000 + len(CONTENT)
+
+
+def test_a_file_that_shrank_on_the_server_is_fetched_anew(site, tmp_path):
+    (tmp_path / ".a.part").write_bytes(bytes(4_000_000))
+    (tmp_path / ".a.part.etag").write_text(site.etag)
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert (tmp_path / "a").read_bytes() == CONTENT
+
+
+def test_a_file_that_had_come_whole_before_the_end_is_not_fetched_again(site, tmp_path):
+    (tmp_path / ".a.part").write_bytes(CONTENT)
+    (tmp_path / ".a.part.etag").write_text(site.etag)
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert (tmp_path / "a").read_bytes() == CONTENT and site.sent == 0
+
+
+def test_a_server_that_does_not_tell_the_length_is_taken_at_its_word(site, tmp_path):
+    site.tells_length = False
+    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
+    assert (tmp_path / "a").read_bytes() == CONTENT
+
+
+def test_a_wrong_checksum_leaves_nothing(site, tmp_path):
+    with pytest.raises(InputError, match=f"has SHA-256 {SHA256}, not 0000"):
+        fetch(f"{site.url}/file.bin", tmp_path / "a", sha256="0" * 64)
+    assert not (tmp_path / "a").exists() and not (tmp_path / ".a.part").exists()
+
+
+def test_what_is_not_there_or_no_web_address_is_one_line(site, tmp_path):
+    with pytest.raises(DownloadError, match=r"/absent: 404 Not Found"):
+        fetch(f"{site.url}/absent", tmp_path / "a")
+    for url in ("file:///etc/passwd", "ftp://host/a", "intel.clf"):
+        with pytest.raises(InputError, match="no address of a web server"):
+            fetch(url, tmp_path / "a")
+    assert left(tmp_path) == []
+
+
+def test_a_server_that_is_not_there_is_one_line(tmp_path):
+    with pytest.raises(DownloadError, match=r"127\.0\.0\.1:9/a: .*; 0 bytes are kept"):
+        fetch("http://127.0.0.1:9/a", tmp_path / "a")
+
+
+# The catalogue
+
+PUBLISHED = {"intel", "aces", "freiburg-079", "mit-csail", "mit-killian", "freiburg-hospital", "kitti"}
+PUBLISHED |= {"kitti-odometry", "newer-college", "mulran", "helipr"}
+
+
+def served(monkeypatch, name, **changes):
+    """The catalogue's entry, its addresses on the local server."""
+    entry = catalogue.load(name)
+    changed = msgspec.structs.replace(entry, source=msgspec.structs.replace(entry.source, **changes))
+    monkeypatch.setattr(catalogue, "load", lambda _: changed)
+
+
+def test_every_recording_of_others_has_its_page_its_licence_and_a_way_to_mcap():
+    assert set(catalogue.names()) >= PUBLISHED
+    for name in PUBLISHED:
+        entry = catalogue.load(name)
+        assert entry.source.page.startswith("http") and entry.licence and entry.conversion and entry.ground_truth
+        if isinstance(entry.source, catalogue.Download):
+            assert entry.source.url.startswith("http")
+        else:
+            assert "scanchain convert" in entry.source.steps and f"{name}.mcap" in entry.source.steps
+
+
+def test_a_carmen_log_is_fetched_converted_and_its_relations_lie_beside_it(site, tmp_path, monkeypatch, capfd):
+    text = save(tmp_path / "x.log", *[flaser(k) for k in range(30)]).read_bytes()
+    site.files = {"/set/intel.clf": text, "/set/intel.relations": b"1 2 3\n"}
+    site.cuts = [len(text) // 2]
+    url, sha256 = f"{site.url}/set/intel.clf", hashlib.sha256(text).hexdigest()
+    served(monkeypatch, "intel", url=url, sha256=sha256, reference_url=f"{site.url}/set/intel.relations")
+    out = tmp_path / "logs"
+    assert main(["sequence", "get", "intel", "--out", str(out), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out) == {"name": "intel", "path": str(out / "intel.mcap")}
+    assert left(out) == ["intel.clf", "intel.mcap", "intel.relations"]
+    assert open_log(out / "intel.mcap").scan_count == 30
+    asked = len(site.asked)
+    assert main(["sequence", "get", "intel", "--out", str(out)]) == 0
+    assert len(site.asked) == asked
+
+
+def zipped(folder, base):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for file in folder.rglob("*") if folder.is_dir() else [folder]:
+            archive.write(file, file.relative_to(base))
+    return packed.getvalue()
+
+
+def test_an_archive_is_unpacked_and_its_folder_converted_with_its_truth(site, tmp_path, monkeypatch):
+    drive = kitti_raw(tmp_path / "made" / "2011_09_26", recorders.clouds())
+    base = tmp_path / "made"
+    site.files = {
+        "/drive.zip": zipped(drive, base),
+        "/calib.zip": zipped(base / "2011_09_26" / "calib_imu_to_velo.txt", base),
+    }
+    served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url=f"{site.url}/calib.zip")
+    log = open_log(catalogue.prepare("kitti", tmp_path / "logs"))
+    truth = log.ground_truth()
+    assert log.scan_count == 3 and truth is not None and len(truth) == 3
+
+
+def test_names_in_an_archive_lead_nowhere_else(site, tmp_path, monkeypatch):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("../../outside.txt", "no")
+        archive.writestr("/absolute.txt", "no")
+    site.files = {"/drive.zip": packed.getvalue()}
+    served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")
+    with pytest.raises(InputError):
+        catalogue.prepare("kitti", tmp_path / "a" / "logs")
+    assert {path.name for path in (tmp_path / "a").rglob("*.txt")} <= {"outside.txt", "absolute.txt"}
+    for path in tmp_path.rglob("*.txt"):
+        assert path.is_relative_to(tmp_path / "a" / "logs" / "kitti-unpacked")
+
+
+def test_an_archive_that_is_none_says_so(site, tmp_path, monkeypatch):
+    site.files = {"/drive.zip": b"no zip"}
+    served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")
+    with pytest.raises(InputError, match=r"drive\.zip: does not unpack"):
+        catalogue.prepare("kitti", tmp_path)
+
+
+def test_a_recording_that_asks_for_an_account_says_what_to_do(capfd, tmp_path):
+    assert main(["sequence", "get", "newer-college", "--out", str(tmp_path)]) == 2
+    said = capfd.readouterr().err
+    assert "ori-drs.github.io/newer-college-dataset" in said and "scanchain convert" in said

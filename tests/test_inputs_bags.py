@@ -1,0 +1,152 @@
+"""ROS 1 bags, ROS 2 bags in SQLite, and folders of the parts of a log, all written by rosbags."""
+
+import shutil
+
+import numpy as np
+import pytest
+import recorders
+from naive_logs import office, write
+from recorders import STAMP_NS, Ros, assert_clouds, assert_planar
+
+from pipeline import lie
+from pipeline.config import LogConfig
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+
+
+def read(path, **config):
+    log = open_log(path, LogConfig(**config))
+    scans = list(log.scans())
+    assert log.damage == []
+    return log, scans
+
+
+def assert_drive(log, scans):
+    assert_planar(scans)
+    assert (log.dimension, log.topic, log.odometry_topic, log.scan_count) == (2, "/scan", "/odom", 3)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+    for k, scan in enumerate(scans):
+        assert scan.log_time_ns == scan.stamp_ns
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_ros_1_bag_is_a_log(tmp_path, compression):
+    drive = Ros(recorders.ROS1).drive()
+    assert_drive(*read(recorders.bag1_of(tmp_path / "a.bag", drive, compression)))
+    sweeps = Ros(recorders.ROS1).sweeps()
+    log, scans = read(recorders.bag1_of(tmp_path / "b.bag", sweeps, compression))
+    assert_clouds(scans)
+    assert log.dimension == 3
+
+
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize("compression", ["NONE", "FILE", "MESSAGE"])
+def test_the_folder_of_a_ros_2_bag_is_a_log(tmp_path, plugin, compression):
+    drive = Ros(recorders.ROS2).drive()
+    assert_drive(*read(recorders.bag2_of(tmp_path / "a", drive, plugin=plugin, compression=compression)))
+
+
+def test_a_db3_alone_is_a_log(tmp_path):
+    folder = recorders.bag2_of(tmp_path / "a", Ros(recorders.ROS2).drive())
+    assert_drive(*read(folder / "a.db3"))
+
+
+def test_parts_in_a_folder_are_one_log_in_natural_order(tmp_path):
+    drive = list(Ros(recorders.ROS1).drive())
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    for name, part in (("run_2.bag", drive[:3]), ("run_10.bag", drive[3:])):
+        recorders.bag1_of(folder / name, part)
+    log, scans = read(folder)
+    assert_drive(log, scans)
+    assert [path.name for path in log.paths] == ["run_2.bag", "run_10.bag"]
+
+
+def test_mcap_and_db3_parts_in_a_folder_are_one_log(tmp_path):
+    said = office(20)
+    folder = tmp_path / "mcap"
+    folder.mkdir()
+    write(folder / "0.mcap", said[:21])
+    write(folder / "1.mcap", said[21:])
+    assert len(read(folder)[1]) == 20
+    drive = list(Ros(recorders.ROS2).drive())
+    for number, part in enumerate((drive[:3], drive[3:])):
+        recorders.bag2_of(tmp_path / f"part_{number}", part)
+        (tmp_path / "db3").mkdir(exist_ok=True)
+        shutil.move(tmp_path / f"part_{number}" / f"part_{number}.db3", tmp_path / "db3")
+    assert_drive(*read(tmp_path / "db3"))
+
+
+def test_a_part_of_a_bag_is_chosen_by_time(tmp_path):
+    path = recorders.bag1_of(tmp_path / "a.bag", Ros(recorders.ROS1).drive())
+    log, scans = read(path, start_s=0.1)
+    assert log.scan_count == len(scans) == 2
+    assert_planar(scans, recorders.planar()[1:])
+
+
+def test_a_bag_of_many_blocks_gives_each_scan_once_in_order(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.logs.formats.bags._BLOCK_BYTES", 4000)
+    sweeps = list(recorders.clouds(60))
+    ros = Ros(recorders.ROS1)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    log, scans = read(recorders.bag1_of(tmp_path / "a.bag", told))
+    assert len(log.indexes[0].blocks) > 10
+    assert_clouds(scans, sweeps)
+
+
+def test_an_empty_bag_says_so(tmp_path):
+    with pytest.raises(InputError, match="no lidar topic"):
+        read(recorders.bag1_of(tmp_path / "a.bag", []))
+
+
+def test_a_bag_that_was_cut_off_says_so_in_one_line(tmp_path):
+    path = recorders.bag1_of(tmp_path / "a.bag", Ros(recorders.ROS1).sweeps())
+    whole = path.read_bytes()
+    for length in range(20, len(whole), 211):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"a\.bag: ") as error:
+            read(path)
+        assert "\n" not in str(error.value)
+
+
+def test_what_cannot_be_read_of_a_bag_is_damage_not_an_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.logs.formats.bags._BLOCK_BYTES", 4000)
+    ros, sweeps = Ros(recorders.ROS1), recorders.clouds(60)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    path = recorders.bag1_of(tmp_path / "a.bag", told)
+    content = bytearray(path.read_bytes())
+    place = content.index(sweeps[30].rows.tobytes())
+    content[place - 300 : place - 100] = bytes(200)
+    path.write_bytes(content)
+    log = open_log(path)
+    scans = list(log.scans())
+    assert 30 <= len(scans) < 60 and "cannot be read" in log.damage[0]
+    assert {scan.stamp_ns for scan in scans} <= {cloud.stamp_ns for cloud in sweeps}
+
+
+def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):
+    (tmp_path / "metadata.yaml").write_text("a: [")
+    with pytest.raises(InputError, match=r"metadata\.yaml: is not that of a ROS 2 bag"):
+        read(tmp_path)
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive())
+    (folder / "bag.db3").unlink()
+    with pytest.raises(InputError, match="database files are missing"):
+        read(folder)
+
+
+def test_a_path_in_metadata_leads_nowhere_else(tmp_path):
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive(), plugin="MCAP")
+    outside = write(tmp_path / "outside.mcap", office(2))
+    text = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text(text.replace("bag.mcap", f"../{outside.name}"))
+    with pytest.raises(InputError):
+        read(folder)
+
+
+def test_stamps_before_the_first_message_of_a_bag_do_not_matter(tmp_path):
+    ros = Ros(recorders.ROS1)
+    scan = recorders.planar(1)[0]
+    told = [("/scan", "sensor_msgs/msg/LaserScan", STAMP_NS + 5, ros.laser_scan(scan))]
+    _, scans = read(recorders.bag1_of(tmp_path / "a.bag", told))
+    assert scans[0].stamp_ns == STAMP_NS and scans[0].log_time_ns == STAMP_NS + 5
