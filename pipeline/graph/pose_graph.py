@@ -12,6 +12,7 @@ from pipeline.config import GraphConfig
 from pipeline.data import GraphState, Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.graph.between import BetweenProblem
+from pipeline.graph.certificate import Certificate, certify
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation, first_guess
@@ -155,6 +156,10 @@ class PoseGraph:
             initialisation=source,
             time_s=time.perf_counter() - begin,
         )
+
+    def certify(self) -> Certificate:
+        """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
+        return certify(self._prepared(), self.poses, self.weight)
 
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
