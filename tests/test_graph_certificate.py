@@ -62,7 +62,7 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
 
 
 def test_the_two_numbers_that_the_bound_rests_on():
-    """V⁻¹ slopes at most 0.9311 up to π, and κ‖φ‖² bends at least as said, for θ* up to 1 rad and any direction."""
+    """V⁻¹ slopes at most 0.9311 up to π; κ‖φ‖² bends at least as said, for θ* up to 1 rad, in all directions."""
     for theta in np.linspace(1e-2, np.pi - 1e-6, 40):
         for towards in np.linspace(0.0, np.pi / 2, 20):
             ahead = 1e-6 * np.array([np.sin(towards), 0.0, np.cos(towards)])
@@ -123,7 +123,7 @@ def test_a_local_minimum_from_a_bad_guess_is_not_certified(name):
 
 
 def closed_ring(dimension, count, turns, noise=0.0):
-    """Poses that each measure the next one straight ahead, the last the first; they start wound up ``turns`` times."""
+    """Poses that each measure the next one where they are, the last the first; they start wound up some turns."""
     k = 3 if dimension == 2 else 6
     rng = np.random.default_rng(0)
     graph = PoseGraph(dimension)

@@ -50,11 +50,11 @@ class Certificate:
 
 
 def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Certificate:
-    """Bound the global minimum of Σ w eᵀΩe from below, w (E,) as they stand, e the logarithm and Ω any information.
+    """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
 
     Every edge's χ² is replaced by a quadratic function of rotations and positions that is nowhere above it and
-    touches it at these poses (``minorise``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et al.
-    2019, theorem 1) bounds it in turn: if S, with the gauge fixed, is positive definite, then for all poses
+    touches it at these poses (``minorise``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et
+    al. 2019, theorem 1) bounds it in turn: if S, with the gauge fixed, is positive definite, then for all poses
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorisation goes through, so the claim holds to the rounding of that.

@@ -5,8 +5,8 @@ two rotations and P = n sin δ, n its axis. Let τ, κ be such that diag(τ I, �
     eᵀΩe ≥ e*ᵀΩe* + 2 yᵀ(e − e*) + τ‖ρ − ρ*‖² + κ‖Δ‖².
 Translation: z = V(φ)(ρ − ρ*) is no longer than ρ − ρ*, and differs from the change u of the relative position by
 (V(φ) − V(φ*))ρ*, at most ½‖ρ*‖‖Δ‖; the linear term changes with V⁻¹, whose slope is at most 0.9311 up to θ = π.
-Rotation: κ‖φ‖² ≥ κ‖φ*‖² + 2κ φ*ᵀP + κ (2 − 0.72 θ*²)(1 − cos δ) for θ* ≤ 1; any other linear term changes from Δ to
-P at a cost of ½‖·‖‖Δ‖². Every cost is paid from τ or from κ, by 2xy ≤ ε x² + y²/ε.
+Rotation: κ‖φ‖² ≥ κ‖φ*‖² + 2κ φ*ᵀP + κ (2 − 0.72 θ*²)(1 − cos δ) for θ* ≤ 1; any other linear term changes from Δ
+to P at a cost of ½‖·‖‖Δ‖². Every cost is paid from τ or from κ, by 2xy ≤ ε x² + y²/ε.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class _Costs:
     def paid(
         self, force: NDArray[np.float64], excess: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What is left of τ and κ, with ``force`` ‖V⁻ᵀy_t‖ and ``excess`` the linear rotational term beside 2κφ*."""
+        """What is left of τ and κ; ``force`` is ‖V⁻ᵀy_t‖, ``excess`` the rotational slope beside 2κφ*."""
         best_tau, best_kappa = self._left(_SHARES[0], force, excess)
         for share in _SHARES[1:]:
             tau, kappa = self._left(share, force, excess)

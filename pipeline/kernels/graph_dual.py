@@ -21,8 +21,8 @@ def scatter_dual(
 ) -> None:
     """Add every edge's quadratic minorant to S = Q − Λ, and its share to the residual r = S X*.
 
-    Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at the
-    estimate X* every G is I. An edge contributes
+    Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at
+    the estimate X* every G is I. An edge contributes
         q = τ‖t_j − t_i − G_i l‖² + fᵀG_iᵀ(t_j − t_i) + ½ κ‖G_i − G_j‖² + ½ ⟨[g]×, G_iᵀG_j⟩
     and, by the multiplier Λ_i of G_iᵀG_i = I that makes X* stationary, −½ sym(f lᵀ) at G_i
     (Carlone et al. 2015, eq. 26; Rosen et al. 2019, eq. 22). A row of S belongs to one row of each G and of t.
