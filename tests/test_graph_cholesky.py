@@ -42,6 +42,17 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
 
 
+@settings(max_examples=150, deadline=None)
+@given(_graphs())
+def test_the_selected_inverse_equals_the_dense_one_for_any_pattern_and_block_sizes(graph):
+    pattern, values, A = _matrix(*graph)
+    cholesky = SparseCholesky(pattern, analyse(pattern))
+    cholesky.factorise(values)
+    inverse = naive_graph.dense(pattern, cholesky.inverse_blocks())
+    there = naive_graph.dense(pattern, np.ones(pattern.value_count)) != 0.0
+    assert np.allclose(inverse[there], np.linalg.inv(A)[there], rtol=1e-9, atol=1e-14)
+
+
 @pytest.mark.parametrize("size", [1, 3, 6])
 def test_wide_fronts_are_eliminated_in_panels_and_tiles(size):
     n = 420 // size

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spilu
 
 from pipeline.data import Matrix
-from pipeline.kernels import graph_cholesky, graph_fronts, graph_symbolic
+from pipeline.kernels import graph_cholesky, graph_fronts, graph_inverse, graph_symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -119,6 +119,12 @@ class SparseCholesky:
             graph_cholesky.solve(self._fronts, self._factor, x, local)
             result[:, column] = x[self._places]
         return result.reshape(right_side.shape)
+
+    def inverse_blocks(self) -> NDArray[np.float64]:
+        """A⁻¹ by the last factor where A may be nonzero: block values, laid out as those of A; nothing is dense."""
+        result = np.empty(self.pattern.value_count)
+        graph_inverse.selected_inverse(self._fronts, self._blocks, self._factor, result, self._stack, self._work)
+        return result
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

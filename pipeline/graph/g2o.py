@@ -65,6 +65,14 @@ def read_g2o(path: Path | str, *, loops: Literal["trusted", "suspect"] = "truste
     return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids))
 
 
+def write_graph(path: Path, graph: PoseGraph, *, ids: NDArray[np.int64], other_lines: Iterable[str] = ()) -> None:
+    """Write a g2o file, or a TORO one where the name ends in .graph or .toro."""
+    try:
+        write_g2o(path, graph, ids=ids, other_lines=other_lines)
+    except OSError as error:
+        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+
+
 def write_g2o(
     path: Path | str,
     graph: PoseGraph,

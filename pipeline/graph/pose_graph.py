@@ -188,6 +188,19 @@ class PoseGraph:
         adjoint = lie.adjoint(lie.inverse(self.poses[i]))
         return adjoint @ (flat.T @ problem.cholesky.solve(flat)) @ adjoint.T
 
+    def covariances(self) -> Matrix:
+        """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ), the held ones zero.
+
+        Given all edges at the poses and weights of now, by the selected inverse of H. Order (translation, rotation),
+        m², m rad, rad².
+        """
+        problem, k = self._factored(), self.freedom
+        result = np.zeros((len(self), k, k))
+        of_left_twists = problem.cholesky.inverse_blocks()[: len(problem.free) * k * k].reshape(-1, k, k)
+        adjoint = lie.adjoint(lie.inverse(self.poses[problem.free]))
+        result[problem.free] = adjoint @ of_left_twists @ np.swapaxes(adjoint, 1, 2)
+        return result
+
     def _factored(self) -> BetweenProblem:
         """The problem, with the factor of the undamped H in its solver."""
         problem = self._prepared()
