@@ -128,7 +128,7 @@ class Answer:
             f"graph          {self.name}: {graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges",
             *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
             f"first guess    {guess}",
-            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after (half: {0.5 * done.chi2_after:.8g})",
+            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
         ]
         if graph.is_loop.any():

@@ -121,7 +121,7 @@ class SparseCholesky:
         return result.reshape(right_side.shape)
 
     def inverse_blocks(self) -> NDArray[np.float64]:
-        """A⁻¹ by the last factor where A may be nonzero: block values, laid out as those of A; nothing is dense."""
+        """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)
         graph_inverse.selected_inverse(self._fronts, self._blocks, self._factor, result, self._stack, self._work)
         return result

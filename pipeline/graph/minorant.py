@@ -111,7 +111,7 @@ def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArra
     scale = np.maximum(np.repeat(np.stack([tau, kappa], axis=1), (d, k - d), axis=1), _NOTHING) ** -0.5
     least = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0]
     least = np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING)
-    return least * np.maximum(tau, _NOTHING), least * np.maximum(kappa, _NOTHING)
+    return (least * np.maximum(tau, _NOTHING)).astype(np.float64), (least * np.maximum(kappa, _NOTHING)).astype(np.float64)
 
 
 def _length(vectors: Matrix) -> NDArray[np.float64]:

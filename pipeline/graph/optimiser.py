@@ -7,16 +7,19 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem, NormalEquations
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.robust import GRADUATED, RobustLoss
+from pipeline.graph.verdicts import Verdicts, contradictions
 
 Optimiser = Literal["gauss-newton", "levenberg-marquardt"]
 
 _MOST_DAMPING = 1e12
 _FIRST_DAMPING = 1e-12  # all but Gauss-Newton: the weakest modes of a long chain have 1e-9 of diag H
+_MOST_ROUNDS = 50  # of mending verdicts
 _GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
 
 
@@ -51,13 +54,13 @@ class Minimiser:
         self._damped = optimiser == "levenberg-marquardt"
         self._damping, self._growth = _FIRST_DAMPING, _GROWTH
 
-    def evaluate(self, poses: Matrix, loss: RobustLoss) -> Estimate:
+    def evaluate(self, poses: Matrix, loss: RobustLoss | Verdicts) -> Estimate:
         """Residuals, χ² and cost at these poses."""
         errors = self._problem.errors(poses)
         chi2 = self._problem.chi2(errors)
         return Estimate(poses, errors, chi2, self._cost(chi2, loss))
 
-    def weights(self, chi2: NDArray[np.float64], loss: RobustLoss) -> NDArray[np.float64]:
+    def weights(self, chi2: NDArray[np.float64], loss: RobustLoss | Verdicts) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the trusted ones."""
         result = np.ones(len(chi2))
         result[self._loops] = loss.weight(chi2[self._loops])
@@ -70,7 +73,38 @@ class Minimiser:
             now, loss, used = self._graduate(now, loss)
         minimum = self._descend(now, loss, max_iterations, tolerance)
         weights = self.weights(minimum.estimate.chi2, loss)
-        return replace(minimum, weights=weights, iterations=used + minimum.iterations)
+        minimum = replace(minimum, weights=weights, iterations=used + minimum.iterations)
+        if loss.kernel == "truncated" and len(self._loops):
+            minimum = self._mend(minimum, loss.scale**2, max_iterations, tolerance)
+        return minimum
+
+    def _mend(self, minimum: Minimum, price: float, max_iterations: int, tolerance: float) -> Minimum:
+        """Change verdicts that the other edges contradict, as long as the truncated cost falls."""
+        share = 1.0
+        for round in range(_MOST_ROUNDS):
+            kept = minimum.weights[self._loops] > 0.5
+            against = contradictions(self._problem, minimum.estimate.poses, minimum.weights)[self._loops]
+            if round == 0:
+                price *= _pessimism(against[kept], self._problem.freedom)
+                print('price', price)
+                minimum = replace(minimum, estimate=self._reweighed(minimum.estimate, Verdicts(kept, price)))
+            gain = np.where(kept, against - price, price - against)
+            if not (gain > 0.0).any():
+                break
+            changed = gain > (1.0 - share) * gain.max()
+            verdicts = Verdicts(kept ^ changed, price)
+            start = self._reweighed(minimum.estimate, verdicts)
+            trial = self._descend(start, verdicts, max_iterations, tolerance)
+            print('mend', share, 'drop', (changed&kept).sum(), 'add', (changed&~kept).sum(), minimum.estimate.cost, trial.estimate.cost)
+            if trial.estimate.cost < minimum.estimate.cost:
+                minimum = replace(trial, weights=self.weights(trial.estimate.chi2, verdicts),
+                                  iterations=minimum.iterations + trial.iterations)
+                share = 1.0
+            elif share > 1e-3:
+                share *= 0.3
+            else:
+                break
+        return minimum
 
     def _graduate(self, now: Estimate, loss: RobustLoss) -> tuple[Estimate, RobustLoss, int]:
         """Follow the minimum from the convex loss to the loss itself, one step for each level."""
@@ -82,10 +116,10 @@ class Minimiser:
             loss = loss.tightened()
         return self._reweighed(now, loss), loss, used
 
-    def _reweighed(self, now: Estimate, loss: RobustLoss) -> Estimate:
+    def _reweighed(self, now: Estimate, loss: RobustLoss | Verdicts) -> Estimate:
         return Estimate(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
-    def _descend(self, now: Estimate, loss: RobustLoss, max_iterations: int, tolerance: float) -> Minimum:
+    def _descend(self, now: Estimate, loss: RobustLoss | Verdicts, max_iterations: int, tolerance: float) -> Minimum:
         """Iterate x ← x − (H + λ diag H)⁻¹ g until nothing more is to be gained."""
         weights = np.ones(len(now.chi2))
         for iteration in range(max_iterations):
@@ -106,7 +140,7 @@ class Minimiser:
         return Minimum(now, weights, max_iterations, False, f"{max_iterations} iterations reached")
 
     def _step(
-        self, now: Estimate, equations: NormalEquations, loss: RobustLoss
+        self, now: Estimate, equations: NormalEquations, loss: RobustLoss | Verdicts
     ) -> tuple[NDArray[np.float64], Estimate | None]:
         """Return one step and where it leads; None where no damping makes it one that lowers the cost."""
         while self._damping < _MOST_DAMPING:
@@ -154,8 +188,15 @@ class Minimiser:
         diagonal = np.maximum(equations.values[self._problem.pattern.diagonal], 1e-300)
         return bool(np.all(np.abs(equations.gradient) <= tolerance * np.sqrt(diagonal)))
 
-    def _cost(self, chi2: NDArray[np.float64], loss: RobustLoss) -> float:
+    def _cost(self, chi2: NDArray[np.float64], loss: RobustLoss | Verdicts) -> float:
         if loss.kernel == "none" or not len(self._loops):
             return float(chi2.sum())
         loops = chi2[self._loops]
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
+
+
+def _pessimism(against, degrees):
+    """Share of the nominal price."""
+    if len(against) < 10:
+        return 1.0
+    return min(1.0, 4.0 * float(np.median(against)) / float(2.0 * gammaincinv(0.5 * degrees, 0.5)))

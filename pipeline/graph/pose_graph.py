@@ -149,7 +149,7 @@ class PoseGraph:
             chi2_before=chi2_before,
             chi2_after=float(chi2.sum()),
             cost_after=minimum.estimate.cost,
-            rejected=(self.is_loop & (chi2 > limit))[self._order()],
+            rejected=(self.is_loop & ((minimum.weights == 0.0) | (chi2 > limit)))[self._order()],
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
@@ -191,8 +191,8 @@ class PoseGraph:
     def covariances(self) -> Matrix:
         """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ), the held ones zero.
 
-        Given all edges at the poses and weights of now, by the selected inverse of H. Order (translation, rotation),
-        m², m rad, rad².
+        Given all edges at the poses and weights of now, by the selected inverse of H. Twists are (translation,
+        rotation), so the units are m², m rad, rad².
         """
         problem, k = self._factored(), self.freedom
         result = np.zeros((len(self), k, k))

@@ -1,4 +1,4 @@
-"""Entries of the inverse of a sparse matrix where the matrix itself has entries, from its Cholesky factor; compiled."""
+"""The inverse of a sparse matrix where the matrix itself has entries, from its Cholesky factor; compiled."""
 
 import numpy as np
 from numba import njit
@@ -14,9 +14,9 @@ _Index = NDArray[np.int64]
 def selected_inverse(
     fronts: Fronts, blocks: Blocks, factor: _Array, inverse: _Array, stack: _Array, work: _Array
 ) -> None:
-    """Fill the blocks of Z = A⁻¹ that A has, by fronts from the root down (Takahashi et al. 1973; Erisman & Tinney 1975).
+    """Fill the blocks of Z = A⁻¹ that A has, by fronts from the root down (Takahashi et al. 1973).
 
-    From A = Uᵀ U follows U Z = U⁻ᵀ, whose part above the diagonal is zero; row a of a front, with Z known below it:
+    From A = Uᵀ U follows U Z = U⁻ᵀ, which is zero above the diagonal; row a of a front, Z being known below it:
         Z_ac = −Σ_{m>a} U_am Z_mc / U_aa for c > a,      Z_aa = (1 / U_aa − Σ_{m>a} U_am Z_ma) / U_aa
     What a front needs of Z beyond its pivots its parent has; it waits on the stack, as the update matrices did.
 
