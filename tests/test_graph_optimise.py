@@ -1,13 +1,18 @@
+from typing import get_args
+
 import numpy as np
 import pytest
-from naive_graph import normal_equations
+from naive_graph import dense, normal_equations
 from scenes import shared_data
 
 from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.errors import InputError
+from pipeline.graph.curvature import full_curvature
+from pipeline.graph.estimate import Estimate
 from pipeline.graph.g2o import read_g2o
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.graph.steps import Optimiser
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
@@ -57,6 +62,59 @@ def test_small_grid_reaches_one_minimum_by_both_optimisers():
     answers = [read("smallGrid3D").optimise(GraphConfig(optimiser=optimiser)) for optimiser in optimisers]
     assert all(answer.converged for answer in answers)
     assert answers[0].chi2_after == pytest.approx(answers[1].chi2_after, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["intel", "manhattan", "smallGrid3D", "sphere2500"])
+@pytest.mark.parametrize("optimiser", ["dogleg", "newton"])
+def test_dogleg_and_newton_reach_the_same_minimum(name, optimiser):
+    answer = read(name).optimise(GraphConfig(optimiser=optimiser, robust="none"))
+    reference = read(name).optimise(PLAIN)
+    assert answer.converged and answer.chi2_after == pytest.approx(reference.chi2_after, rel=2e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_every_optimiser_ends_in_the_same_minimum_of_a_ring(dimension):
+    """Gradient descent too, only that it takes its time."""
+    chi2 = {}
+    for optimiser in get_args(Optimiser):
+        graph, _ = ring(dimension, noise=0.05)
+        config = GraphConfig(optimiser=optimiser, max_iterations=20_000, tolerance=1e-10, robust="none")
+        answer = graph.optimise(config)
+        assert answer.converged, (optimiser, answer.reason)
+        chi2[optimiser] = answer.chi2_after
+    assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
+def test_no_step_of_a_guarded_optimiser_raises_chi2(optimiser):
+    graph = read("smallGrid3D")
+    before = np.inf
+    for _ in range(6):
+        answer = graph.optimise(
+            GraphConfig(optimiser=optimiser, max_iterations=1, robust="none"), initialise="given"
+        )
+        assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
+        before = answer.chi2_after
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
+    graph, _ = ring(dimension, count=4, noise=0.2)
+    problem, poses = graph._prepared(), graph.poses
+    weights = np.array([1.0, 0.5, 1.0, 0.7])
+    errors = problem.errors(poses)
+    now = Estimate(poses, errors, problem.chi2(errors), 0.0)
+    values = full_curvature(problem, now, problem.linearise(poses, errors, weights))
+    n, step = problem.pattern.scalars, 1e-3
+
+    def cost(a, b):
+        return 0.5 * weights @ problem.chi2(problem.errors(problem.moved(poses, step * (a + b))))
+
+    axes = np.eye(n)
+    expected = [
+        [(cost(a, b) - cost(a, -b) - cost(-a, b) + cost(-a, -b)) / (4.0 * step**2) for a in axes] for b in axes
+    ]
+    assert np.allclose(dense(problem.pattern, values), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():

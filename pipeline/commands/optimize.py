@@ -76,7 +76,8 @@ def optimize(
       scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
     """
     from pipeline.graph.covariance_table import chosen_poses, write_covariances
-    from pipeline.graph.g2o import read_g2o, write_graph
+    from pipeline.graph.g2o import read_g2o
+    from pipeline.graph.g2o_write import write_graph
     from pipeline.graph.optimisation import GraphChange
 
     settings = [*_shortcuts(shortcuts), *overrides(ctx)]

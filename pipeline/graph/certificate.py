@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
+from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from pipeline.graph.minorant import Minorants, minorise
 from pipeline.kernels.graph_dual import scatter_dual
 
@@ -68,7 +68,8 @@ def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]
     centred = poses.copy()
     centred[:, :-1, -1] -= centred[:, :-1, -1].mean(axis=0)
     minorants = minorise(problem, centred, weights)
-    loose = np.flatnonzero(kept & ~(minorants.kappa > 0.0))
+    turning = ~problem.is_point[problem.edges].any(axis=1)
+    loose = np.flatnonzero(kept & turning & ~(minorants.kappa > 0.0))
     if len(loose):
         i, j = problem.edges[loose[0]]
         reason = f"{len(loose)} edges are too far from their measurements to be bounded, first {i}-{j}"
@@ -85,17 +86,23 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
     n, d = len(problem.free), minorants.leap.shape[1]
     blocks = np.zeros((len(problem.pattern.rows), d + 1, d + 1))
     residual = np.zeros((n, d + 1, d))
-    edges = (minorants.leap, minorants.force, minorants.torque, minorants.tau, minorants.kappa, problem.slots)
-    scatter_dual(*(array[kept] for array in edges), blocks, residual)
-    pattern = BlockPattern(np.full(n, d + 1, np.int64), problem.pattern.pairs)
+    scatter_dual(
+        minorants.leap[kept], minorants.force[kept], minorants.torque[kept], minorants.tau[kept],
+        minorants.kappa[kept], problem.slots[kept], blocks, residual,
+    )  # fmt: skip
+    sizes = np.where(problem.is_point[problem.free], 1, d + 1)
+    pattern = BlockPattern(sizes, problem.pattern.pairs)
+    packing = Packing(pattern, d + 1, at_end=True)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     rotation = np.diag([1.0] * d + [0.0])
     for share in _SHARES:
         shift = share * chi2 / (d * max(n, 1))
+        shifted = blocks.copy()
+        shifted[:n] += shift * rotation
         try:
-            factor.factorise((blocks + shift * rotation * (np.arange(len(blocks)) < n)[:, None, None]).reshape(-1))
+            factor.factorise(packing.values(shifted))
         except SingularMatrixError:
             continue
-        right = (residual + shift * rotation[:, :d]).reshape(-1, d)
+        right = packing.rows(residual + shift * rotation[:, :d])
         return float((right * factor.solve(right)).sum())
     return None

@@ -61,9 +61,13 @@ def minorise(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     torque = slope[:, d:] - _moment(poses[j, :d, d], force)
     turned = errors[:, d:] if d == 2 else (poses[j, :3, :3] @ errors[:, 3:, None])[..., 0]
     tau, kappa = _isotropic(information, d)
+    seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
+    tau[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], _NOTHING
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
     costs = _Costs(tau, kappa, _length(errors[:, :d]), _length(errors[:, d:]), _length(pull[:, :d]))
+    isotropic = tau
     tau, kappa = costs.paid(0.5 * _length(force), excess)
+    tau[seen], kappa[seen] = isotropic[seen], 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
 
@@ -111,7 +115,9 @@ def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArra
     scale = np.maximum(np.repeat(np.stack([tau, kappa], axis=1), (d, k - d), axis=1), _NOTHING) ** -0.5
     least = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0]
     least = np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING)
-    return (least * np.maximum(tau, _NOTHING)).astype(np.float64), (least * np.maximum(kappa, _NOTHING)).astype(np.float64)
+    return (least * np.maximum(tau, _NOTHING)).astype(np.float64), (least * np.maximum(kappa, _NOTHING)).astype(
+        np.float64
+    )
 
 
 def _length(vectors: Matrix) -> NDArray[np.float64]:

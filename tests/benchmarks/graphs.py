@@ -17,7 +17,8 @@ import numpy as np
 from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.graph.between import BetweenProblem
-from pipeline.graph.g2o import read_g2o, write_g2o
+from pipeline.graph.g2o import read_g2o
+from pipeline.graph.g2o_write import write_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
