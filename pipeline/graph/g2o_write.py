@@ -44,7 +44,7 @@ def write_g2o(
     for name, pose, is_point in zip(names, _numbers(graph.poses).tolist(), graph.is_point.tolist(), strict=True):
         lines.append(f"{POINT} {name} {_text(pose[:2])}" if is_point else f"{VERTICES[d]} {name} {_text(pose)}")
     lines += [f"FIX {names[index]}" for index in graph.held]
-    sees: list[bool] = graph.is_point[graph.edges].any(axis=1).tolist()
+    sees = graph.is_point[graph.edges[:, 1]].tolist()
     rows = zip(graph.edges.tolist(), _numbers(graph.measurements).tolist(), _triangles(graph), sees, strict=True)
     for (i, j), measured, upper, is_sighting in rows:
         if is_sighting:

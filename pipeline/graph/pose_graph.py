@@ -14,6 +14,7 @@ from pipeline.errors import InputError
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.certificate import Certificate, certify
 from pipeline.graph.cholesky import SingularMatrixError
+from pipeline.graph.covariance import own_covariances, relative_covariance
 from pipeline.graph.estimate import Minimum
 from pipeline.graph.graduation import minimise
 from pipeline.graph.growing_array import GrowingArray
@@ -191,30 +192,13 @@ class PoseGraph:
     def relative_covariance(self, i: int, j: int) -> Matrix:
         """Covariance (k, k) of a left twist on T_i⁻¹ T_j, given all edges at the poses and weights of now.
 
-        With left twists ξ_i, ξ_j of the world poses it is Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ. The factor of H
-        is kept until the graph changes, so that each further pair costs k solves.
+        The factor of H is kept until the graph changes, so that each further pair costs k solves.
         """
-        problem = self._factored()
-        selection = np.zeros((len(problem.free), self.freedom, self.freedom))
-        for pose, sign in ((i, -1.0), (j, 1.0)):
-            if problem.variable[pose] >= 0:
-                selection[problem.variable[pose]] += sign * np.eye(self.freedom)
-        flat = problem.packing.rows(selection)
-        adjoint = lie.adjoint(lie.inverse(self.poses[i]))
-        return adjoint @ (flat.T @ problem.cholesky.solve(flat)) @ adjoint.T
+        return relative_covariance(self._factored(), self.poses, i, j)
 
     def covariances(self) -> Matrix:
-        """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ), the held ones zero.
-
-        Given all edges at the poses and weights of now, by the selected inverse of H. Twists are (translation,
-        rotation), so the units are m², m rad, rad².
-        """
-        problem, k = self._factored(), self.freedom
-        result = np.zeros((len(self), k, k))
-        of_left_twists = problem.packing.blocks(problem.cholesky.inverse_blocks())[: len(problem.free)]
-        adjoint = lie.adjoint(lie.inverse(self.poses[problem.free]))
-        result[problem.free] = adjoint @ of_left_twists @ np.swapaxes(adjoint, 1, 2)
-        return result
+        """Covariance (K, k, k) of every pose's twist in its own frame, given all edges at the poses of now."""
+        return own_covariances(self._factored(), self.poses)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         if not np.isfinite(T_world).all():

@@ -55,8 +55,8 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
 def contradictions(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """How much of the whole graph's χ² each edge costs, or would cost were it kept, (E,), to first order.
 
-    It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges predict:
-    with P the covariance of the prediction, given all kept edges,
+    It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges
+    predict: with P the covariance of the prediction, given all kept edges,
         eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
     The residual alone says less: a kept edge bends the graph towards itself.
     """
