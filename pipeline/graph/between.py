@@ -67,6 +67,11 @@ class BetweenProblem:
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
         self.cholesky = SparseCholesky(self.pattern, analyse(self.pattern))
 
+    def restricted(self, kept: NDArray[np.bool_]) -> BetweenProblem:
+        """The problem of the same poses with some of its edges, kept (E,)."""
+        measurements, information = self.measurements[kept], self.information[kept]
+        return BetweenProblem(self.edges[kept], measurements, information, self.variable < 0, self.is_point)
+
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
         return self._errors(poses, self.edges)

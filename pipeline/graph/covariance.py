@@ -24,14 +24,16 @@ def own_covariances(problem: BetweenProblem, poses: Matrix) -> Matrix:
 
 
 def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) -> Matrix:
-    """Covariance (k, k) of a left twist on T_i⁻¹ T_j, by k solves with the factor of H.
+    """Covariance (k, k) of a left twist on T_i⁻¹ T_j, Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ."""
+    adjoint = lie.adjoint(lie.inverse(poses[i]))
+    return adjoint @ difference_covariance(problem, i, j) @ adjoint.T
 
-    With left twists ξ_i, ξ_j of the world poses it is Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ.
-    """
+
+def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
+    """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by k solves with the factor of H."""
     selection = np.zeros((len(problem.free), problem.freedom, problem.freedom))
     for pose, sign in ((i, -1.0), (j, 1.0)):
         if problem.variable[pose] >= 0:
             selection[problem.variable[pose]] += sign * np.eye(problem.freedom)
     flat = problem.packing.rows(selection)
-    adjoint = lie.adjoint(lie.inverse(poses[i]))
-    return adjoint @ (flat.T @ problem.cholesky.solve(flat)) @ adjoint.T
+    return flat.T @ problem.cholesky.solve(flat)

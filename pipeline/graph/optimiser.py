@@ -21,7 +21,8 @@ class Minimiser:
     def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimiser: Optimiser) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
         self.problem = problem
-        self.loops = np.flatnonzero(is_loop)
+        self.optimiser = optimiser
+        self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
         self._rule = step_rule(optimiser, problem)
 
     def evaluate(self, poses: Matrix, loss: Loss) -> Estimate:
@@ -33,6 +34,10 @@ class Minimiser:
     def reweighed(self, now: Estimate, loss: Loss) -> Estimate:
         """The same poses at the cost of another loss."""
         return Estimate(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
+
+    def restricted(self, kept: NDArray[np.bool_]) -> Minimiser:
+        """The same with some of the edges, kept (E,)."""
+        return Minimiser(self.problem.restricted(kept), self.is_loop[kept], self.optimiser)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the trusted ones."""

@@ -14,7 +14,7 @@ GRADUATED: tuple[Kernel, ...] = ("geman-mcclure", "tukey", "truncated")
 
 _TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is as good as its limit
-_FLAT, _LONG_FACTOR = 1e-2, 2.0  # control below which truncated least squares is all but convex; its step there
+_FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is all but convex; its step there
 _FACTOR = 1.4  # step of the graduation (Yang et al. 2020, remark 5)
 
 

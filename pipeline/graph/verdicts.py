@@ -11,6 +11,7 @@ from scipy.special import gammaincinv
 
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
+from pipeline.graph.covariance import difference_covariance
 
 _MARGIN = 6.0  # over what a pessimistic noise model would allow: residuals have longer tails than the normal law
 _FEWEST = 10  # kept edges that say something about the noise model
@@ -52,22 +53,38 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
     return nominal * min(1.0, _MARGIN * float(np.median(against)) / expected)
 
 
-def contradictions(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_], price: float) -> Matrix:
     """How much of the whole graph's χ² each edge costs, or would cost were it kept, (E,), to first order.
 
-    It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges
+    It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
     predict: with P the covariance of the prediction, given all kept edges,
         eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
-    The residual alone says less: a kept edge bends the graph towards itself.
+    The residual alone says less: a kept edge bends the graph towards itself. Where a lower bound of the second,
+    by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
     """
-    errors = problem.errors(poses)
-    problem.cholesky.factorise(problem.linearise(poses, errors, weights).values)
-    k = problem.freedom
-    blocks = np.concatenate([problem.packing.blocks(problem.cholesky.inverse_blocks()), np.zeros((1, k, k))])
-    i, j, pair = problem.slots.T  # -1, a fixed pose, finds the zeros at the end
-    joint = blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
-    jacobian = problem.jacobians(poses, errors)
-    P = jacobian @ joint @ np.swapaxes(jacobian, 1, 2)
-    sign = np.where(weights > 0.5, -1.0, 1.0)[:, None, None]
-    solved = np.linalg.solve((1.0 + _ROUNDING) * np.eye(k) + sign * (P @ problem.information), errors[..., None])
-    return (errors[:, None] @ problem.information @ solved)[:, 0, 0]
+    errors, k = problem.errors(poses), problem.freedom
+    jacobians = problem.jacobians(poses, errors)
+    sparse = problem.restricted(kept)
+    sparse.cholesky.factorise(sparse.linearise(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    blocks = sparse.packing.blocks(sparse.cholesky.inverse_blocks())
+    blocks = np.concatenate([blocks, np.zeros((1, k, k))])  # found by -1, a fixed pose
+    i, j = problem.variable[problem.edges].T
+    joint = 2.0 * (blocks[i] + blocks[j])
+    i, j, pair = sparse.slots.T
+    joint[kept] = blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
+    result = _distances(errors, jacobians, problem.information, joint, kept)
+    for edge in np.flatnonzero(~kept & (result < price)):
+        one = np.array([edge])
+        joint = difference_covariance(sparse, *problem.edges[edge])[None]
+        result[edge] = _distances(errors[one], jacobians[one], problem.information[one], joint, kept[one])[0]
+    return result
+
+
+def _distances(
+    errors: Matrix, jacobians: Matrix, information: Matrix, joint: Matrix, kept: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The squared distances (E,), from the covariances (E, k, k) of ξ_j − ξ_i."""
+    P = jacobians @ joint @ np.swapaxes(jacobians, 1, 2)
+    sign = np.where(kept, -1.0, 1.0)[:, None, None]
+    matrix = (1.0 + _ROUNDING) * np.eye(errors.shape[1]) + sign * (P @ information)
+    return (errors[:, None] @ information @ np.linalg.solve(matrix, errors[..., None]))[:, 0, 0]
