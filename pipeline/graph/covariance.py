@@ -12,8 +12,8 @@ from pipeline.graph.between import BetweenProblem
 def own_covariances(problem: BetweenProblem, poses: Matrix) -> Matrix:
     """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ); the fixed ones zero, a point's 2 × 2.
 
-    By the selected inverse of H, which the problem's solver has factored. Twists are (translation, rotation), so the
-    units are m², m rad, rad².
+    By the selected inverse of H, which the problem's solver has factored. Twists are (translation, rotation), so
+    the units are m², m rad, rad².
     """
     k = problem.freedom
     result = np.zeros((len(poses), k, k))

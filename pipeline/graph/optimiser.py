@@ -21,7 +21,7 @@ class Minimiser:
     def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimiser: Optimiser) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
         self.problem = problem
-        self.optimiser = optimiser
+        self.optimiser: Optimiser = optimiser
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
         self._rule = step_rule(optimiser, problem)
 

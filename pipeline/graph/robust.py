@@ -59,8 +59,8 @@ class RobustLoss:
         if self.kernel == "geman-mcclure":
             return chi2 * self.control * s2 / (self.control * s2 + chi2)
         if self.kernel == "tukey":
-            s2 *= self.control
-            return s2 / 3.0 * (1.0 - np.maximum(1.0 - chi2 / s2, 0.0) ** 3)
+            share = np.minimum(chi2 / (self.control * s2), 1.0)
+            return self.control * s2 * share * (1.0 - share + share**2 / 3.0)
         if self.kernel == "truncated":
             return self._truncated_loss(chi2)
         return chi2
