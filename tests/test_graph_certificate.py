@@ -1,5 +1,6 @@
 """The certificate: its bounds hold, true minima get it, false ones do not."""
 
+import naive_graph
 import numpy as np
 import pytest
 from scenes import shared_data
@@ -7,9 +8,11 @@ from scenes import shared_data
 from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.graph.between import BetweenProblem
+from pipeline.graph.cholesky import BlockPattern
 from pipeline.graph.g2o import read_g2o
-from pipeline.graph.minorant import minorise
+from pipeline.graph.minorant import Minorants, minorise
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.kernels.graph_dual import scatter_dual
 
 PLAIN = GraphConfig(robust="none")
 
@@ -59,6 +62,42 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
         values = minorant_values(bound, at_estimate, G_i, G_j, T_j[:, :-1, -1] - T_i[:, :-1, -1])
         assert np.all(values <= chi2 + 1e-9 * (chi2 + at_estimate))
     assert bounded >= 20 or noise == 0.25
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
+    """For any rotations and positions: S with the multipliers taken off differs from the bounds by a constant."""
+    rng = np.random.default_rng(5)
+    k, count = (3, 6)[dimension - 2], 5
+    poses = lie.exp(rng.normal(size=(count, k)))
+    edges = np.array([[0, 1], [2, 1], [2, 3], [4, 3], [4, 0], [1, 3]])
+    measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.05 * rng.normal(size=(6, k)))
+    A = rng.normal(size=(6, k, k))
+    problem = BetweenProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
+    bound = minorise(problem, poses, np.ones(6))
+    blocks = np.zeros((len(problem.pattern.rows), dimension + 1, dimension + 1))
+    residual = np.zeros((count, dimension + 1, dimension))
+    scatter_dual(bound.leap, bound.force, bound.torque, bound.tau, bound.kappa, problem.slots, blocks, residual)
+    pattern = BlockPattern(np.full(count, dimension + 1), problem.pattern.pairs)
+    S = naive_graph.dense(pattern, blocks.reshape(-1))
+
+    def stacked(G, t):
+        return np.concatenate([np.concatenate([G_i.T, t_i[None]]) for G_i, t_i in zip(G, t, strict=True)])
+
+    start = stacked(np.tile(np.eye(dimension), (count, 1, 1)), poses[:, :-1, -1])
+    assert np.allclose(S @ start, residual.reshape(-1, dimension))
+    for _ in range(5):
+        moved = lie.exp(rng.normal(size=(count, k)))
+        G, t = moved[:, :-1, :-1], poses[:, :-1, -1] + rng.normal(size=(count, dimension))
+        expected = sum(
+            minorant_values(
+                Minorants(*(getattr(bound, name)[e : e + 1] for name in Minorants.__slots__)),
+                0.0, G[i][None], G[j][None], (t[j] - t[i])[None],
+            )[0]
+            for e, (i, j) in enumerate(edges)
+        )  # fmt: skip
+        X = stacked(G, t)
+        assert np.trace(X.T @ S @ X) - np.trace(start.T @ S @ start) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_two_numbers_that_the_bound_rests_on():

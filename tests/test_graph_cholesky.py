@@ -40,6 +40,7 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
     b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
     assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
+    assert np.allclose(pattern.multiply(values, b[:, 0]), A @ b[:, 0], rtol=1e-12, atol=1e-9)
 
 
 @settings(max_examples=150, deadline=None)

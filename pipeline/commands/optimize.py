@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.graph.certificate import Certificate
     from pipeline.graph.g2o import G2oFile
     from pipeline.graph.initialise import Initialisation
-    from pipeline.graph.optimisation import Optimisation
+    from pipeline.graph.optimisation import GraphChange, Optimisation
     from pipeline.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
@@ -75,47 +75,73 @@ def optimize(
       scanchain optimize run/graph.g2o --robust truncated --out run/robust.g2o --marginals all
       scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
     """
-    from pipeline.graph.covariance_table import chosen_poses, write_covariances
-    from pipeline.graph.g2o import read_g2o
-    from pipeline.graph.g2o_write import write_graph
-    from pipeline.graph.optimisation import GraphChange
-
+    outputs = Outputs(out, marginals, png, recording)
+    outputs.check(force)
     settings = [*_shortcuts(shortcuts), *overrides(ctx)]
     config = _config(settings)
-    if marginals is not None and out is None:
-        raise InputError("--marginals writes a table beside the graph; give --out FILE")
-    table = out.with_suffix(".marginals.csv") if out is not None and marginals is not None else None
-    written = [path for path in (out, table, png, recording) if path is not None]
-    _check_targets(written, png, recording, force)
-    is_suspicious = any(setting.key == "graph.robust" for setting in settings) and config.robust != "none"
-    file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
-    chosen = None if marginals is None else chosen_poses(marginals, file.ids)
-    before = file.graph.state()
-    answer = Answer(
-        source.name,
-        file,
-        file.graph.optimise(config, initialise=cast("Initialisation", initialise)),
-        file.graph.certify(),
-    )
-    if out is not None:
-        write_graph(out, file.graph, ids=file.ids, other_lines=file.other_lines)
-    if table is not None and chosen is not None:
-        write_covariances(table, file.ids[chosen], file.graph.covariances()[chosen])
-    viewing: Viewing = ctx.obj
-    change = GraphChange(source.name, before, answer.optimisation.state, answer.optimisation.rejected)
-    if png is not None:
-        viewing.draw_graph(change, png)
-    if recording is not None:
-        viewing.record_graph(change, recording)
-    click.echo(answer.json(written) if as_json else answer.text(written))
+    is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
+    answer = _solved(source, config, cast("Initialisation", initialise), is_suspicious)
+    outputs.write(answer, ctx.obj)
+    click.echo(answer.json(outputs.paths) if as_json else answer.text(outputs.paths))
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The files to write, and the poses whose covariances are wanted."""
+
+    graph: Path | None
+    marginals: str | None
+    picture: Path | None
+    recording: Path | None
+
+    @property
+    def table(self) -> Path | None:
+        """Where the covariances go."""
+        return self.graph.with_suffix(".marginals.csv") if self.graph and self.marginals else None
+
+    @property
+    def paths(self) -> list[Path]:
+        """Every file that is wanted."""
+        return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
+
+    def check(self, force: bool) -> None:
+        """Refuse before the work what could not be written after it."""
+        if self.marginals is not None and self.graph is None:
+            raise InputError("--marginals writes a table beside the graph; give --out FILE")
+        for path, ending in ((self.picture, ".png"), (self.recording, ".rrd")):
+            if path is not None and path.suffix != ending:
+                raise InputError(f"{path}: name a file that ends in {ending}")
+        for path in self.paths:
+            if not path.parent.is_dir():
+                raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+            if path.is_dir():
+                raise InputError(f"{path}: is a folder; name a file")
+            if path.exists() and not force:
+                raise InputError(f"{path}: exists; choose another name, or --force to replace it")
+
+    def write(self, answer: Answer, viewing: Viewing) -> None:
+        """Write them all."""
+        from pipeline.graph.covariance_table import chosen_poses, write_covariances
+        from pipeline.graph.g2o_write import write_graph
+
+        file = answer.file
+        chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
+        if self.graph is not None:
+            write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+        if self.table is not None:
+            write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
+        if self.picture is not None:
+            viewing.draw_graph(answer.change, self.picture)
+        if self.recording is not None:
+            viewing.record_graph(answer.change, self.recording)
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
     """What there is to print."""
 
-    name: str
     file: G2oFile
+    change: GraphChange
     optimisation: Optimisation
     certificate: Certificate
 
@@ -125,8 +151,9 @@ class Answer:
         guess = done.initialisation
         if guess == "given":
             guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
+        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
         lines = [
-            f"graph          {self.name}: {graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges",
+            f"graph          {self.change.name}: {size}",
             *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
             f"first guess    {guess}",
             f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
@@ -141,7 +168,7 @@ class Answer:
         """The same, and every rejected edge, by vertex ids."""
         graph, done = self.file.graph, self.optimisation
         tree = {
-            "graph": self.name,
+            "graph": self.change.name,
             "dimension": graph.dimension,
             "poses": len(graph),
             "edges": len(graph.edges),
@@ -175,15 +202,13 @@ def _config(settings: list[Override]) -> GraphConfig:
     return load_settings(overrides=settings).config.graph
 
 
-def _check_targets(paths: list[Path], png: Path | None, recording: Path | None, force: bool) -> None:
-    """Refuse before the work what could not be written after it."""
-    for path, ending in ((png, ".png"), (recording, ".rrd")):
-        if path is not None and path.suffix != ending:
-            raise InputError(f"{path}: name a file that ends in {ending}")
-    for path in paths:
-        if not path.parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}; make it first")
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder; name a file")
-        if path.exists() and not force:
-            raise InputError(f"{path}: exists; choose another name, or --force to replace it")
+def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_suspicious: bool) -> Answer:
+    """Read, optimise, certify."""
+    from pipeline.graph.g2o import read_g2o
+    from pipeline.graph.optimisation import GraphChange
+
+    file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
+    before = file.graph.state()
+    done = file.graph.optimise(config, initialise=initialise)
+    change = GraphChange(source.name, before, done.state, done.rejected)
+    return Answer(file, change, done, file.graph.certify())
