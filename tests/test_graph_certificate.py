@@ -190,6 +190,14 @@ def test_a_ring_wound_up_once_is_a_minimum_but_not_certified(dimension, noise):
     assert unwound.certify().certified
 
 
+def test_a_graph_without_contradictions_is_optimal_whatever_the_rounding():
+    graph = closed_ring(2, 5, 0)
+    graph.optimise(PLAIN)
+    certificate = graph.certify()
+    assert certificate.certified and certificate.relative_gap == 0.0
+    assert certificate.verdict == "globally optimal: χ² is zero"
+
+
 def test_an_unfinished_answer_has_a_wider_gap():
     graph = read_g2o(shared_data("graphs/sphere2500.g2o")).graph
     best = graph.optimise(GraphConfig(robust="none")).chi2_after

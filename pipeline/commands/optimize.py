@@ -161,7 +161,8 @@ class Answer:
         ]
         if graph.is_loop.any():
             lines.append(f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges")
-        lines.append(f"certificate    {self.certificate.verdict}; {1e3 * self.certificate.time_s:.0f} ms")
+        held = ", the robust weights held" if graph.is_loop.any() else ""
+        lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
 
     def json(self, written: list[Path]) -> str:

@@ -14,6 +14,7 @@ from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, 
 from pipeline.graph.minorant import Minorants, minorise
 from pipeline.kernels.graph_dual import scatter_dual
 
+_NOTHING = 1e-9  # χ² that is zero but for rounding
 _SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
 
 
@@ -38,12 +39,14 @@ class Certificate:
 
     @property
     def relative_gap(self) -> float:
-        """The gap as a share of χ², 0 to 1."""
-        return self.gap / self.chi2 if self.chi2 > 0.0 else 0.0
+        """The gap as a share of χ², 0 to 1; 0 where χ² is zero."""
+        return self.gap / self.chi2 if self.chi2 > _NOTHING else 0.0
 
     @property
     def verdict(self) -> str:
         """One line for people."""
+        if self.chi2 < _NOTHING:
+            return "globally optimal: χ² is zero"
         if self.certified:
             return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
         return f"not certified: {self.reason}"
