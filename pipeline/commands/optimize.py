@@ -39,7 +39,7 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 @click.option(
     "--robust",
     metavar="KERNEL",
-    help="Suspect edges that skip poses: truncated, geman-mcclure, cauchy, huber. [default: trust all]",
+    help="Suspect edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: trust all]",
 )
 @click.option(
     "--marginals",
@@ -160,7 +160,10 @@ class Answer:
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
         ]
         if graph.is_loop.any():
-            lines.append(f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges")
+            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
+            lines.append(
+                f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
+            )
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
