@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +15,7 @@ from pipeline.commands.convert import convert
 from pipeline.commands.doctor import doctor
 from pipeline.commands.evaluate import evaluate
 from pipeline.commands.info import info
+from pipeline.commands.optimize import optimize
 from pipeline.commands.run import run
 from pipeline.commands.sequence import sequence
 from pipeline.commands.simulate import simulate
@@ -21,6 +23,9 @@ from pipeline.commands.view import view
 from pipeline.config import RecordingConfig
 from pipeline.errors import InputError, ScanchainError
 from pipeline.runs.recorder import Recorder, SinkName, Viewing
+
+if TYPE_CHECKING:
+    from pipeline.graph.optimisation import GraphChange
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -38,13 +43,13 @@ def scanchain() -> None:
     """
 
 
-for _command in (run, view, info, doctor, convert, simulate, evaluate, config, sequence):
+for _command in (run, view, info, doctor, convert, simulate, evaluate, optimize, config, sequence):
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show, _draw)
+    viewing = Viewing(_record, _show, _draw, _draw_graph, _record_graph)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -94,6 +99,18 @@ def _draw(directory: Path, picture: Path) -> None:
     from viz.run_picture import draw_run
 
     draw_run(directory, picture)
+
+
+def _draw_graph(change: GraphChange, picture: Path) -> None:
+    from viz.graph_picture import draw_graph
+
+    draw_graph(change, picture)
+
+
+def _record_graph(change: GraphChange, path: Path) -> None:
+    from viz.graph_recording import record_graph
+
+    record_graph(change, path)
 
 
 if __name__ == "__main__":

@@ -131,10 +131,12 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
 class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """How the pose graph is optimised."""
 
-    optimiser: Literal["gauss-newton", "levenberg-marquardt"] = "levenberg-marquardt"
+    optimiser: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "newton", "gradient-descent"] = (
+        "levenberg-marquardt"
+    )
     max_iterations: Count = 50
     tolerance: Positive = 1e-6
-    robust: Literal["none", "huber", "cauchy", "geman-mcclure", "truncated"] = "truncated"
+    robust: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "truncated"] = "truncated"
     robust_scale: Positive = 3.0
 
 

@@ -663,6 +663,90 @@ def test_simulate_takes_sensor_noise_and_dropout(call, tmp_path):
     assert (tmp_path / "x.mcap").stat().st_size < 200_000
 
 
+# pose graphs
+
+
+@pytest.fixture
+def ring(tmp_path):
+    """A square of four poses and one false edge across it, as g2o."""
+    path = tmp_path / "ring.g2o"
+    lines = [f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 {math.pi / 2} 100 0 0 100 0 1000" for i in range(4)]
+    path.write_text("\n".join([*lines, "EDGE_SE2 0 2 1 1.01 3.14 100 0 0 100 0 1000", "PARAMS 7"]) + "\n")
+    return path
+
+
+def test_optimize_prints_what_it_did_and_writes_the_graph(call, tmp_path, ring):
+    code, output, errors = call("optimize", ring, "--out", tmp_path / "done.g2o")
+    assert (code, errors) == (0, "")
+    says(output, "2D, 4 poses, 5 edges", "1 lines PARAMS", "odometry, as the file has no vertices")
+    says(output, "chi2", "iterations", "below the tolerance", "certificate    globally optimal to within")
+    written = (tmp_path / "done.g2o").read_text()
+    assert written.count("VERTEX_SE2") == 4 and written.count("EDGE_SE2") == 5 and written.endswith("PARAMS 7\n")
+    again = json.loads(call("optimize", tmp_path / "done.g2o", "--json")[1])
+    assert again["chi2_before"] == pytest.approx(again["chi2_after"], rel=1e-9)
+    assert again["certificate"]["certified"] and again["certificate"]["relative_gap"] < 1e-6
+    assert again["initialisation"] == "given" and again["kept_lines"] == {"PARAMS": 1}
+
+
+def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path, ring):
+    ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
+    trusting = json.loads(call("optimize", ring, "--json")[1])
+    assert trusting["suspected"] == 0 and trusting["rejected"] == [] and trusting["chi2_after"] > 1000.0
+    code, output, _ = call("optimize", ring, "--robust", "truncated")
+    assert code == 0
+    says(output, "rejected       1 of 3 suspected edges")
+    tree = json.loads(call("optimize", ring, "--graph.robust", "truncated", "--json")[1])
+    assert tree["rejected"] == [[1, 3]] and tree["certificate"]["chi2"] < 1.0
+
+
+def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, ring):
+    png, rrd = tmp_path / "ring.png", tmp_path / "ring.rrd"
+    words = ["--out", tmp_path / "done.graph", "--marginals", "0,2", "--png", png, "--recording", rrd]
+    code, output, errors = call("optimize", ring, *words)
+    assert (code, errors) == (0, "")
+    says(output, png, rrd, tmp_path / "done.marginals.csv")
+    rows = [line.split(",") for line in (tmp_path / "done.marginals.csv").read_text().splitlines()]
+    assert rows[0] == ["id", "x_x", "x_y", "x_yaw", "y_y", "y_yaw", "yaw_yaw"]
+    assert [row[0] for row in rows[1:]] == ["0", "2"]
+    assert float(rows[1][1]) == 0.0 and 0.0 < float(rows[2][1]) < 0.02
+    assert png.read_bytes().startswith(b"\x89PNG") and rrd.read_bytes().startswith(b"RRF")
+    assert (tmp_path / "done.graph").read_text().startswith("VERTEX2 0 ")
+
+
+@pytest.mark.parametrize(("optimiser", "initialise"), [("dogleg", "chordal"), ("newton", "spanning-tree")])
+def test_optimize_takes_an_optimiser_and_a_first_guess(call, ring, optimiser, initialise):
+    words = ["--optimiser", optimiser, "--initialise", initialise, "--graph.max_iterations", "99", "--json"]
+    tree = json.loads(call("optimize", ring, *words)[1])
+    assert tree["initialisation"] == initialise and tree["converged"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--marginals", "all"], "give --out FILE"),
+        (["--marginals", "9", "--out", "{}/a.g2o"], "--marginals 9: no such vertex; the ids go from 0 to 3"),
+        (["--marginals", "one", "--out", "{}/a.g2o"], "take all, or vertex ids"),
+        (["--png", "{}/a.jpg"], "name a file that ends in .png"),
+        (["--recording", "{}/a.png"], "name a file that ends in .rrd"),
+        (["--out", "{}/none/a.g2o"], "there is no folder"),
+        (["--out", "{}/ring.g2o"], "exists; choose another name, or --force"),
+        (["--out", "{}"], "is a folder"),
+        (["--optimiser", "magic"], "graph.optimiser is 'magic'; it must be one of"),
+        (["--loops.drift", "1"], "--loops.drift has no meaning for optimize"),
+    ],
+)
+def test_optimize_refuses_what_it_cannot_do_before_it_begins(refused, tmp_path, ring, words, said):
+    says(refused("optimize", ring, *(word.format(tmp_path) for word in words)), said)
+
+
+def test_optimize_refuses_bad_graphs_in_one_line(refused, tmp_path, ring):
+    says(refused("optimize", tmp_path / "none.g2o"), "none.g2o: cannot be read as g2o")
+    ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 2 3 1 0 0 1 0 0 1 0 1\n")
+    says(refused("optimize", ring), "2 of 4 poses are not joined to a fixed one")
+    ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 x\n")
+    says(refused("optimize", ring), "ring.g2o:1: EDGE_SE2: could not convert")
+
+
 # as a program
 
 

@@ -132,6 +132,8 @@ LOSSES = [
     robust_loss("cauchy", 2.0, 3),
     robust_loss("geman-mcclure", 3.0, 3),
     RobustLoss("geman-mcclure", 3.0, 7.0),
+    robust_loss("tukey", 7.0, 3),
+    RobustLoss("tukey", 3.0, 20.0),
     RobustLoss("truncated", 3.0, 0.5),
 ]
 

@@ -40,6 +40,18 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
     b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
     assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
+    assert np.allclose(pattern.multiply(values, b[:, 0]), A @ b[:, 0], rtol=1e-12, atol=1e-9)
+
+
+@settings(max_examples=150, deadline=None)
+@given(_graphs())
+def test_the_selected_inverse_equals_the_dense_one_for_any_pattern_and_block_sizes(graph):
+    pattern, values, A = _matrix(*graph)
+    cholesky = SparseCholesky(pattern, analyse(pattern))
+    cholesky.factorise(values)
+    inverse = naive_graph.dense(pattern, cholesky.inverse_blocks())
+    there = naive_graph.dense(pattern, np.ones(pattern.value_count)) != 0.0
+    assert np.allclose(inverse[there], np.linalg.inv(A)[there], rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [1, 3, 6])

@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
 from scenes import shared_data
+from scipy.spatial.transform import Rotation
 
 from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.errors import InputError
-from pipeline.graph.g2o import read_g2o, write_g2o
+from pipeline.graph.g2o import read_g2o
+from pipeline.graph.g2o_write import write_g2o, write_toro
+from pipeline.graph.pose_graph import PoseGraph
 
 SQUARE = """\
 # a comment
@@ -17,7 +20,8 @@ VERTEX_SE2 30 1 1.2 3.1
 EDGE_SE2 10 20 1 0 1.5707963267948966 4 0.5 0.25 5 0 6
 EDGE_SE2 20 30 1 0 1.5707963267948966 4 0 0 5 0 6
 EDGE_SE2 30 10 1.4142135623730951 0 0 4 0 0 5 0 6
-EDGE_SE2_XY 10 7 1 2 1 0 1
+EDGE_SE2_XY 10 7 1 2 1 0.5 3
+EDGE_BEARING_SE2_XY 10 7 1 2
 """
 
 
@@ -39,12 +43,16 @@ def test_the_numbers_of_a_line_go_where_they_belong(tmp_path):
     path.write_text(SQUARE)
     file = read_g2o(path)
     graph = file.graph
-    assert file.ids.tolist() == [10, 20, 30]
-    assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert file.ids.tolist() == [10, 20, 30, 7]
+    assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0], [0, 3]]
+    assert graph.is_point.tolist() == [False, False, False, True]
+    assert np.allclose(graph.poses[3], lie.pose_2d(3.0, 4.0, 0.0))
+    assert np.allclose(graph.measurements[3], lie.pose_2d(1.0, 2.0, 0.0))
+    assert graph.information[3].tolist() == [[1, 0.5, 0], [0.5, 3, 0], [0, 0, 0]]
     assert np.allclose(graph.poses[1], lie.pose_2d(1.1, 0.1, 1.5))
     assert np.allclose(graph.measurements[0], lie.pose_2d(1.0, 0.0, np.pi / 2))
     assert graph.information[0].tolist() == [[4, 0.5, 0.25], [0.5, 5, 0], [0.25, 0, 6]]
-    assert graph.held == [1] and graph.fixed.tolist() == [False, True, False]
+    assert graph.held == [1] and graph.fixed.tolist() == [False, True, False, False]
     assert not graph.is_loop.any()
 
 
@@ -52,11 +60,73 @@ def test_lines_not_understood_are_counted_and_kept(tmp_path):
     path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
     path.write_text(SQUARE)
     file = read_g2o(path)
-    assert dict(file.other_tags) == {"#": 1, "VERTEX_XY": 1, "EDGE_SE2_XY": 1}
+    assert dict(file.other_tags) == {"#": 1, "EDGE_BEARING_SE2_XY": 1}
     write_g2o(copy, file.graph, ids=file.ids, other_lines=file.other_lines)
     again = read_g2o(copy)
     assert again.other_lines == file.other_lines
-    assert again.ids.tolist() == [10, 20, 30] and again.graph.held == [1]
+    assert again.ids.tolist() == [10, 20, 30, 7] and again.graph.held == [1]
+
+
+def test_points_and_their_sightings_read_back_the_same(tmp_path):
+    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
+    path.write_text(SQUARE)
+    first = read_g2o(path)
+    write_g2o(copy, first.graph, ids=first.ids)
+    second = read_g2o(copy).graph
+    for name in ("edges", "is_point", "information"):
+        assert np.array_equal(getattr(first.graph, name), getattr(second, name))
+    for name in ("poses", "measurements"):
+        assert np.allclose(getattr(first.graph, name), getattr(second, name), rtol=0, atol=1e-12)
+
+
+def test_points_without_vertices_begin_where_they_are_seen(tmp_path):
+    path = tmp_path / "seen.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2_XY 1 9 2 0.5 1 0 1\n")
+    file = read_g2o(path)
+    assert file.ids.tolist() == [0, 1, 9] and not file.has_guess
+    assert np.allclose(file.graph.poses[2][:2, 2], [0.5, 2.0])
+
+
+@pytest.mark.parametrize("name", ["intel", "MIT", "sphere2500", "torus3D"])
+def test_what_is_written_as_toro_reads_back_the_same(name, tmp_path):
+    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
+    path = tmp_path / "again.graph"
+    write_toro(path, first.graph, ids=first.ids)
+    second = read_g2o(path).graph
+    assert np.array_equal(first.graph.edges, second.edges)
+    assert np.array_equal(first.graph.information, second.information)
+    assert np.allclose(first.graph.measurements, second.measurements, rtol=0, atol=1e-12)
+    assert np.allclose(first.graph.poses, second.poses, rtol=0, atol=1e-12)
+
+
+def test_toro_orders_the_information_of_the_plane_in_its_own_way(tmp_path):
+    path = tmp_path / "pair.graph"
+    path.write_text("VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0.1 11 12 22 33 13 23\n")
+    graph = read_g2o(path).graph
+    assert graph.information[0].tolist() == [[11, 12, 13], [12, 22, 23], [13, 23, 33]]
+
+
+@pytest.mark.parametrize("pitch", [0.0, 1.0, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
+def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_path):
+    graph = PoseGraph(3)
+    angles = [(0.3, pitch, -2.0), (-3.0, pitch, 0.5)]
+    for index, (roll, nod, yaw) in enumerate(angles):
+        T = lie.identity(3)
+        T[:3, :3] = Rotation.from_euler("ZYX", [yaw, nod, roll]).as_matrix()
+        graph.add_pose(T, index)
+    graph.add_edge(0, 1, graph.poses[1], np.eye(6))
+    path = tmp_path / "up.graph"
+    write_toro(path, graph)
+    assert np.allclose(read_g2o(path).graph.poses, graph.poses, rtol=0, atol=1e-12)
+    if abs(pitch) < 1.5:
+        assert np.allclose(np.array(path.read_text().split()[5:8], float), angles[0])
+
+
+def test_toro_cannot_hold_points(tmp_path):
+    path = tmp_path / "square.g2o"
+    path.write_text(SQUARE)
+    with pytest.raises(InputError, match="TORO knows no points, and the graph has 1"):
+        write_toro(tmp_path / "x.graph", read_g2o(path).graph)
 
 
 def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
@@ -115,6 +185,12 @@ EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
         (f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nVERTEX_SE2 0 1 0 0\n{EDGE}\n", r":3: vertex 0 stands .* twice"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1\n", r":1: information matrix of edge 0-1 is not positive semidefinite"),
         ("EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1\n", r":1: edge 1-1 joins a vertex to itself"),
+        (
+            f"{EDGE}\nVERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nEDGE_SE2_XY 0 8 1 1 1 0 1\n",
+            r":4: vertex 8 is not in",
+        ),
+        (f"{EDGE}\nEDGE_SE2_XY 0 1 1 1 1 0 1\n", r"vertex 1 is a pose and a point"),
+        (f"{EDGE}\nEDGE_SE2_XY 0 8 1 1 1 5 1\n", r":2: information matrix is not positive semidefinite"),
         (f"{EDGE}\nFIX 5\n", r":2: vertex 5 is not in the file"),
         (f"{EDGE}\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", r":2: VERTEX_SE3:QUAT in an SE\(2\) graph"),
         ("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 " + "0 " * 21 + "\n", r":1: quaternion of length 0"),

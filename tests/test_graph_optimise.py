@@ -1,13 +1,18 @@
+from typing import get_args
+
 import numpy as np
 import pytest
-from naive_graph import normal_equations
+from naive_graph import dense, normal_equations
 from scenes import shared_data
 
 from pipeline import lie
 from pipeline.config import GraphConfig
 from pipeline.errors import InputError
+from pipeline.graph.curvature import full_curvature
+from pipeline.graph.estimate import Estimate
 from pipeline.graph.g2o import read_g2o
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.graph.steps import Optimiser
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
@@ -57,6 +62,59 @@ def test_small_grid_reaches_one_minimum_by_both_optimisers():
     answers = [read("smallGrid3D").optimise(GraphConfig(optimiser=optimiser)) for optimiser in optimisers]
     assert all(answer.converged for answer in answers)
     assert answers[0].chi2_after == pytest.approx(answers[1].chi2_after, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["intel", "manhattan", "smallGrid3D", "sphere2500"])
+@pytest.mark.parametrize("optimiser", ["dogleg", "newton"])
+def test_dogleg_and_newton_reach_the_same_minimum(name, optimiser):
+    answer = read(name).optimise(GraphConfig(optimiser=optimiser, robust="none"))
+    reference = read(name).optimise(PLAIN)
+    assert answer.converged and answer.chi2_after == pytest.approx(reference.chi2_after, rel=2e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_every_optimiser_ends_in_the_same_minimum_of_a_ring(dimension):
+    """Gradient descent too, only that it takes its time."""
+    chi2 = {}
+    for optimiser in get_args(Optimiser):
+        graph, _ = ring(dimension, noise=0.05)
+        config = GraphConfig(optimiser=optimiser, max_iterations=20_000, tolerance=1e-10, robust="none")
+        answer = graph.optimise(config)
+        assert answer.converged, (optimiser, answer.reason)
+        chi2[optimiser] = answer.chi2_after
+    assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
+def test_no_step_of_a_guarded_optimiser_raises_chi2(optimiser):
+    graph = read("smallGrid3D")
+    before = np.inf
+    for _ in range(6):
+        answer = graph.optimise(
+            GraphConfig(optimiser=optimiser, max_iterations=1, robust="none"), initialise="given"
+        )
+        assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
+        before = answer.chi2_after
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
+    graph, _ = ring(dimension, count=4, noise=0.2)
+    problem, poses = graph._prepared(), graph.poses
+    weights = np.array([1.0, 0.5, 1.0, 0.7])
+    errors = problem.errors(poses)
+    now = Estimate(poses, errors, problem.chi2(errors), 0.0)
+    values = full_curvature(problem, now, problem.linearise(poses, errors, weights))
+    n, step = problem.pattern.scalars, 1e-3
+
+    def cost(a, b):
+        return 0.5 * weights @ problem.chi2(problem.errors(problem.moved(poses, step * (a + b))))
+
+    axes = np.eye(n)
+    expected = [
+        [(cost(a, b) - cost(a, -b) - cost(-a, b) + cost(-a, -b)) / (4.0 * step**2) for a in axes] for b in axes
+    ]
+    assert np.allclose(dense(problem.pattern, values), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
@@ -198,6 +256,52 @@ def test_relative_covariance_equals_the_dense_inverse(dimension):
     assert np.allclose(graph.relative_covariance(i, j), adjoint @ joint @ adjoint.T, rtol=1e-5, atol=1e-9)
     from_the_held_one = P[:k, :k]  # pose 0 is held at the identity, so the world is its frame
     assert np.allclose(graph.relative_covariance(0, 1), from_the_held_one, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_covariances_equal_the_dense_inverse(dimension):
+    graph, _ = ring(dimension, count=9, noise=0.02)
+    graph.optimise(PLAIN)
+    k = graph.freedom
+    H, _ = normal_equations(
+        graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
+    )
+    P = np.linalg.inv(H).reshape(8, k, 8, k)
+    found = graph.covariances()
+    assert not found[0].any()
+    for pose in range(1, 9):
+        adjoint = lie.adjoint(lie.inverse(graph.poses[pose]))
+        expected = adjoint @ P[pose - 1, :, pose - 1] @ adjoint.T
+        assert np.allclose(found[pose], expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
+def test_covariances_equal_those_of_gtsam(name):
+    gtsam = pytest.importorskip("gtsam")
+    graph = read(name)
+    graph.optimise(PLAIN)
+    flat = graph.dimension == 2
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for index, T in enumerate(graph.poses):
+        values.insert(index, gtsam.Pose2(*T[:2, 2], float(lie.yaw(T))) if flat else gtsam.Pose3(T))
+    order = np.arange(3) if flat else np.array([3, 4, 5, 0, 1, 2])  # GTSAM's rotation comes first in space
+    for (i, j), Z, omega in zip(graph.edges.tolist(), graph.measurements, graph.information, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])
+        if flat:
+            factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*Z[:2, 2], float(lie.yaw(Z))), noise))
+        else:
+            factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(Z), noise))
+    held = gtsam.noiseModel.Diagonal.Sigmas(np.full(graph.freedom, 1e-6))
+    prior = gtsam.PriorFactorPose2 if flat else gtsam.PriorFactorPose3
+    factors.add(prior(0, values.atPose2(0) if flat else values.atPose3(0), held))
+    marginals = gtsam.Marginals(factors, values)
+    found = graph.covariances()
+    for pose in (1, len(graph) // 2, len(graph) - 1):
+        theirs = marginals.marginalCovariance(pose)
+        spread = np.sqrt(np.diag(theirs))
+        ours = found[pose][np.ix_(order, order)]
+        # GTSAM linearises its residual in another chart where the residual is large, hence a few thousandths
+        assert np.abs((ours - theirs) / np.outer(spread, spread)).max() < (1e-3 if flat else 0.05)
 
 
 def test_odometry_alone_adds_up_the_covariances_of_its_steps():

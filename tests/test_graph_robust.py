@@ -4,7 +4,11 @@ from scenes import shared_data
 
 from pipeline import lie
 from pipeline.config import GraphConfig
+from pipeline.graph.between import BetweenProblem
 from pipeline.graph.g2o import read_g2o
+from pipeline.graph.pose_graph import PoseGraph
+from pipeline.graph.verdicts import contradictions
+from tests.benchmarks.wrong_edges import try_wrong_loops
 
 
 def with_false_loops(name, share, seed=0):
@@ -51,6 +55,66 @@ def test_false_loops_are_rejected_and_true_ones_kept(name, robust, true_lost, er
     assert not rejected[~graph.is_loop].any()
 
 
+@pytest.mark.parametrize(
+    ("name", "share"), [("intel", 0.1), ("intel", 0.3), ("intel", 0.5), ("manhattan", 0.1), ("manhattan", 0.5)]
+)
+def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share):
+    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, "nearby", seed=0)
+    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
+    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
+    assert outcome.certified
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_with_it(dimension):
+    rng = np.random.default_rng(3)
+    k, count = (3, 6)[dimension - 2], 10
+    true = lie.exp(0.5 * rng.normal(size=(count, k)))
+    pairs = np.array([*((i, i + 1) for i in range(count - 1)), (0, 4), (2, 7), (1, 9), (3, 8)])
+    noise = 0.01 * rng.normal(size=(len(pairs), k))
+    measured = lie.inverse(true[pairs[:, 0]]) @ true[pairs[:, 1]] @ lie.exp(noise)
+
+    def optimised(chosen):
+        graph = PoseGraph(dimension)
+        for index, T in enumerate(true):
+            graph.add_pose(T, index)
+        omega = np.tile(1e4 * np.eye(k), (len(pairs), 1, 1))
+        graph.add_edges(pairs[chosen], measured[chosen], omega[chosen], np.zeros(chosen.sum(), bool))
+        answer = graph.optimise(GraphConfig(robust="none", tolerance=1e-14))
+        return graph, answer.chi2_after
+
+    everything = np.ones(len(pairs), bool)
+    whole, with_all = optimised(everything)
+    problem = BetweenProblem(pairs, measured, whole.information, whole.fixed)
+    for edge in range(count - 1, len(pairs)):
+        others = everything.copy()
+        others[edge] = False
+        without, chi2 = optimised(others)
+        falls = contradictions(problem, whole.poses, everything, np.inf)[edge]
+        rises = contradictions(problem, without.poses, others, np.inf)[edge]
+        assert falls == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
+        assert rises == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
+        bound = contradictions(problem, without.poses, others, 0.0)[edge]
+        assert bound <= rises * (1.0 + 1e-9)
+
+
+def test_loops_are_judged_by_the_noise_they_have_where_they_claim_to_have_more():
+    """Information matrices a hundred times too small would let in a loop that is off by a metre."""
+    rng = np.random.default_rng(0)
+    graph, sigma = PoseGraph(2), np.array([0.02, 0.02, 0.002])
+    true = [lie.pose_2d(np.cos(a) * 5, np.sin(a) * 5, a) for a in np.linspace(0.0, 12.0 * np.pi, 180)]
+    for index, T in enumerate(true):
+        graph.add_pose(T, index)
+    pairs = [(i, i + 1) for i in range(179)] + [(i, i + 30) for i in range(0, 150, 3)]
+    for i, j in pairs:
+        Z = lie.inverse(true[i]) @ true[j] @ lie.exp(sigma * rng.normal(size=3))
+        graph.add_edge(i, j, Z, 0.01 * np.diag(sigma**-2), is_loop=j - i > 1)
+    Z = lie.inverse(true[10]) @ true[100] @ lie.exp(np.array([1.0, 0.0, 0.0]))
+    graph.add_edge(10, 100, Z, 0.01 * np.diag(sigma**-2), is_loop=True)
+    answer = graph.optimise(GraphConfig(robust="truncated"))
+    assert answer.state.edges[answer.rejected].tolist() == [[10, 100]]
+
+
 def test_without_robust_weights_the_same_false_loops_ruin_the_map():
     graph, true, _ = with_false_loops("intel", 0.03)
     graph.optimise(GraphConfig(robust="none"), initialise="given")
@@ -63,7 +127,7 @@ def test_truncated_weights_are_verdicts():
     assert np.all((weight == 0.0) | (weight == 1.0))
 
 
-@pytest.mark.parametrize("robust", ["huber", "cauchy", "geman-mcclure", "truncated"])
+@pytest.mark.parametrize("robust", ["huber", "cauchy", "geman-mcclure", "tukey", "truncated"])
 def test_a_robust_loss_hardly_moves_a_graph_whose_loops_are_true(robust):
     graph, true, _ = with_false_loops("intel", 0.0)
     answer = graph.optimise(GraphConfig(robust=robust))

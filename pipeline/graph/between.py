@@ -9,16 +9,20 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.data import Matrix
-from pipeline.graph.cholesky import BlockPattern, SparseCholesky, analyse
+from pipeline.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyse
 from pipeline.kernels import graph_between_se2, graph_between_se3, graph_scatter
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g."""
+    """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g.
+
+    ``weights`` (E,) are the robust weights w that went into them.
+    """
 
     values: NDArray[np.float64]
     gradient: NDArray[np.float64]
+    weights: NDArray[np.float64]
 
 
 class BetweenProblem:
@@ -28,12 +32,20 @@ class BetweenProblem:
     covariance of a right twist on Z. Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the
     fixed poses out of the system: ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,)
     the pose of each block, ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
+
+    In the plane, j may be a point: a pose without a heading, its rotation the identity. Then e is
+    (R_iᵀ(t_j − t_i) − t_z, 0), Ω has no rotational part, and of the point's block only the translation is kept.
     """
 
     def __init__(
-        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, fixed: NDArray[np.bool_]
+        self,
+        edges: NDArray[np.int64],
+        measurements: Matrix,
+        information: Matrix,
+        fixed: NDArray[np.bool_],
+        is_point: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Edges (E, 2) pairs (i, j), measurements (E, d+1, d+1) Z, information (E, k, k) Ω, fixed (K,)."""
+        """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,)."""
         self.edges, self.measurements, self.information = edges, measurements, information
         self.freedom = information.shape[-1]
         self.free = np.flatnonzero(~fixed)
@@ -48,16 +60,28 @@ class BetweenProblem:
         self.slots = np.full((len(edges), 3), -1, np.int64)
         self.slots[:, :2] = ends
         self.slots[joined, 2] = len(self.free) + which
-        sizes = np.full(len(self.free), self.freedom, np.int64)
+        self.is_point = np.zeros(len(fixed), np.bool_) if is_point is None else is_point
+        self.sightings = np.flatnonzero(self.is_point[edges].any(axis=1))
+        sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
+        self.packing = Packing(self.pattern, self.freedom, at_end=False)
         self.cholesky = SparseCholesky(self.pattern, analyse(self.pattern))
+
+    def restricted(self, kept: NDArray[np.bool_]) -> BetweenProblem:
+        """The problem of the same poses with some of its edges, kept (E,)."""
+        measurements, information = self.measurements[kept], self.information[kept]
+        return BetweenProblem(self.edges[kept], measurements, information, self.variable < 0, self.is_point)
 
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
-        errors = np.empty((len(self.edges), self.freedom))
-        kernel = graph_between_se2 if self.freedom == 3 else graph_between_se3
-        kernel.residuals(poses, self.edges, self.measurements, errors)
-        return errors
+        return self._errors(poses, self.edges)
+
+    def between(self, T_i: Matrix, T_j: Matrix) -> tuple[Matrix, Matrix]:
+        """Residuals (E, k) and ∂e/∂ξ_j (E, k, k) with ends (E, d+1, d+1) given edge by edge."""
+        poses = np.concatenate([T_i, T_j])
+        edges = np.arange(2 * len(T_i)).reshape(2, -1).T.copy()
+        errors = self._errors(poses, edges)
+        return errors, self._jacobians(poses, edges, errors)
 
     def chi2(self, errors: Matrix) -> NDArray[np.float64]:
         """Return eᵀΩe of every edge, (E,)."""
@@ -67,12 +91,7 @@ class BetweenProblem:
 
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
         """∂e/∂ξ_j (E, k, k); ∂e/∂ξ_i is its negative."""
-        jacobian = np.empty((len(self.edges), self.freedom, self.freedom))
-        if self.freedom == 3:
-            graph_between_se2.jacobians(poses, self.edges, self.measurements, jacobian)
-        else:
-            graph_between_se3.jacobians(poses, self.edges, errors, jacobian)
-        return jacobian
+        return self._jacobians(poses, self.edges, errors)
 
     def linearise(self, poses: Matrix, errors: Matrix, weights: NDArray[np.float64]) -> NormalEquations:
         """Normal equations at these poses, with these residuals and robust weights (E,)."""
@@ -80,13 +99,38 @@ class BetweenProblem:
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
         graph_scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
-        return NormalEquations(blocks.reshape(-1), gradient.reshape(-1))
+        return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
 
     def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:
-        """Poses after left twists: exp(ξ) T of every free pose; step (n k,)."""
+        """Poses after left twists: exp(ξ) T of every free pose; step (scalars of the pattern,)."""
         result = poses.copy()
-        result[self.free] = lie.exp(step.reshape(-1, self.freedom)) @ poses[self.free]
+        result[self.free] = lie.exp(self.packing.spread_rows(step)) @ poses[self.free]
         return result
+
+    def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
+        errors = np.empty((len(edges), self.freedom))
+        kernel = graph_between_se2 if self.freedom == 3 else graph_between_se3
+        kernel.residuals(poses, edges, self.measurements, errors)
+        if len(self.sightings):
+            T_i, T_j = poses[edges[self.sightings].T]
+            seen = (T_j[:, None, :2, 2] - T_i[:, None, :2, 2]) @ T_i[:, :2, :2]
+            errors[self.sightings, :2] = seen[:, 0] - self.measurements[self.sightings, :2, 2]
+            errors[self.sightings, 2] = 0.0
+        return errors
+
+    def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
+        jacobian = np.empty((len(edges), self.freedom, self.freedom))
+        if self.freedom == 3:
+            graph_between_se2.jacobians(poses, edges, self.measurements, jacobian)
+        else:
+            graph_between_se3.jacobians(poses, edges, errors, jacobian)
+        if len(self.sightings):
+            T_i, T_j = poses[edges[self.sightings].T]
+            R_t, (x, y) = np.swapaxes(T_i[:, :2, :2], 1, 2), T_j[:, :2, 2].T
+            jacobian[self.sightings] = 0.0
+            jacobian[self.sightings, :2, :2] = R_t
+            jacobian[self.sightings, :2, 2] = (R_t @ np.stack([-y, x], axis=1)[..., None])[..., 0]
+        return jacobian
 
 
 def right_information(T_ij: Matrix, left_information: Matrix) -> Matrix:

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spilu
 
 from pipeline.data import Matrix
-from pipeline.kernels import graph_cholesky, graph_fronts, graph_symbolic
+from pipeline.kernels import graph_cholesky, graph_fronts, graph_inverse, graph_scatter, graph_symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -47,6 +47,49 @@ class BlockPattern:
         squares = np.cumsum(self.sizes**2) - self.sizes**2
         within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
         return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
+
+    def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The product of the symmetric matrix of these values with a vector (scalars,)."""
+        result = np.zeros(self.scalars)
+        graph_scatter.multiply(self.rows, self.columns, self.starts, self.sizes, values, x, result)
+        return result
+
+
+class Packing:
+    """Blocks of one size k, as kernels fill them, to and from the values of a pattern whose blocks may be smaller.
+
+    A variable of fewer scalars keeps the first of its k rows, or the last.
+    """
+
+    def __init__(self, pattern: BlockPattern, k: int, *, at_end: bool) -> None:
+        begin = k - pattern.sizes if at_end else np.zeros_like(pattern.sizes)
+        is_kept = (np.arange(k) >= begin[:, None]) & (np.arange(k) < (begin + pattern.sizes)[:, None])
+        self._k = k
+        self._kept_rows = is_kept
+        self._kept = is_kept[pattern.rows][:, :, None] & is_kept[pattern.columns][:, None, :]
+        self._is_whole = bool(is_kept.all())
+
+    def values(self, blocks: Matrix) -> NDArray[np.float64]:
+        """Block values of blocks (B, k, k)."""
+        return blocks.reshape(-1) if self._is_whole else blocks[self._kept]
+
+    def blocks(self, values: NDArray[np.float64]) -> Matrix:
+        """Blocks (B, k, k) of block values, zero where nothing is kept."""
+        if self._is_whole:
+            return values.reshape(-1, self._k, self._k)
+        result = np.zeros(self._kept.shape)
+        result[self._kept] = values
+        return result
+
+    def rows(self, vectors: Matrix) -> Matrix:
+        """(scalars, ...) of (n, k, ...)."""
+        return vectors[self._kept_rows]
+
+    def spread_rows(self, packed: Matrix) -> Matrix:
+        """(n, k, ...) of (scalars, ...), zero where nothing is kept."""
+        result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
+        result[self._kept_rows] = packed
+        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +162,12 @@ class SparseCholesky:
             graph_cholesky.solve(self._fronts, self._factor, x, local)
             result[:, column] = x[self._places]
         return result.reshape(right_side.shape)
+
+    def inverse_blocks(self) -> NDArray[np.float64]:
+        """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
+        result = np.empty(self.pattern.value_count)
+        graph_inverse.selected_inverse(self._fronts, self._blocks, self._factor, result, self._stack, self._work)
+        return result
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,9 +1,8 @@
-"""Pose graphs as g2o text: SE2 and SE3:QUAT vertices and edges, FIX; other lines are kept as they are."""
+"""Pose graphs read from g2o text (SE2, SE3:QUAT, XY, SE2_XY, FIX) or TORO's; other lines are kept as they are."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline import lie
 from pipeline.data import Matrix
 from pipeline.errors import InputError
-from pipeline.graph.g2o_lines import EDGES, POSE_NUMBERS, TRIANGLE, VERTICES, G2oLines, Rows, sort_lines
+from pipeline.graph.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
 from pipeline.graph.initialise import follow_odometry
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.graph.soundness import positive_semidefinite
@@ -26,7 +25,7 @@ class G2oFile:
 
     Attributes
     ----------
-    graph : the poses in the order of their ids; the stamp of each is its id
+    graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
     ids : (K,) the file's vertex ids
     other_lines : lines that say nothing about poses and edges, kept to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
@@ -48,50 +47,36 @@ def read_g2o(path: Path | str, *, loops: Literal["trusted", "suspect"] = "truste
     path = Path(path)
     lines = sort_lines(path)
     dimension = lines.dimension
-    ids, poses = _vertices(path, lines)
-    pairs = _places(path, lines.edges, 2, ids)
+    pose_ids, poses = _vertices(path, lines)
+    point_ids, points = _points(path, lines, pose_ids)
+    ids = np.concatenate([pose_ids, point_ids])
+    pairs = _places(path, lines.edges, 2, pose_ids)
     measurements, information = _measurements(path, lines.edges, dimension)
+    sightings, seen, certainty = _sightings(path, lines.sightings, pose_ids, point_ids)
     fixed = _places(path, lines.fixed, 1, ids)[:, 0]
     if not lines.vertices.ids:
-        held = np.isin(np.arange(len(ids)), fixed if len(fixed) else 0)
+        held = np.isin(np.arange(len(pose_ids)), fixed if len(fixed) else 0)
         poses = follow_odometry(poses, held, pairs, measurements)
+        from_i = poses[sightings[:, 0]]
+        points[sightings[:, 1] - len(poses)] = (from_i[:, :2, :2] @ seen[..., None])[..., 0] + from_i[:, :2, 2]
     graph = PoseGraph(dimension)
-    for pose, stamp in zip(poses, ids.tolist(), strict=True):
+    for pose, stamp in zip(poses, pose_ids.tolist(), strict=True):
         graph.add_pose(pose, stamp)
+    for point, stamp in zip(points, point_ids.tolist(), strict=True):
+        graph.add_point(point, stamp)
     suspect = (loops == "suspect") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1)
     graph.add_edges(pairs, measurements, information, suspect)
+    if len(sightings):
+        graph.add_sightings(sightings, seen, certainty)
     for index in fixed.tolist():
         graph.fix(index)
     return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids))
 
 
-def write_g2o(
-    path: Path | str,
-    graph: PoseGraph,
-    *,
-    ids: NDArray[np.int64] | None = None,
-    other_lines: Iterable[str] = (),
-) -> None:
-    """Write poses and edges with full information matrices, every number to its last digit.
-
-    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name.
-    """
-    d = graph.dimension
-    names = (np.arange(len(graph)) if ids is None else ids).tolist()
-    upper = np.triu_indices(graph.freedom)
-    numbers = np.hstack([_numbers(graph.measurements), graph.information[:, upper[0], upper[1]]])
-    lines = [f"{VERTICES[d]} {name} {_text(row)}" for name, row in zip(names, _numbers(graph.poses), strict=True)]
-    lines += [f"FIX {names[index]}" for index in graph.held]
-    for (i, j), row in zip(graph.edges.tolist(), numbers, strict=True):
-        lines.append(f"{EDGES[d]} {names[i]} {names[j]} {_text(row)}")
-    lines += other_lines
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def _vertices(path: Path, lines: G2oLines) -> tuple[NDArray[np.int64], Matrix]:
     """Return ids, ascending, and poses; without vertex lines the ids of the edges, at the identity."""
     if not lines.vertices.ids:
-        ids = np.unique(lines.edges.ids_array(2))
+        ids = np.unique(np.append(lines.edges.ids_array(2), lines.sightings.ids_array(2)[:, 0]))
         return ids, np.tile(lie.identity(lines.dimension), (len(ids), 1, 1))
     ids, first = np.unique(lines.vertices.ids_array(1)[:, 0], return_index=True)
     again = np.setdiff1d(np.arange(len(lines.vertices.ids)), first)
@@ -101,11 +86,46 @@ def _vertices(path: Path, lines: G2oLines) -> tuple[NDArray[np.int64], Matrix]:
     return ids, _poses(path, lines.vertices, lines.vertices.numbers_array(POSE_NUMBERS[lines.dimension]))[first]
 
 
+def _points(
+    path: Path, lines: G2oLines, pose_ids: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return ids, ascending, and positions (L, 2) of the points; without vertex lines those seen, at 0."""
+    if not lines.vertices.ids:
+        ids = np.unique(lines.sightings.ids_array(2)[:, 1])
+        first, points = np.arange(len(ids)), np.zeros((len(ids), 2))
+    else:
+        names, points = lines.points.ids_array(1)[:, 0], lines.points.numbers_array(2)
+        ids, first = np.unique(names, return_index=True)
+        for again in np.setdiff1d(np.arange(len(names)), first)[:1]:
+            raise InputError(f"{path}:{lines.points.lines[again]}: vertex {names[again]} stands in the file twice")
+    for name in np.intersect1d(ids, pose_ids)[:1]:
+        raise InputError(f"{path}: vertex {name} is a pose and a point; give each an id of its own")
+    return ids, points[first]
+
+
+def _sightings(
+    path: Path, rows: Rows, pose_ids: NDArray[np.int64], point_ids: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], Matrix]:
+    """Pose and point indices (S, 2), positions (S, 2) in the pose's frame and information (S, 2, 2)."""
+    names, numbers = rows.ids_array(2), rows.numbers_array(5)
+    single = [Rows(rows.lines, [[name] for name in names[:, end].tolist()]) for end in (0, 1)]
+    i, j = _places(path, single[0], 1, pose_ids)[:, 0], _places(path, single[1], 1, point_ids)[:, 0]
+    information = numbers[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    for bad in np.flatnonzero(~positive_semidefinite(information))[:1]:
+        raise InputError(
+            f"{path}:{rows.lines[bad]}: information matrix is not positive semidefinite;"
+            " give the upper triangle of an inverse covariance"
+        )
+    return np.stack([i, j + len(pose_ids)], axis=1), numbers[:, :2], information
+
+
 def _places(path: Path, rows: Rows, width: int, ids: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pose indices (n, width) of the vertices that these lines name."""
-    names = rows.ids_array(width)
-    places = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
-    unknown = np.argwhere(ids[places] != names)
+    names, order = rows.ids_array(width), np.argsort(ids)
+    if not names.size:
+        return names
+    places = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)] if len(ids) else names * 0
+    unknown = np.argwhere(ids[places] != names if len(ids) else np.ones_like(names))
     if len(unknown):
         row, column = unknown[0]
         raise InputError(
@@ -147,16 +167,3 @@ def _poses(path: Path, rows: Rows, numbers: Matrix) -> Matrix:
         raise InputError(f"{path}:{rows.lines[bad]}: quaternion of length 0; write qx qy qz qw, 0 0 0 1 for none")
     result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:])
     return result
-
-
-def _numbers(poses: Matrix) -> Matrix:
-    """Poses as rows x y θ, or x y z qx qy qz qw."""
-    d = poses.shape[-1] - 1
-    if d == 2:
-        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)])
-    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
-
-
-def _text(row: NDArray[np.float64]) -> str:
-    """Shortest decimals that read back as the same numbers."""
-    return " ".join(map(repr, row.tolist()))

@@ -4,17 +4,45 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
+from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
 
 VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+POINT, SIGHTING = "VERTEX_XY", "EDGE_SE2_XY"
 POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
 TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a tag stands for: where its lines go, ids and numbers on each, whether they are written as in TORO."""
+
+    name: Literal["vertices", "edges", "points", "sightings"]
+    dimension: int
+    ids: int
+    numbers: int
+    is_toro: bool = False
+
+
+_KINDS = {
+    VERTICES[2]: Kind("vertices", 2, 1, 3),
+    VERTICES[3]: Kind("vertices", 3, 1, 7),
+    EDGES[2]: Kind("edges", 2, 2, 9),
+    EDGES[3]: Kind("edges", 3, 2, 28),
+    POINT: Kind("points", 2, 1, 2),
+    SIGHTING: Kind("sightings", 2, 2, 5),
+    TORO_VERTICES[2]: Kind("vertices", 2, 1, 3, is_toro=True),
+    TORO_VERTICES[3]: Kind("vertices", 3, 1, 6, is_toro=True),
+    TORO_EDGES[2]: Kind("edges", 2, 2, 9, is_toro=True),
+    TORO_EDGES[3]: Kind("edges", 3, 2, 27, is_toro=True),
+}
 
 
 @dataclass(slots=True)
@@ -41,6 +69,8 @@ class G2oLines:
     dimension: int = 0
     vertices: Rows = field(default_factory=Rows)
     edges: Rows = field(default_factory=Rows)
+    points: Rows = field(default_factory=Rows)
+    sightings: Rows = field(default_factory=Rows)
     fixed: Rows = field(default_factory=Rows)
     others: list[str] = field(default_factory=list)
 
@@ -59,7 +89,7 @@ def sort_lines(path: Path) -> G2oLines:
         words = line.split()
         if words:
             _sort_line(path, number, words, line, result)
-    if not result.edges.ids:
+    if not result.edges.ids and not result.sightings.ids:
         raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
     return result
 
@@ -71,20 +101,19 @@ def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2o
         for word in words[1:]:
             _append(path, number, [tag, word], 1, 0, result.fixed)
         return
-    for dimension in (2, 3):
-        if tag not in (VERTICES[dimension], EDGES[dimension]):
-            continue
-        if result.dimension not in (0, dimension):
-            raise InputError(
-                f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file"
-            )
-        result.dimension = dimension
-        if tag == VERTICES[dimension]:
-            _append(path, number, words, 1, POSE_NUMBERS[dimension], result.vertices)
-        else:
-            _append(path, number, words, 2, POSE_NUMBERS[dimension] + TRIANGLE[dimension], result.edges)
+    kind = _KINDS.get(tag)
+    if kind is None:
+        result.others.append(line)
         return
-    result.others.append(line)
+    if result.dimension not in (0, kind.dimension):
+        raise InputError(
+            f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file"
+        )
+    result.dimension = kind.dimension
+    rows: Rows = getattr(result, kind.name)
+    _append(path, number, words, kind.ids, kind.numbers, rows)
+    if kind.is_toro:
+        rows.numbers[-1] = from_toro(rows.numbers[-1], kind.dimension)
 
 
 def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, rows: Rows) -> None:

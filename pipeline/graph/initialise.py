@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
+from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.chordal import relax_chordally
 from pipeline.kernels.graph_tree import follow_tree
 
@@ -27,6 +28,8 @@ def first_guess(
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
     not every edge is trusted it keeps them in any case: no other guess is safe from a false loop.
     """
+    if problem.is_point.any():
+        return _with_points(problem, poses, initialise, trusted=trusted)
     fixed = problem.variable < 0
     if initialise == "odometry":
         return follow_odometry(poses, fixed, problem.edges, problem.measurements), initialise
@@ -41,6 +44,46 @@ def first_guess(
         if problem.chi2(problem.errors(relaxed)).sum() < chi2:
             return relaxed, "chordal"
     return poses.copy(), "given"
+
+
+def place_points(problem: BetweenProblem, poses: Matrix) -> Matrix:
+    """Poses with every free point where it is seen from its poses, on average."""
+    i, j = problem.edges[problem.sightings].T
+    seen = (poses[i] @ problem.measurements[problem.sightings])[:, :-1, -1]
+    total, count = np.zeros((len(poses), seen.shape[1])), np.zeros(len(poses))
+    np.add.at(total, j, seen)
+    np.add.at(count, j, 1.0)
+    placed = (count > 0) & (problem.variable >= 0)
+    result = poses.copy()
+    result[placed, :-1, -1] = total[placed] / count[placed, None]
+    return result
+
+
+def _with_points(
+    problem: BetweenProblem, poses: Matrix, initialise: Initialisation, *, trusted: bool
+) -> tuple[Matrix, Initialisation]:
+    """The guess for the poses alone, and the points as they are seen from there, if that fits better."""
+    ways = np.flatnonzero(~problem.is_point)
+    place = np.cumsum(~problem.is_point) - 1
+    between = np.setdiff1d(np.arange(len(problem.edges)), problem.sightings)
+    alone = BetweenProblem(
+        place[problem.edges[between]],
+        problem.measurements[between],
+        problem.information[between],
+        problem.variable[ways] < 0,
+    )
+    try:
+        guess, source = first_guess(alone, poses[ways], initialise, trusted=trusted)
+    except SingularMatrixError:
+        return poses.copy(), "given"
+    result = poses.copy()
+    result[ways] = guess
+    placed = place_points(problem, result)
+    if source != "given" or initialise == "auto":
+        chi2 = [problem.chi2(problem.errors(candidate)).sum() for candidate in (poses, placed)]
+        if source != "given" or chi2[1] < chi2[0]:
+            return placed, source
+    return poses.copy(), source
 
 
 def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:

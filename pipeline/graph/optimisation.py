@@ -12,6 +12,16 @@ from pipeline.graph.initialise import Initialisation
 
 
 @dataclass(frozen=True, slots=True)
+class GraphChange:
+    """A graph before and after, for those who show it; ``rejected`` (E,) in the order of ``after.edges``."""
+
+    name: str
+    before: GraphState
+    after: GraphState
+    rejected: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
 class Optimisation:
     """The answer of ``PoseGraph.optimise``.
 

@@ -12,11 +12,15 @@ from pipeline.config import GraphConfig
 from pipeline.data import GraphState, Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.graph.between import BetweenProblem
+from pipeline.graph.certificate import Certificate, certify
 from pipeline.graph.cholesky import SingularMatrixError
+from pipeline.graph.covariance import own_covariances, relative_covariance
+from pipeline.graph.estimate import Minimum
+from pipeline.graph.graduation import minimise
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation, first_guess
 from pipeline.graph.optimisation import Optimisation
-from pipeline.graph.optimiser import Minimiser, Minimum
+from pipeline.graph.optimiser import Minimiser
 from pipeline.graph.robust import rejection_limit, robust_loss
 from pipeline.graph.soundness import check_connected, check_edges, undetermined
 
@@ -35,7 +39,7 @@ class PoseGraph:
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
         self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
         self._information, self._is_loop = GrowingArray((k, k), np.float64), GrowingArray((), np.bool_)
-        self._weight = GrowingArray((), np.float64)
+        self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._fixed: set[int] = set()
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
@@ -79,6 +83,11 @@ class PoseGraph:
         return self._weight.rows
 
     @property
+    def is_point(self) -> NDArray[np.bool_]:
+        """Which poses are points, without a heading, (K,)."""
+        return self._is_point.rows
+
+    @property
     def fixed(self) -> NDArray[np.bool_]:
         """Which poses are held, (K,); pose 0 where none was named."""
         held = np.zeros(len(self), np.bool_)
@@ -92,11 +101,11 @@ class PoseGraph:
 
     def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
         """Index of the new pose, with this first guess."""
-        if not np.isfinite(T_world).all():
-            raise InputError(f"pose {len(self)} is not finite; give it a first guess or leave it out")
-        self._changed()
-        self._stamps_ns.append(stamp_ns)
-        return self._poses.append(T_world)
+        return self._append(T_world, stamp_ns, is_point=False)
+
+    def add_point(self, position: NDArray[np.float64], stamp_ns: int) -> int:
+        """Index of a new point of the plane (2,): it counts among the poses, with the identity as its rotation."""
+        return self._append(lie.pose_2d(position[0], position[1], 0.0), stamp_ns, is_point=True)
 
     def add_edge(self, i: int, j: int, T_ij: Pose, information: Matrix, is_loop: bool = False) -> None:
         """Add a measurement of frame j in frame i.
@@ -118,6 +127,14 @@ class PoseGraph:
         self._is_loop.extend(is_loop)
         self._weight.extend(np.ones(len(edges)))
 
+    def add_sightings(self, edges: NDArray[np.int64], positions: NDArray[np.float64], information: Matrix) -> None:
+        """Add points as poses see them: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
+        measurements = np.tile(lie.identity(2), (len(edges), 1, 1))
+        measurements[:, :2, 2] = positions
+        padded = np.zeros((len(edges), 3, 3))
+        padded[:, :2, :2] = information
+        self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
+
     def fix(self, index: int) -> None:
         """Hold this pose where it is, instead of pose 0."""
         if not 0 <= index < len(self):
@@ -137,7 +154,7 @@ class PoseGraph:
         loss = robust_loss(config.robust, config.robust_scale, self.freedom)
         minimiser = Minimiser(problem, self.is_loop, config.optimiser)
         try:
-            minimum = minimiser.minimise(guess, loss, config.max_iterations, config.tolerance)
+            minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance)
         except SingularMatrixError as error:
             raise undetermined(int(problem.free[error.variable])) from error
         self._take(minimum, shift)
@@ -148,13 +165,17 @@ class PoseGraph:
             chi2_before=chi2_before,
             chi2_after=float(chi2.sum()),
             cost_after=minimum.estimate.cost,
-            rejected=(self.is_loop & (chi2 > limit))[self._order()],
+            rejected=(self.is_loop & ((minimum.weights == 0.0) | (chi2 > limit)))[self._order()],
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
             initialisation=source,
             time_s=time.perf_counter() - begin,
         )
+
+    def certify(self) -> Certificate:
+        """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
+        return certify(self._prepared(), self.poses, self.weight)
 
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
@@ -171,17 +192,21 @@ class PoseGraph:
     def relative_covariance(self, i: int, j: int) -> Matrix:
         """Covariance (k, k) of a left twist on T_i⁻¹ T_j, given all edges at the poses and weights of now.
 
-        With left twists ξ_i, ξ_j of the world poses it is Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ. The factor of H
-        is kept until the graph changes, so that each further pair costs k solves.
+        The factor of H is kept until the graph changes, so that each further pair costs k solves.
         """
-        problem = self._factored()
-        selection = np.zeros((len(problem.free), self.freedom, self.freedom))
-        for pose, sign in ((i, -1.0), (j, 1.0)):
-            if problem.variable[pose] >= 0:
-                selection[problem.variable[pose]] += sign * np.eye(self.freedom)
-        flat = selection.reshape(-1, self.freedom)
-        adjoint = lie.adjoint(lie.inverse(self.poses[i]))
-        return adjoint @ (flat.T @ problem.cholesky.solve(flat)) @ adjoint.T
+        return relative_covariance(self._factored(), self.poses, i, j)
+
+    def covariances(self) -> Matrix:
+        """Covariance (K, k, k) of every pose's twist in its own frame, given all edges at the poses of now."""
+        return own_covariances(self._factored(), self.poses)
+
+    def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
+        if not np.isfinite(T_world).all():
+            raise InputError(f"pose {len(self)} is not finite; give it a first guess or leave it out")
+        self._changed()
+        self._stamps_ns.append(stamp_ns)
+        self._is_point.append(is_point)
+        return self._poses.append(T_world)
 
     def _factored(self) -> BetweenProblem:
         """The problem, with the factor of the undamped H in its solver."""
@@ -200,7 +225,7 @@ class PoseGraph:
         if self._problem is None:
             fixed = self.fixed
             check_connected(self.edges, fixed)
-            self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed)
+            self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
 
     def _take(self, minimum: Minimum, shift: NDArray[np.float64]) -> None:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "truncated"]
-GRADUATED: tuple[Kernel, ...] = ("geman-mcclure", "truncated")
+Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "truncated"]
+GRADUATED: tuple[Kernel, ...] = ("geman-mcclure", "tukey", "truncated")
 
 _TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is as good as its limit
+_FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is all but convex; its step there
 _FACTOR = 1.4  # step of the graduation (Yang et al. 2020, remark 5)
 
 
@@ -25,8 +26,8 @@ class RobustLoss:
     ----------
     kernel : which loss
     scale : s, the χ (a pure number) at which a residual starts to count less
-    control : μ of graduated non-convexity (Yang et al. 2020); ∞ → convex, and 1, for geman-mcclure; 0 → convex,
-        and ∞, for truncated least squares
+    control : μ of graduated non-convexity (Yang et al. 2020); ∞ → convex, and 1, for geman-mcclure and tukey,
+        where it widens s²; 0 → convex, and ∞, for truncated least squares
     """
 
     kernel: Kernel
@@ -42,6 +43,8 @@ class RobustLoss:
             return s2 / (s2 + chi2)
         if self.kernel == "geman-mcclure":
             return (self.control * s2 / (self.control * s2 + chi2)) ** 2
+        if self.kernel == "tukey":
+            return np.maximum(1.0 - chi2 / (self.control * s2), 0.0) ** 2
         if self.kernel == "truncated":
             return self._truncated_weight(chi2)
         return np.ones_like(chi2)
@@ -55,6 +58,9 @@ class RobustLoss:
             return s2 * np.log1p(chi2 / s2)
         if self.kernel == "geman-mcclure":
             return chi2 * self.control * s2 / (self.control * s2 + chi2)
+        if self.kernel == "tukey":
+            share = np.minimum(chi2 / (self.control * s2), 1.0)
+            return self.control * s2 * share * (1.0 - share + share**2 / 3.0)
         if self.kernel == "truncated":
             return self._truncated_loss(chi2)
         return chi2
@@ -69,7 +75,8 @@ class RobustLoss:
     def tightened(self) -> RobustLoss:
         """The next, less convex loss."""
         if self.kernel == "truncated":
-            return replace(self, control=self.control * _FACTOR if self.control < _SHARP else np.inf)
+            factor = _FACTOR if self.control > _FLAT else _LONG_FACTOR
+            return replace(self, control=self.control * factor if self.control < _SHARP else np.inf)
         return replace(self, control=max(1.0, self.control / _FACTOR))
 
     def settled(self, chi2: NDArray[np.float64]) -> bool:

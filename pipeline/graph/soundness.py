@@ -45,16 +45,25 @@ def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:
     """Refuse a graph with poses that no chain of edges joins to a fixed one."""
     if not len(fixed):
         raise InputError("the pose graph has no poses; add some before optimising")
-    n = len(fixed)
-    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    _, part = connected_components(links, directed=False)
-    loose = np.flatnonzero(~np.isin(part, part[fixed]))
+    n, loose = len(fixed), _loose(edges, fixed)
     if len(loose):
         names = ", ".join(str(v) for v in loose[:8]) + (", ..." if len(loose) > 8 else "")
         raise InputError(
             f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {names};"
             " add edges to them or fix one of them"
         )
+
+
+def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
+    """Whether a chain of these edges joins every pose to a fixed one."""
+    return not len(_loose(edges, fixed))
+
+
+def _loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Poses that no chain of edges joins to a fixed one."""
+    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(fixed), len(fixed)))
+    _, part = connected_components(links, directed=False)
+    return np.flatnonzero(~np.isin(part, part[fixed]))
 
 
 def undetermined(pose: int) -> InputError:

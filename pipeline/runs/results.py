@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import MapsConfig
 from pipeline.data import Points, Pose
-from pipeline.graph.g2o import write_g2o
+from pipeline.graph.g2o_write import write_g2o
 from pipeline.maps import OccupancyGrid, build_point_map, draw_grid, fitting_resolution, write_map, write_ply
 from pipeline.runs.recorder import Recorder
 from pipeline.runs.verdicts import JudgedClosure

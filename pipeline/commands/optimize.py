@@ -1,0 +1,218 @@
+"""``scanchain optimize``: a pose graph from a file to its certified minimum."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.errors import InputError
+from pipeline.settings import Override, load_settings
+
+if TYPE_CHECKING:
+    from pipeline.config import GraphConfig
+    from pipeline.graph.certificate import Certificate
+    from pipeline.graph.g2o import G2oFile
+    from pipeline.graph.initialise import Initialisation
+    from pipeline.graph.optimisation import GraphChange, Optimisation
+    from pipeline.runs.recorder import Viewing
+
+_PATH = click.Path(path_type=Path)
+_WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
+
+
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
+@click.argument("source", metavar="GRAPH.g2o", type=_PATH)
+@click.option("--out", metavar="FILE", type=_PATH, help="Write the optimised graph: .g2o, or TORO's .graph.")
+@click.option("--optimiser", metavar="NAME", help="Short for --graph.optimiser.")
+@click.option(
+    "--initialise",
+    type=click.Choice(_WAYS),
+    default="auto",
+    show_default=True,
+    help="First guess; auto takes the file's, or the chordal one where that is poor.",
+)
+@click.option(
+    "--robust",
+    metavar="KERNEL",
+    help="Suspect edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: trust all]",
+)
+@click.option(
+    "--marginals",
+    metavar="all|IDS",
+    help="Covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
+)
+@click.option("--png", metavar="FILE", type=_PATH, help="Draw the graph before and after to a picture.")
+@click.option("--recording", metavar="FILE.rrd", type=_PATH, help="Record the graph before and after for rerun.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.pass_context
+def optimize(
+    ctx: click.Context,
+    source: Path,
+    out: Path | None,
+    initialise: str,
+    marginals: str | None,
+    png: Path | None,
+    recording: Path | None,
+    force: bool,
+    as_json: bool,
+    **shortcuts: str | None,
+) -> None:
+    """Optimise a pose graph and say whether the minimum is the global one.
+
+    GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
+    below; edges that --robust rejected do not count in it.
+
+    \b
+    Examples:
+      scanchain optimize sphere2500.g2o --out optimised.g2o
+      scanchain optimize sphere2500.g2o --png sphere.png --json
+      scanchain optimize run/graph.g2o --robust truncated --out run/robust.g2o --marginals all
+      scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
+    """
+    outputs = Outputs(out, marginals, png, recording)
+    outputs.check(force)
+    settings = [*_shortcuts(shortcuts), *overrides(ctx)]
+    config = _config(settings)
+    is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
+    answer = _solved(source, config, cast("Initialisation", initialise), is_suspicious)
+    outputs.write(answer, ctx.obj)
+    click.echo(answer.json(outputs.paths) if as_json else answer.text(outputs.paths))
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The files to write, and the poses whose covariances are wanted."""
+
+    graph: Path | None
+    marginals: str | None
+    picture: Path | None
+    recording: Path | None
+
+    @property
+    def table(self) -> Path | None:
+        """Where the covariances go."""
+        return self.graph.with_suffix(".marginals.csv") if self.graph and self.marginals else None
+
+    @property
+    def paths(self) -> list[Path]:
+        """Every file that is wanted."""
+        return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
+
+    def check(self, force: bool) -> None:
+        """Refuse before the work what could not be written after it."""
+        if self.marginals is not None and self.graph is None:
+            raise InputError("--marginals writes a table beside the graph; give --out FILE")
+        for path, ending in ((self.picture, ".png"), (self.recording, ".rrd")):
+            if path is not None and path.suffix != ending:
+                raise InputError(f"{path}: name a file that ends in {ending}")
+        for path in self.paths:
+            if not path.parent.is_dir():
+                raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+            if path.is_dir():
+                raise InputError(f"{path}: is a folder; name a file")
+            if path.exists() and not force:
+                raise InputError(f"{path}: exists; choose another name, or --force to replace it")
+
+    def write(self, answer: Answer, viewing: Viewing) -> None:
+        """Write them all."""
+        from pipeline.graph.covariance_table import chosen_poses, write_covariances
+        from pipeline.graph.g2o_write import write_graph
+
+        file = answer.file
+        chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
+        if self.graph is not None:
+            write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+        if self.table is not None:
+            write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
+        if self.picture is not None:
+            viewing.draw_graph(answer.change, self.picture)
+        if self.recording is not None:
+            viewing.record_graph(answer.change, self.recording)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What there is to print."""
+
+    file: G2oFile
+    change: GraphChange
+    optimisation: Optimisation
+    certificate: Certificate
+
+    def text(self, written: list[Path]) -> str:
+        """A line for each fact."""
+        graph, done = self.file.graph, self.optimisation
+        guess = done.initialisation
+        if guess == "given":
+            guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
+        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
+        lines = [
+            f"graph          {self.change.name}: {size}",
+            *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            f"first guess    {guess}",
+            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
+            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
+        ]
+        if graph.is_loop.any():
+            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
+            lines.append(
+                f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
+            )
+        held = ", the robust weights held" if graph.is_loop.any() else ""
+        lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
+        return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    def json(self, written: list[Path]) -> str:
+        """The same, and every rejected edge, by vertex ids."""
+        graph, done = self.file.graph, self.optimisation
+        tree = {
+            "graph": self.change.name,
+            "dimension": graph.dimension,
+            "poses": len(graph),
+            "edges": len(graph.edges),
+            "suspected": int(graph.is_loop.sum()),
+            "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
+            "kept_lines": dict(self.file.other_tags),
+            "chi2_before": done.chi2_before,
+            "chi2_after": done.chi2_after,
+            "cost_after": done.cost_after,
+            "iterations": done.iterations,
+            "converged": done.converged,
+            "reason": done.reason,
+            "initialisation": done.initialisation,
+            "time_s": done.time_s,
+            "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
+            "written": [str(path) for path in written],
+        }
+        return json.dumps(tree, indent=2)
+
+
+def _shortcuts(flags: dict[str, str | None]) -> list[Override]:
+    """The short flags as the keys they stand for; a ``--graph.key`` flag beats them."""
+    return [Override(f"graph.{name}", value, f"--{name}") for name, value in flags.items() if value is not None]
+
+
+def _config(settings: list[Override]) -> GraphConfig:
+    """The graph's branch of the configuration; nothing else means anything here."""
+    for setting in settings:
+        if not setting.key.startswith("graph."):
+            raise InputError(f"{setting.flag} has no meaning for optimize; its keys begin with --graph.")
+    return load_settings(overrides=settings).config.graph
+
+
+def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_suspicious: bool) -> Answer:
+    """Read, optimise, certify."""
+    from pipeline.graph.g2o import read_g2o
+    from pipeline.graph.optimisation import GraphChange
+
+    file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
+    before = file.graph.state()
+    done = file.graph.optimise(config, initialise=initialise)
+    change = GraphChange(source.name, before, done.state, done.rejected)
+    return Answer(file, change, done, file.graph.certify())

@@ -1,0 +1,111 @@
+"""Whether a minimum of a pose graph is the global one: a lower bound of χ² by Lagrangian duality."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.graph.between import BetweenProblem
+from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
+from pipeline.graph.minorant import Minorants, minorise
+from pipeline.kernels.graph_dual import scatter_dual
+
+_NOTHING = 1e-9  # χ² that is zero but for rounding
+_SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What is known of the distance to the global minimum.
+
+    Attributes
+    ----------
+    certified : whether no poses whatever have a χ² lower than this one by more than ``gap``
+    gap : χ² less its lower bound, from 0 up; as large as χ² itself where nothing is known
+    chi2 : Σ w eᵀΩe that was certified
+    reason : why there is no certificate; empty where there is one
+    time_s : wall time
+    """
+
+    certified: bool
+    gap: float
+    chi2: float
+    reason: str
+    time_s: float
+
+    @property
+    def relative_gap(self) -> float:
+        """The gap as a share of χ², 0 to 1; 0 where χ² is zero."""
+        return self.gap / self.chi2 if self.chi2 > _NOTHING else 0.0
+
+    @property
+    def verdict(self) -> str:
+        """One line for people."""
+        if self.chi2 < _NOTHING:
+            return "globally optimal: χ² is zero"
+        if self.certified:
+            return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
+        return f"not certified: {self.reason}"
+
+
+def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Certificate:
+    """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
+
+    Every edge's χ² is replaced by a quadratic function of rotations and positions that is nowhere above it and
+    touches it at these poses (``minorise``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et
+    al. 2019, theorem 1) bounds it in turn: if S, with the gauge fixed, is positive definite, then for all poses
+        χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
+    Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
+    factorisation goes through, so the claim holds to the rounding of that.
+    """
+    begin = time.perf_counter()
+    kept = weights > 0.0
+    chi2 = float((weights * problem.chi2(problem.errors(poses))).sum())
+    if len(poses) - len(problem.free) > 1:
+        reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
+        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
+    centred = poses.copy()
+    centred[:, :-1, -1] -= centred[:, :-1, -1].mean(axis=0)
+    minorants = minorise(problem, centred, weights)
+    turning = ~problem.is_point[problem.edges].any(axis=1)
+    loose = np.flatnonzero(kept & turning & ~(minorants.kappa > 0.0))
+    if len(loose):
+        i, j = problem.edges[loose[0]]
+        reason = f"{len(loose)} edges are too far from their measurements to be bounded, first {i}-{j}"
+        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
+    gap = _gap(problem, minorants, kept, chi2)
+    if gap is None:
+        reason = "the dual matrix is not positive definite, as at a local minimum"
+        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
+    return Certificate(True, min(gap, chi2), chi2, "", time.perf_counter() - begin)
+
+
+def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:
+    """χ² less the best bound that a few shifts of the dual matrix give, None where none gives any."""
+    n, d = len(problem.free), minorants.leap.shape[1]
+    blocks = np.zeros((len(problem.pattern.rows), d + 1, d + 1))
+    residual = np.zeros((n, d + 1, d))
+    scatter_dual(
+        minorants.leap[kept], minorants.force[kept], minorants.torque[kept], minorants.tau[kept],
+        minorants.kappa[kept], problem.slots[kept], blocks, residual,
+    )  # fmt: skip
+    sizes = np.where(problem.is_point[problem.free], 1, d + 1)
+    pattern = BlockPattern(sizes, problem.pattern.pairs)
+    packing = Packing(pattern, d + 1, at_end=True)
+    factor = SparseCholesky(pattern, problem.cholesky.analysis)
+    rotation = np.diag([1.0] * d + [0.0])
+    for share in _SHARES:
+        shift = share * chi2 / (d * max(n, 1))
+        shifted = blocks.copy()
+        shifted[:n] += shift * rotation
+        try:
+            factor.factorise(packing.values(shifted))
+        except SingularMatrixError:
+            continue
+        right = packing.rows(residual + shift * rotation[:, :d])
+        return float((right * factor.solve(right)).sum())
+    return None

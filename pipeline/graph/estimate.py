@@ -1,0 +1,39 @@
+"""Where a minimisation is, and where it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Poses with what follows from them: residuals e, χ² of every edge, and the robust cost Σ ρ(χ²)."""
+
+    poses: Matrix
+    errors: Matrix
+    chi2: NDArray[np.float64]
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """Where a minimisation ended, with what robust weights (E,), after how many linear solves, and why."""
+
+    estimate: Estimate
+    weights: NDArray[np.float64]
+    iterations: int
+    converged: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A step (n k,) of left twists, and where it leads."""
+
+    step: NDArray[np.float64]
+    to: Estimate

@@ -1,0 +1,107 @@
+"""Pose graphs written as g2o or TORO text, every number to its last digit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Matrix
+from pipeline.errors import InputError
+from pipeline.graph.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
+from pipeline.graph.pose_graph import PoseGraph
+from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
+
+TORO_SUFFIXES = (".graph", ".toro")
+
+
+def write_graph(path: Path, graph: PoseGraph, *, ids: NDArray[np.int64], other_lines: Iterable[str] = ()) -> None:
+    """Write a g2o file, or a TORO one where the name ends in .graph or .toro."""
+    write = write_toro if path.suffix in TORO_SUFFIXES else write_g2o
+    try:
+        write(path, graph, ids=ids, other_lines=other_lines)
+    except OSError as error:
+        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+
+
+def write_g2o(
+    path: Path | str,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+) -> None:
+    """Write poses, points and edges with full information matrices.
+
+    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name.
+    """
+    d = graph.dimension
+    names = (np.arange(len(graph)) if ids is None else ids).tolist()
+    lines = []
+    for name, pose, is_point in zip(names, _numbers(graph.poses).tolist(), graph.is_point.tolist(), strict=True):
+        lines.append(f"{POINT} {name} {_text(pose[:2])}" if is_point else f"{VERTICES[d]} {name} {_text(pose)}")
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    sees = graph.is_point[graph.edges[:, 1]].tolist()
+    rows = zip(graph.edges.tolist(), _numbers(graph.measurements).tolist(), _triangles(graph), sees, strict=True)
+    for (i, j), measured, upper, is_sighting in rows:
+        if is_sighting:
+            lines.append(
+                f"{SIGHTING} {names[i]} {names[j]} {_text([*measured[:2], upper[0], upper[1], upper[3]])}"
+            )
+        else:
+            lines.append(f"{EDGES[d]} {names[i]} {names[j]} {_text([*measured, *upper])}")
+    _write(path, [*lines, *other_lines])
+
+
+def write_toro(
+    path: Path | str,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+) -> None:
+    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO knows no points."""
+    if graph.is_point.any():
+        raise InputError(f"{path}: TORO knows no points, and the graph has {graph.is_point.sum()}; write .g2o")
+    d = graph.dimension
+    names = (np.arange(len(graph)) if ids is None else ids).tolist()
+    lines = [
+        f"{TORO_VERTICES[d]} {name} {_text(row)}" for name, row in zip(names, _toro(graph.poses), strict=True)
+    ]
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    for (i, j), row, upper in zip(graph.edges.tolist(), _toro(graph.measurements), _triangles(graph), strict=True):
+        lines.append(f"{TORO_EDGES[d]} {names[i]} {names[j]} {_text([*row, *to_toro_triangle(upper)])}")
+    _write(path, [*lines, *other_lines])
+
+
+def _write(path: Path | str, lines: list[str]) -> None:
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _numbers(poses: Matrix) -> Matrix:
+    """Poses as rows x y θ, or x y z qx qy qz qw."""
+    d = poses.shape[-1] - 1
+    if d == 2:
+        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)])
+    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
+
+
+def _toro(poses: Matrix) -> list[list[float]]:
+    """Poses as rows x y θ, or x y z roll pitch yaw."""
+    if poses.shape[-1] == 3:
+        return _numbers(poses).tolist()
+    return [[*T[:3, 3].tolist(), *to_toro_angles(T[:3, :3])] for T in poses]
+
+
+def _triangles(graph: PoseGraph) -> list[list[float]]:
+    """Ω of every edge, upper triangle row by row."""
+    upper = np.triu_indices(graph.freedom)
+    return graph.information[:, upper[0], upper[1]].tolist()
+
+
+def _text(row: list[float]) -> str:
+    """Shortest decimals that read back as the same numbers."""
+    return " ".join(map(repr, row))

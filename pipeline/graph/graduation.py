@@ -1,0 +1,109 @@
+"""Robust minimisation: from a convex loss to the loss itself, then verdicts that the other edges bear out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.graph.estimate import Estimate, Minimum
+from pipeline.graph.optimiser import Minimiser
+from pipeline.graph.robust import GRADUATED, RobustLoss
+from pipeline.graph.soundness import is_connected
+from pipeline.graph.verdicts import Verdicts, contradictions, fair_price
+
+_WASTE = 0.1  # share of edges without weight that is worth a new analysis
+_MOST_ROUNDS = 50  # of mending verdicts
+_FEWER, _FEWEST = 0.3, 1e-3  # after changes that do not help, of those that promise the most
+
+
+def minimise(
+    minimiser: Minimiser, poses: Matrix, loss: RobustLoss, max_iterations: int, tolerance: float
+) -> Minimum:
+    """Minimise from these poses; a kernel that is not convex is graduated first (Yang et al. 2020)."""
+    now, used = minimiser.evaluate(poses, loss), 0
+    if loss.kernel in GRADUATED and len(minimiser.loops):
+        now, loss, used = _graduate(minimiser, now, loss)
+    if loss.kernel == "truncated" and len(minimiser.loops):
+        minimum = _judge(minimiser, now, loss, max_iterations, tolerance)
+    else:
+        minimum = minimiser.descend(now, loss, max_iterations, tolerance)
+    return replace(minimum, iterations=used + minimum.iterations)
+
+
+def _graduate(minimiser: Minimiser, now: Estimate, loss: RobustLoss) -> tuple[Estimate, RobustLoss, int]:
+    """Follow the minimum from the convex loss to the loss itself, one step for each level."""
+    used, focus = 0, _Focus(minimiser)
+    loss = loss.started(now.chi2[minimiser.loops])
+    while not loss.settled(now.chi2[minimiser.loops]):
+        chosen = focus.on(minimiser.weights(now.chi2, loss))
+        minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, 1, 0.0)
+        now, used = minimiser.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
+        loss = loss.tightened()
+    return minimiser.reweighed(now, loss), loss, used
+
+
+class _Focus:
+    """Leaves out edges of weight zero, which fill in the factor for nothing: soon most of the wrong ones."""
+
+    def __init__(self, minimiser: Minimiser) -> None:
+        self._whole = self._chosen = minimiser
+        self._kept = np.ones(len(minimiser.is_loop), np.bool_)
+        problem = minimiser.problem
+        self._is_free = is_connected(problem.edges[~minimiser.is_loop], problem.variable < 0)
+
+    def on(self, weights: NDArray[np.float64]) -> Minimiser:
+        """A minimiser of the edges with weight, (E,), and of hardly any other."""
+        wanted = weights > 0.0
+        wasted = 1.0 - wanted.sum() / self._kept.sum()
+        if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
+            self._kept, self._chosen = wanted, self._whole.restricted(wanted)
+        return self._chosen
+
+
+def _judge(
+    minimiser: Minimiser, now: Estimate, loss: RobustLoss, max_iterations: int, tolerance: float
+) -> Minimum:
+    """The minimum with the verdicts of now, and then with those that the other edges bear out."""
+    kept, nominal = loss.weight(now.chi2[minimiser.loops]) > 0.5, loss.scale**2
+    minimum = _settle(minimiser, now, Verdicts(kept, nominal), max_iterations, tolerance)
+    problem = minimiser.problem
+    if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
+        return minimum
+    against = _against(minimiser, minimum, nominal)
+    price = fair_price(against[kept], nominal, problem.freedom)
+    minimum = replace(minimum, estimate=minimiser.reweighed(minimum.estimate, Verdicts(kept, price)))
+    share = 1.0
+    for _ in range(_MOST_ROUNDS):
+        gain = np.where(kept, against - price, price - against)
+        if share < _FEWEST or not (gain > 0.0).any():
+            break
+        verdicts = Verdicts(kept ^ (gain > (1.0 - share) * gain.max()), price)
+        trial = _settle(minimiser, minimum.estimate, verdicts, max_iterations, tolerance)
+        used = minimum.iterations + trial.iterations
+        if not trial.estimate.cost < minimum.estimate.cost:
+            minimum, share = replace(minimum, iterations=used), _FEWER * share
+            continue
+        minimum, kept, share = replace(trial, iterations=used), verdicts.kept, 1.0
+        against = _against(minimiser, minimum, price)
+    return minimum
+
+
+def _settle(
+    minimiser: Minimiser, start: Estimate, verdicts: Verdicts, max_iterations: int, tolerance: float
+) -> Minimum:
+    """The minimum with these verdicts."""
+    weights = minimiser.weights(start.chi2, verdicts)
+    chosen = _Focus(minimiser).on(weights)
+    kept = verdicts.kept
+    inner = Verdicts(kept if chosen is minimiser else kept[kept], verdicts.price)
+    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
+    return replace(minimum, estimate=minimiser.evaluate(minimum.estimate.poses, verdicts), weights=weights)
+
+
+def _against(minimiser: Minimiser, minimum: Minimum, price: float) -> NDArray[np.float64]:
+    """What every loop edge costs the others, (L,)."""
+    kept = minimum.weights > 0.5
+    return contradictions(minimiser.problem, minimum.estimate.poses, kept, price)[minimiser.loops]

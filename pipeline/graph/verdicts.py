@@ -1,0 +1,90 @@
+"""Loop edges judged one by one against all the others, and the verdicts mended until they agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from pipeline.data import Matrix
+from pipeline.graph.between import BetweenProblem
+from pipeline.graph.covariance import difference_covariance
+
+_MARGIN = 6.0  # over what a pessimistic noise model would allow: residuals have longer tails than the normal law
+_FEWEST = 10  # kept edges that say something about the noise model
+_ROUNDING = 1e-9  # keeps an edge without which its poses would be loose from a division by zero
+
+
+@dataclass(frozen=True, slots=True)
+class Verdicts:
+    """Loop edges kept or not, as a loss: a kept edge costs its χ², another its price.
+
+    Attributes
+    ----------
+    kept : (L,) bool, of the loop edges
+    price : what leaving an edge out costs, in χ²
+    """
+
+    kept: NDArray[np.bool_]
+    price: float
+    kernel: Literal["truncated"] = "truncated"
+
+    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """1 or 0, whatever the residuals."""
+        return self.kept.astype(np.float64)
+
+    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """χ² or the price."""
+        return np.where(self.kept, chi2, self.price)
+
+
+def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> float:
+    """The price, lowered where the contradictions of kept edges (L,) show that the noise model is pessimistic.
+
+    Information matrices that are far too small would let in any edge. The median of the contradictions, against
+    that of χ² with so many degrees of freedom, says by how much they are.
+    """
+    if len(against) < _FEWEST:
+        return nominal
+    expected = 2.0 * float(gammaincinv(0.5 * degrees, 0.5))
+    return nominal * min(1.0, _MARGIN * float(np.median(against)) / expected)
+
+
+def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_], price: float) -> Matrix:
+    """How much of the whole graph's χ² each edge costs, or would cost were it kept, (E,), to first order.
+
+    It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
+    predict: with P the covariance of the prediction, given all kept edges,
+        eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
+    The residual alone says less: a kept edge bends the graph towards itself. Where a lower bound of the second,
+    by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
+    """
+    errors, k = problem.errors(poses), problem.freedom
+    jacobians = problem.jacobians(poses, errors)
+    sparse = problem.restricted(kept)
+    sparse.cholesky.factorise(sparse.linearise(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    blocks = sparse.packing.blocks(sparse.cholesky.inverse_blocks())
+    blocks = np.concatenate([blocks, np.zeros((1, k, k))])  # found by -1, a fixed pose
+    i, j = problem.variable[problem.edges].T
+    joint = 2.0 * (blocks[i] + blocks[j])
+    i, j, pair = sparse.slots.T
+    joint[kept] = blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
+    result = _distances(errors, jacobians, problem.information, joint, kept)
+    for edge in np.flatnonzero(~kept & (result < price)):
+        one = np.array([edge])
+        joint = difference_covariance(sparse, *problem.edges[edge])[None]
+        result[edge] = _distances(errors[one], jacobians[one], problem.information[one], joint, kept[one])[0]
+    return result
+
+
+def _distances(
+    errors: Matrix, jacobians: Matrix, information: Matrix, joint: Matrix, kept: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The squared distances (E,), from the covariances (E, k, k) of ξ_j − ξ_i."""
+    P = jacobians @ joint @ np.swapaxes(jacobians, 1, 2)
+    sign = np.where(kept, -1.0, 1.0)[:, None, None]
+    matrix = (1.0 + _ROUNDING) * np.eye(errors.shape[1]) + sign * (P @ information)
+    return (errors[:, None] @ information @ np.linalg.solve(matrix, errors[..., None]))[:, 0, 0]

@@ -1,0 +1,126 @@
+"""Wrong loop edges added to published graphs, and what becomes of them: python -m tests.benchmarks.wrong_edges.
+
+To the loops of a graph are added, in proportion to their number, edges between random poses that never saw each
+other: "anywhere", their relative pose drawn from the extent of the map; "nearby", within 2 m and any angle, as a
+matcher that was deceived would give; "groups", nearby ones that agree in runs of five successive poses, as along a
+corridor that looks like another. The trajectory is compared with the optimum of the graph without them.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.config import GraphConfig
+from pipeline.data import Trajectory
+from pipeline.evaluate import Alignment, absolute_error, pair
+from pipeline.graph.g2o import read_g2o
+
+ROOT = Path(__file__).resolve().parents[2]
+KINDS = ("anywhere", "nearby", "groups")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Shares of wrong edges and of true loops that were rejected, ATE without and with wrong edges, time."""
+
+    wrong_rejected: float
+    true_rejected: float
+    ate_clean_m: float
+    ate_m: float
+    time_s: float
+    certified: bool
+
+
+def add_wrong_loops(graph, share, kind, rng):
+    """Add them, ``share`` times as many as there are loops; which edges they are, (E,) bool."""
+    real = len(graph.edges)
+    wanted = int(share * graph.is_loop.sum())
+    omega = np.median(graph.information[graph.is_loop], axis=0)
+    pairs, poses = [], []
+    while len(pairs) < wanted:
+        i, j = rng.integers(0, len(graph) - 5, 2)
+        if abs(i - j) <= 10:
+            continue
+        T = random_pose(graph, kind, rng)
+        for step in range(5 if kind == "groups" else 1):
+            pairs.append((i + step, j + step))
+            poses.append(moved_along(graph, i, j, step, T))
+    graph.add_edges(
+        np.array(pairs), np.array(poses), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool)
+    )
+    return np.arange(len(graph.edges)) >= real
+
+
+def random_pose(graph, kind, rng):
+    d, k = graph.dimension, graph.freedom
+    turn = rng.uniform(-np.pi, np.pi) if d == 2 else rng.normal(size=3)
+    reach = np.ptp(graph.poses[:, :d, d], axis=0) / 2 if kind == "anywhere" else np.full(d, 2.0)
+    twist = np.zeros(k)
+    twist[d:] = turn
+    T = lie.exp(twist)
+    T[:d, d] = rng.uniform(-reach, reach)
+    return T
+
+
+def moved_along(graph, i, j, step, T_ij):
+    """The same mistake a few poses later: T_ij carried along the poses of both ends."""
+    poses = graph.poses
+    return lie.inverse(lie.inverse(poses[i]) @ poses[i + step]) @ T_ij @ lie.inverse(poses[j]) @ poses[j + step]
+
+
+def try_wrong_loops(path, share, kind, seed, robust="truncated"):
+    """Optimise with and without them."""
+    clean = read_g2o(path).graph
+    clean.optimise(GraphConfig())
+    alone = read_g2o(path, loops="suspect").graph
+    alone.optimise(GraphConfig(robust=robust))
+    graph = read_g2o(path, loops="suspect").graph
+    is_wrong = add_wrong_loops(graph, share, kind, np.random.default_rng(seed))
+    answer = graph.optimise(GraphConfig(robust=robust))
+    rejected = np.empty(len(is_wrong), bool)
+    rejected[np.argsort(graph.is_loop, kind="stable")] = answer.rejected
+    return Outcome(
+        float(rejected[is_wrong].mean()),
+        float(rejected[graph.is_loop & ~is_wrong].mean()),
+        ate_m(alone, clean),
+        ate_m(graph, clean),
+        answer.time_s,
+        graph.certify().certified,
+    )
+
+
+def ate_m(graph, reference):
+    ways = [Trajectory(g.stamps_ns, g.poses) for g in (graph, reference)]
+    return absolute_error(pair(*ways, limit_s=0.0), Alignment.RIGID).translation_m.rmse
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("graphs", nargs="*", default=("manhattan", "intel"))
+    parser.add_argument("--shares", type=float, nargs="+", default=(0.1, 0.3, 0.5))
+    parser.add_argument("--kinds", nargs="+", default=KINDS)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--robust", default="truncated")
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "graphs")
+    options = parser.parse_args()
+    print(
+        f"{'graph':12} {'kind':9} {'added':>6} {'seed':>4} {'wrong rejected':>15} {'true rejected':>14} "
+        f"{'ATE m':>9} {'without':>9} {'time s':>7}"
+    )
+    for name in options.graphs:
+        for kind in options.kinds:
+            for share in options.shares:
+                for seed in range(options.seeds):
+                    o = try_wrong_loops(options.data / f"{name}.g2o", share, kind, seed, options.robust)
+                    print(
+                        f"{name:12} {kind:9} {100 * share:5.0f}% {seed:4d} {100 * o.wrong_rejected:14.2f}% "
+                        f"{100 * o.true_rejected:13.2f}% {o.ate_m:9.4f} {o.ate_clean_m:9.4f} {o.time_s:7.2f}",
+                        flush=True,
+                    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""A pose graph before and after optimisation as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from pipeline.data import GraphState
+from pipeline.errors import InputError
+from pipeline.graph.optimisation import GraphChange
+from viz import entities, shapes
+from viz.messages import Message, Times
+from viz.sinks import file_sink, open_stream
+
+
+def record_graph(change: GraphChange, path: Path) -> None:
+    """Write a .rrd file: the timeline ``scan`` is 0 before and 1 after, edges are coloured by verdict."""
+    stream = open_stream(change.name, change.after.poses.shape[-1] - 1, uuid4())
+    layout = rrb.Blueprint(
+        rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=rrb.LineGrid3D(visible=False)),
+        rrb.TimePanel(timeline="scan", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+    sink = file_sink(path, stream, layout)
+    sink.send([Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)])
+    accepted = np.zeros_like(change.rejected)
+    sink.send([*_messages(change.before, accepted, 0), *_messages(change.after, change.rejected, 1)])
+    sink.close()
+    for warning in sink.warnings:
+        raise InputError(f"{path}: {warning}")
+
+
+def _messages(state: GraphState, rejected: NDArray[np.bool_], when: int) -> list[Message]:
+    """Nodes, chain, loops and rejected edges at one instant."""
+    times = Times.at(when, when)
+    nodes = shapes.positions(state.poses)
+    skips = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
+    dots = rr.Points3D.columns(
+        positions=nodes, colors=[entities.VIOLET] * len(nodes), radii=[entities.pixels(1.5)] * len(nodes)
+    )
+    kinds = (
+        (entities.ODOMETRY_EDGES, ~skips & ~rejected, entities.GREY),
+        (entities.ACCEPTED, skips & ~rejected, entities.GREEN),
+        (entities.REJECTED, rejected, entities.RED),
+    )
+    lines = [_lines(entity, nodes[state.edges[chosen]], colour, times) for entity, chosen, colour in kinds]
+    return [Message(entities.KEYFRAMES, dots.partition([len(nodes)]), times), *lines]
+
+
+def _lines(entity: str, strips: NDArray[np.float32], colour: tuple[int, int, int], times: Times) -> Message:
+    columns = rr.LineStrips3D.columns(
+        strips=strips, colors=[colour] * len(strips), radii=[entities.pixels(0.75)] * len(strips)
+    )
+    return Message(entity, columns.partition([len(strips)]), times)
