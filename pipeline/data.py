@@ -125,6 +125,7 @@ class Keyframe:
     points : (M, d) deskewed points, lidar frame
     T_odom_lidar : pose in the odometry frame
     travelled_m : length of the way up to it, by odometry
+    scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
     index: int
@@ -133,6 +134,7 @@ class Keyframe:
     points: Points
     T_odom_lidar: Pose
     travelled_m: float
+    scale: float = 1.0
 
 
 class Verdict(StrEnum):
@@ -142,12 +144,20 @@ class Verdict(StrEnum):
     REJECTED = "rejected"
 
 
+class Proposal(StrEnum):
+    """What a loop closure was tried for."""
+
+    POSITION = "position"
+    PLACE = "place"
+
+
 @dataclass(frozen=True, slots=True)
 class Closure:
     """A proposed loop closure: the later keyframe ``source`` seen from the earlier ``target``.
 
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
-    ``overlap`` is the share of source points that lie on the target's surfaces after matching.
+    ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``chi2_before`` is
+    what the graph said of it before it was added, NaN if it never was.
     """
 
     target: int
@@ -156,6 +166,8 @@ class Closure:
     overlap: float
     verdict: Verdict
     reason: str
+    proposed_by: Proposal = Proposal.POSITION
+    chi2_before: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,7 +98,9 @@ class Slam:
         )
 
     def finish(self) -> SlamResult:
-        """Optimise once more and spread the corrections over all scans."""
+        """Close what is left, optimise once more and spread the corrections over all scans."""
+        if self.config.loops.enabled:
+            self._take(self.closer.finish(self.keyframes, self.graph.poses))
         state = self._optimise()
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
@@ -131,6 +133,7 @@ class Slam:
             points=tracked.points,
             T_odom_lidar=tracked.T_odom_lidar,
             travelled_m=self.travelled_m,
+            scale=self.odometry.local_map.scale,
         )
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
         if self.keyframes:
@@ -154,7 +157,10 @@ class Slam:
         return distance_m > config.keyframe_distance_m or float(lie.rotation_angle(T)) > config.keyframe_angle_rad
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        closures = self.closer.close(self.keyframes, self.graph.poses)
+        return self._take(self.closer.close(self.keyframes, self.graph.poses))
+
+    def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """Keep closures; those accepted become edges of the graph."""
         config = self.config.loops
         for closure in closures:
             self.closures.append(closure)

@@ -9,8 +9,9 @@ import numpy as np
 from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Closure, Keyframe, Match, Matrix, Points, Pose, Verdict
-from pipeline.kernels.association import associate
+from pipeline.loops.place_closer import PlaceCloser
 from pipeline.loops.submaps import Submaps
+from pipeline.loops.verification import overlap as overlap_of
 from pipeline.matching import PointToShapeMatcher, VoxelMap
 from pipeline.preprocess import downsample
 
@@ -23,19 +24,29 @@ class LoopCloser:
         self.match_voxel_m = config.preprocess.match_voxel_m
         self.matcher = PointToShapeMatcher(config.matching)
         self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map)
+        self.places = PlaceCloser(config) if dimension == 3 and config.loops.recognise_places else None
 
     def close(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to the nearest older place, accepted or not.
+        """Closures of the newest keyframe to the nearest older place, and of places recognised; accepted or not.
 
         keyframes : all so far; T_world_keyframes : (K, d+1, d+1) their best known poses
         """
+        places = () if self.places is None else self.places.close(keyframes, T_world_keyframes)
+        return self._close_near(keyframes, T_world_keyframes) + places
+
+    def finish(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
+        """Closures of the places that waited for more of their surroundings to be seen."""
+        return () if self.places is None else self.places.close(keyframes, T_world_keyframes, finish=True)
+
+    def _close_near(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
+        """The closure of the newest keyframe to the nearest older place."""
         source = keyframes[-1]
         target = self._nearest(keyframes, T_world_keyframes)
         if target < 0:
             return ()
         T_predicted = lie.inverse(T_world_keyframes[target]) @ T_world_keyframes[source.index]
         submap = self.submaps.around(target, keyframes, self._newest_old(keyframes))
-        points = downsample(source.points, self.match_voxel_m)
+        points = downsample(source.points, submap.scale * self.match_voxel_m)
         match = self.matcher.align(points, submap, T_predicted, wide=True)
         return (self._judge(target, source.index, match, points, submap, T_predicted),)
 
@@ -64,7 +75,7 @@ class LoopCloser:
     def _judge(
         self, target: int, source: int, match: Match, points: Points, submap: VoxelMap, T_predicted: Pose
     ) -> Closure:
-        overlap = _overlap(points, match.T_target_source, submap)
+        overlap = overlap_of(points, match.T_target_source, submap)
         moved_m = float(np.linalg.norm((lie.inverse(T_predicted) @ match.T_target_source)[:-1, -1]))
         problem = self._problem(match, overlap, moved_m)
         verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
@@ -82,9 +93,3 @@ class LoopCloser:
         if moved_m > limits.max_radius_m:
             return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
         return ""
-
-
-def _overlap(points: Points, T: Pose, submap: VoxelMap) -> float:
-    """Share of the points that lie within a voxel of the submap's surfaces."""
-    partner = np.empty(len(points), np.int32)
-    return associate(submap.voxels, points, T, 1, submap.config.voxel_size_m, partner) / len(points)
