@@ -133,6 +133,7 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     place_drift: Positive = 0.1
     min_likeness: Share = 0.45
     min_place_overlap: Share = 0.4
+    min_place_information: NonNegative = 0.005
     min_agreement: Share = 0.75
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.data import Matrix
 from pipeline.loops.place import Place
 
 _GROWTH = 1.25  # of the number of places, before the tree is built anew
@@ -42,6 +43,12 @@ class Gallery:
             found += np.atleast_1d(self.tree.query(place.key, min(count, self.planted))[1]).tolist()
         distance = [_square(self.places[index].key - place.key) for index in found]
         return [self.places[found[rank]] for rank in np.argsort(distance, kind="stable")[:count]]
+
+    def nearest(self, T_world_keyframes: Matrix, position: NDArray[np.float64], count: int) -> list[Place]:
+        """The places nearest to a position (3,) in the world, of those that ``alike`` was last asked about."""
+        anchors = [place.anchor for place in self.places]
+        distance_m = np.linalg.norm(T_world_keyframes[anchors, :3, 3] - position, axis=1)
+        return [self.places[index] for index in np.argsort(distance_m, kind="stable")[:count]]
 
 
 def _square(v: NDArray[np.float32]) -> float:

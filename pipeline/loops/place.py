@@ -18,6 +18,7 @@ SIZE = 128  # cells along each side of a view
 _ANGLES = 64  # steps of half a turn
 _FREQUENCIES = np.arange(2.0, 34.0)  # periods in a view
 _BANDS, _HARMONICS = 16, 5  # of the key
+_WEIGHT_OF_MEAN = 0.3  # of the harmonic 0 in the key
 _BLUR = 0.7  # cells
 _STEPS = 16.0  # of an image in 8 bits, per unit
 
@@ -90,20 +91,24 @@ def describe(surroundings: LocalMap, T_anchor_level: Pose) -> Place:
     )
 
 
-def compare(source: Place, target: Place) -> Likeness:
-    """Where the source lies in the target: heading by the spectra, which leave it open by half a turn, then shift."""
-    heading = _heading(source.spectrum, target.spectrum)
+def compare(source: Place, target: Place, *, expected_rad: float = 0.0, within_rad: float = np.pi) -> Likeness:
+    """Where the source lies in the target: heading by the spectra, which leave it open by half a turn, then shift.
+
+    The heading is looked for within so many radians of the expected one.
+    """
+    heading, is_open = _heading(source.spectrum, target.spectrum, expected_rad, within_rad)
     fixed = target.image * _INSIDE
     turned = _turned(source.image.astype(np.float32), heading) * _INSIDE
-    norm = np.sqrt(np.square(fixed).sum() * np.square(turned).sum())
+    norm = max(float(np.sqrt(np.square(fixed).sum() * np.square(turned).sum())), 1e-9)
     fixed_spectrum, turned_spectrum = fft.rfft2(fixed), fft.rfft2(turned)
-    ahead = _shift(fft.irfft2(fixed_spectrum * turned_spectrum.conj(), (SIZE, SIZE)), 0)
-    # half a turn about the middle reverses both axes, which is conjugation and a shift by one cell
-    back = _shift(fft.irfft2(fixed_spectrum * turned_spectrum, (SIZE, SIZE)), 1 - SIZE)
-    (correlation, x, y), half_turn = (ahead, 0.0) if ahead[0] >= back[0] else (back, np.pi)
-    T_level = lie.lift(lie.pose_2d(x * target.cell_m, y * target.cell_m, heading + half_turn))
+    correlation, x, y = _shift(fft.irfft2(fixed_spectrum * turned_spectrum.conj(), (SIZE, SIZE)), 0)
+    if is_open:  # the other half turn reverses both axes, which is conjugation and a shift by one cell
+        back = _shift(fft.irfft2(fixed_spectrum * turned_spectrum, (SIZE, SIZE)), 1 - SIZE)
+        if back[0] > correlation:
+            (correlation, x, y), heading = back, heading + np.pi
+    T_level = lie.lift(lie.pose_2d(x * target.cell_m, y * target.cell_m, heading))
     T_target_source = target.T_anchor_level @ T_level @ lie.inverse(source.T_anchor_level)
-    return Likeness(T_target_source, correlation / max(float(norm), 1e-9))
+    return Likeness(T_target_source, correlation / norm)
 
 
 def _key_of(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -115,18 +120,22 @@ def _key_of(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
     return key / max(float(np.linalg.norm(key)), 1e-9)
 
 
-_WEIGHT_OF_MEAN = 0.3
+def _heading(
+    source: NDArray[np.float32], target: NDArray[np.float32], expected_rad: float, within_rad: float
+) -> tuple[float, bool]:
+    """Turn of the source that makes its spectrum the target's, and whether the opposite one is as good.
 
-
-def _heading(source: NDArray[np.float32], target: NDArray[np.float32]) -> float:
-    """Turn of the source that makes its spectrum the target's, in (−π, 0]; a parabola refines the best step."""
+    A parabola refines the best of the steps.
+    """
     product = fft.rfft(target, axis=1) * fft.rfft(source, axis=1).conj()
     likeness = fft.irfft(product.sum(axis=0), _ANGLES)
-    best = int(likeness.argmax())
+    off_rad = np.abs(lie.wrap(np.arange(2 * _ANGLES) * (np.pi / _ANGLES) - expected_rad)).reshape(2, _ANGLES)
+    best = int(np.where(off_rad.min(axis=0) <= within_rad, likeness, -np.inf).argmax())
     left, middle, right = likeness[best - 1], likeness[best], likeness[(best + 1) % _ANGLES]
     bend = left - 2.0 * middle + right
-    offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    return float((best + offset) * np.pi / _ANGLES)
+    offset = 0.5 * (left - right) / bend if bend < min(-abs(left - right), 0.0) else 0.0
+    half = int(off_rad[:, best].argmin())
+    return float((half * _ANGLES + best + offset) * np.pi / _ANGLES), bool(off_rad[:, best].max() <= within_rad)
 
 
 def _turned(image: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Matrix, Verdict
+from pipeline.data import Closure, Keyframe, Matrix, Pose, Verdict
 from pipeline.loops.local_map import FUTURE, PAST, LocalMap, local_map
 from pipeline.loops.place import describe
 from pipeline.loops.recognition import Candidate, Recognition
@@ -31,6 +31,7 @@ class PlaceCloser:
         self.verifier = Verifier(config)
         self.examined = 0
         self.next_m = 0.0
+        self.last: Closure | None = None
 
     def close(
         self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix, *, finish: bool = False
@@ -62,14 +63,29 @@ class PlaceCloser:
         surroundings = local_map(keyframes, anchor.index, radius_m)
         place = describe(surroundings, level_frame(anchor, self.map_config))
         apart_m = max((PAST + FUTURE) * radius_m, self.config.min_travel_m)  # no scan belongs to both
-        before_m = anchor.travelled_m - apart_m
-        for candidate in self.recognition.candidates(place, radius_m, keyframes, T_world, before_m):
+        candidates = self.recognition.candidates(
+            place,
+            self._expected(anchor, keyframes, T_world),
+            before_m=anchor.travelled_m - apart_m,
+            radius_m=radius_m,
+            keyframes=keyframes,
+            T_world=T_world,
+        )
+        for candidate in candidates:
             target = local_map(keyframes, candidate.target, radius_m)
             measured = self.verifier.measure(surroundings, target, candidate.likeness.T_target_source)
             closure = self._judge(candidate, surroundings, target, measured, T_world)
             yield closure
             if closure.verdict is Verdict.ACCEPTED:
+                self.last = closure
                 return
+
+    def _expected(self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
+        """T_world_lidar by odometry since the last closure; that one may not have moved the map yet."""
+        if self.last is None:
+            return T_world[anchor.index]
+        T_last_anchor = lie.inverse(keyframes[self.last.source].T_odom_lidar) @ anchor.T_odom_lidar
+        return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
 
     def _radius_m(self, anchor: Keyframe) -> float:
         return self.config.place_radius_m * anchor.scale
@@ -99,9 +115,10 @@ class PlaceCloser:
             return match.reason
         if measured.overlap < limits.min_place_overlap:
             return f"overlap {measured.overlap:.2f} < loops.min_place_overlap ({limits.min_place_overlap:g})"
-        if match.degeneracy_eigenvalue < limits.min_information:
+        if match.degeneracy_eigenvalue < limits.min_place_information:
             return (
-                f"information {match.degeneracy_eigenvalue:.1e} < loops.min_information ({limits.min_information:g})"
+                f"information {match.degeneracy_eigenvalue:.1e} < "
+                f"loops.min_place_information ({limits.min_place_information:g})"
             )
         if measured.agreement < limits.min_agreement:
             return f"agreement {measured.agreement:.2f} < loops.min_agreement ({limits.min_agreement:g})"

@@ -14,6 +14,8 @@ from pipeline.loops.gallery import Gallery
 from pipeline.loops.place import Likeness, Place, compare
 
 _CANDIDATES = 10  # compared in full, of the places whose keys are alike
+_NEAREST = 3  # compared in full, of those near to where odometry has the place
+_HEADING_RAD = 0.5  # how far odometry's heading may be off
 _RIVAL = 0.9  # of the best likeness, from which on another place is as good
 _APART = 0.25  # radii between two answers that are not the same
 
@@ -36,11 +38,19 @@ class Recognition:
         self.galleries: dict[float, Gallery] = {}
 
     def candidates(
-        self, place: Place, radius_m: float, keyframes: Sequence[Keyframe], T_world: Matrix, before_m: float
+        self,
+        place: Place,
+        T_world_place: Pose,
+        *,
+        before_m: float,
+        radius_m: float,
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
     ) -> list[Candidate]:
-        """At most two older places, passed before so many metres; the most likely first. The new one is kept.
+        """At most two older places: the most alike, and the nearest to where the new one should be; it is kept.
 
-        T_world : (K, 4, 4) best known poses of the keyframes
+        T_world_place : where the new one should be; T_world : (K, 4, 4) best known poses of the keyframes
+        before_m : way until which places count as old
         """
         anchor = keyframes[place.anchor]
         gallery = self.galleries.setdefault(anchor.scale, Gallery())
@@ -48,12 +58,12 @@ class Recognition:
         gallery.add(place, anchor.travelled_m)
         if not alike:
             return []
-        found = [self._by_looks(place, alike, radius_m, keyframes, T_world)]
-        near = gallery.places[int(np.argmin(_distances_m(gallery, place, T_world)))]
-        found.append(Candidate(near.anchor, compare(place, near), Proposal.POSITION))
-        return [each for each in found if self._is_likely(each, place.anchor, keyframes, T_world)]
+        best = self._most_alike(place, alike, radius_m, keyframes, T_world)
+        found = [best] if best.likeness.score >= self.config.min_likeness else []
+        near = gallery.nearest(T_world, T_world_place[:3, 3], _NEAREST)
+        return found + self._most_alike_here(place, near, T_world_place, keyframes, T_world)
 
-    def _by_looks(
+    def _most_alike(
         self, place: Place, alike: Sequence[Place], radius_m: float, keyframes: Sequence[Keyframe], T_world: Matrix
     ) -> Candidate:
         """The most similar of several places, and whether another one contradicts it.
@@ -72,21 +82,35 @@ class Recognition:
                 return Candidate(target, best, Proposal.PLACE, rival=other)
         return Candidate(target, best, Proposal.PLACE)
 
-    def _is_likely(self, candidate: Candidate, source: int, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-        """Whether a candidate is worth a closer look."""
-        if candidate.proposed_by is Proposal.PLACE:
-            return candidate.likeness.score >= self.config.min_likeness
-        moved_m = np.linalg.norm(_position(T_world, candidate.target, candidate.likeness) - T_world[source, :3, 3])
-        travelled_m = keyframes[source].travelled_m - keyframes[candidate.target].travelled_m
-        limits = self.config
-        return bool(moved_m <= np.clip(limits.drift * travelled_m, limits.min_radius_m, limits.max_radius_m))
+    def _most_alike_here(
+        self,
+        place: Place,
+        near: Sequence[Place],
+        T_world_place: Pose,
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+    ) -> list[Candidate]:
+        """The most similar of the nearest places that leave the new one about where it should be, if any does."""
+        found: list[Candidate] = []
+        for other in near:
+            T_expected = lie.inverse(T_world[other.anchor] @ other.T_anchor_level) @ T_world_place @ place.T_anchor_level
+            likeness = compare(place, other, expected_rad=_yaw(T_expected), within_rad=_HEADING_RAD)
+            moved_m = np.linalg.norm(_position(T_world, other.anchor, likeness) - T_world_place[:3, 3])
+            travelled_m = keyframes[place.anchor].travelled_m - keyframes[other.anchor].travelled_m
+            if moved_m <= search_radius_m(self.config, travelled_m):
+                found.append(Candidate(other.anchor, likeness, Proposal.POSITION))
+        return sorted(found, key=lambda each: -each.likeness.score)[:1]
 
 
-def _distances_m(gallery: Gallery, place: Place, T_world: Matrix) -> Matrix:
-    anchors = [other.anchor for other in gallery.places]
-    return np.linalg.norm(T_world[anchors, :3, 3] - T_world[place.anchor, :3, 3], axis=1)
+def search_radius_m(config: LoopsConfig, travelled_m: float) -> float:
+    """How far from where odometry says a place is looked for, so many metres of the way later."""
+    return float(np.clip(config.drift * travelled_m, config.min_radius_m, config.max_radius_m))
 
 
 def _position(T_world: Matrix, target: int, likeness: Likeness) -> Matrix:
     """Where the source would be in the world, (3,)."""
     return (T_world[target] @ likeness.T_target_source)[:3, 3]
+
+
+def _yaw(T: Pose) -> float:
+    return float(np.arctan2(T[1, 0], T[0, 0]))

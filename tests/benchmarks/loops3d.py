@@ -7,8 +7,8 @@ turned left by ``--turn`` and up by a quarter of that, radians a metre, before t
 
 A keyframe is a revisit where the truth has it within 5 m of an older one that lies 100 m or more of the way back,
 and an opposite one where all those were driven the other way (headings 135° apart or more). It is found where an
-accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 1 m and
-3° of the truth: precision is the share of true ones among those accepted in the end. ATE is over all scans, after
+accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 2 m and
+3° of the truth (odometry bends the local maps, too): precision is the share of true ones among those accepted in the end. ATE is over all scans, after
 alignment, with drift and after closure.
 """
 
@@ -35,7 +35,7 @@ from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
 
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
-TRUE_M, TRUE_RAD = 1.0, np.radians(3.0)
+TRUE_M, TRUE_RAD = 2.0, np.radians(3.0)
 
 
 class DriftingOdometry:
