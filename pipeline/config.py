@@ -114,7 +114,7 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     In 3D, places are also recognised by their looks from above, as far as ``place_radius_m`` around where voxels
     have their full size, wherever odometry has them within ``place_drift`` metres a metre. They look alike from
     ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces and
-    ``min_agreement`` of those in sight do so.
+    ``min_agreement`` of as many of those in sight do so as within either view alone.
     """
 
     enabled: bool = True
@@ -134,7 +134,7 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_likeness: Share = 0.45
     min_place_overlap: Share = 0.4
     min_place_information: NonNegative = 0.005
-    min_agreement: Share = 0.75
+    min_agreement: Share = 0.87
 
 
 class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -157,7 +157,7 @@ class Closure:
 
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
     ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``chi2_before`` is
-    what the graph said of it before it was added, NaN if it never was.
+    its χ² in the graph as it was before it became an edge, NaN if it never did.
     """
 
     target: int
@@ -182,6 +182,7 @@ class GraphState:
     is_loop : (E,) bool
     weight : (E,) robust weight in [0, 1] that the optimiser left to each edge; 1 for odometry
     chi2 : Σ eᵀΩe
+    edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
     """
 
     poses: Matrix
@@ -190,6 +191,7 @@ class GraphState:
     is_loop: NDArray[np.bool_]
     weight: NDArray[np.float64]
     chi2: float
+    edge_chi2: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,20 +161,24 @@ class Slam:
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
+        taken = tuple(
+            self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
+        )
+        self.closures += taken
+        return taken
+
+    def _add(self, closure: Closure) -> Closure:
+        """Make an edge of a closure, which is returned with what the graph said of it before."""
         config = self.config.loops
-        for closure in closures:
-            self.closures.append(closure)
-            if closure.verdict is Verdict.ACCEPTED:
-                self.waiting_closures += 1
-                self.surprising |= self._moves_the_map(closure)
-                self.graph.add_edge(
-                    closure.target,
-                    closure.source,
-                    closure.match.T_target_source,
-                    edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad),
-                    is_loop=True,
-                )
-        return closures
+        information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
+        Z_ij = closure.match.T_target_source
+        error = lie.log(
+            lie.inverse(Z_ij) @ lie.inverse(self.graph.poses[closure.target]) @ self.graph.poses[closure.source]
+        )
+        self.waiting_closures += 1
+        self.surprising |= self._moves_the_map(closure)
+        self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
+        return replace(closure, chi2_before=float(error @ information @ error))
 
     def _moves_the_map(self, closure: Closure) -> bool:
         """Whether the closure is further from what the graph says than its own error explains."""

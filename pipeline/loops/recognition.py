@@ -70,7 +70,9 @@ class Recognition:
 
         Two that are the same place, but for what the map may have drifted between them, do not contradict.
         """
-        ranked = sorted(((compare(place, other), other.anchor) for other in alike), key=lambda each: -each[0].score)
+        ranked = sorted(
+            ((compare(place, other), other.anchor) for other in alike), key=lambda each: -each[0].score
+        )
         best, target = ranked[0]
         here = _position(T_world, target, best)
         for likeness, other in ranked[1:]:
@@ -93,7 +95,9 @@ class Recognition:
         """The most similar of the nearest places that leave the new one about where it should be, if any does."""
         found: list[Candidate] = []
         for other in near:
-            T_expected = lie.inverse(T_world[other.anchor] @ other.T_anchor_level) @ T_world_place @ place.T_anchor_level
+            T_expected = (
+                lie.inverse(T_world[other.anchor] @ other.T_anchor_level) @ T_world_place @ place.T_anchor_level
+            )
             likeness = compare(place, other, expected_rad=_yaw(T_expected), within_rad=_HEADING_RAD)
             moved_m = np.linalg.norm(_position(T_world, other.anchor, likeness) - T_world_place[:3, 3])
             travelled_m = keyframes[place.anchor].travelled_m - keyframes[other.anchor].travelled_m

@@ -26,7 +26,8 @@ class Measurement:
     ----------
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
-    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both ways
+    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both ways, of
+        the share that either map has with itself
     """
 
     match: Match
@@ -46,16 +47,20 @@ class Verifier:
         scale = source.anchor.scale
         fine_m = scale * self.config.preprocess.match_voxel_m
         surfaces, dense = target.points(), source.points()
-        points = downsample(dense, fine_m)
         rough = self._align(downsample(dense, _COARSE * fine_m), surfaces, T_first, _COARSE * scale)
         voxels = self._voxels(surfaces, scale)
+        points, others = downsample(dense, fine_m), downsample(surfaces, fine_m)
         match = self.matcher.align(points, voxels, rough.T_target_source)
-        T = match.T_target_source
-        agreement = min(
-            free_space_agreement(target, points, T, voxels.voxels.size_m),
-            free_space_agreement(source, downsample(surfaces, fine_m), lie.inverse(T), voxels.voxels.size_m),
+        T, margin_m = match.T_target_source, voxels.voxels.size_m
+        both_ways = min(
+            free_space_agreement(target, points, T, margin_m),
+            free_space_agreement(source, others, lie.inverse(T), margin_m),
         )
-        return Measurement(match, overlap(points, T, voxels), agreement)
+        alone = min(
+            free_space_agreement(source, points, lie.identity(3), margin_m),
+            free_space_agreement(target, others, lie.identity(3), margin_m),
+        )
+        return Measurement(match, overlap(points, T, voxels), both_ways / max(alone, 1e-9))
 
     def _align(self, points: Points, surfaces: Points, T_first: Pose, scale: float) -> Match:
         return self.matcher.align(points, self._voxels(surfaces, scale), T_first, wide=True)
