@@ -8,7 +8,7 @@ FAR = 1e9  # m, in bins that no ray fell into
 
 @njit(cache=True, nogil=True)
 def nearest_ranges(points, ranges_m):
-    """Fill ``ranges_m`` (E, A) with the least range of all points in each bin of direction, FAR where there is none.
+    """Fill ``ranges_m`` (E, A) with the least range in each bin of direction, FAR where no point is.
 
     points : (N, 3) metres, lidar frame; rows are E equal steps of elevation from −π/2 to π/2, columns A equal
     steps of azimuth from −π
@@ -22,7 +22,7 @@ def nearest_ranges(points, ranges_m):
 
 @njit(cache=True, nogil=True)
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
-    """How many points (N, 3), moved by T (4, 4) into the lidar's frame, agree with its ranges, and how many do not.
+    """How many points (N, 3), moved by T (4, 4) into the lidar's frame, agree with its ranges and contradict.
 
     A point agrees where its range is that of its bin, within the margin: so many metres and such a share of the
     range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.data import Matrix
 from pipeline.loops.place import Place
@@ -16,15 +16,15 @@ _SLACK = 16  # places that may wait outside the tree in any case
 
 
 class Gallery:
-    """Places by their keys, in a tree that is built anew as their number grows; those since then are tried in turn.
+    """Places by their keys, in a tree that is built anew as they become more; those since then are tried in turn.
 
-    All building together takes little more than a few times the last, and asking about the logarithm of the number.
+    To build it again and again takes but a few times as long as to build the last one.
     """
 
     def __init__(self) -> None:
         self.places: list[Place] = []
         self.waiting: deque[tuple[float, Place]] = deque()
-        self.tree: cKDTree | None = None
+        self.tree: KDTree | None = None
         self.planted = 0
 
     def add(self, place: Place, travelled_m: float) -> None:
@@ -36,7 +36,7 @@ class Gallery:
         while self.waiting and self.waiting[0][0] <= before_m:
             self.places.append(self.waiting.popleft()[1])
         if len(self.places) > _GROWTH * self.planted + _SLACK:
-            self.tree = cKDTree([each.key for each in self.places])
+            self.tree = KDTree([each.key for each in self.places])
             self.planted = len(self.places)
         found = list(range(self.planted, len(self.places)))
         if self.tree is not None:

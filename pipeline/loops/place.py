@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import fft
 from numpy.typing import NDArray
-from scipy import fft
 from scipy.ndimage import affine_transform, gaussian_filter, map_coordinates
 
 from pipeline import lie
@@ -34,6 +34,7 @@ def _disc() -> NDArray[np.float32]:
 
 
 _POLAR = _polar_grid()
+_HEADINGS: NDArray[np.float64] = np.linspace(0.0, 2.0 * np.pi, 2 * _ANGLES, endpoint=False)
 _RADIUS = _disc()  # of every cell, 1 at the rim and beyond
 _WINDOW = np.cos(0.5 * np.pi * _RADIUS)
 _INSIDE = (_RADIUS < 1.0).astype(np.float32)
@@ -64,7 +65,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """How one place lies in another: pose between their anchors, and correlation of the images there, 1 at most."""
+    """How one place lies in another: pose between the anchors, and correlation of the images there, up to 1."""
 
     T_target_source: Pose
     score: float
@@ -117,7 +118,7 @@ def _key_of(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
     strength = np.abs(fft.rfft(bands, axis=1))[:, :_HARMONICS]
     strength[:, 0] = _WEIGHT_OF_MEAN * (strength[:, 0] - strength[:, 0].mean())
     key = strength.ravel()
-    return key / max(float(np.linalg.norm(key)), 1e-9)
+    return (key / max(float(np.linalg.norm(key)), 1e-9)).astype(np.float32)
 
 
 def _heading(
@@ -129,7 +130,7 @@ def _heading(
     """
     product = fft.rfft(target, axis=1) * fft.rfft(source, axis=1).conj()
     likeness = fft.irfft(product.sum(axis=0), _ANGLES)
-    off_rad = np.abs(lie.wrap(np.arange(2 * _ANGLES) * (np.pi / _ANGLES) - expected_rad)).reshape(2, _ANGLES)
+    off_rad = np.abs(lie.wrap(_HEADINGS - expected_rad)).reshape(2, _ANGLES)
     best = int(np.where(off_rad.min(axis=0) <= within_rad, likeness, -np.inf).argmax())
     left, middle, right = likeness[best - 1], likeness[best], likeness[(best + 1) % _ANGLES]
     bend = left - 2.0 * middle + right
@@ -143,10 +144,11 @@ def _turned(image: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     back = np.array([[c, -s], [s, c]])  # from (row, column) of the result to that of the image
     middle = np.full(2, 0.5 * (SIZE - 1))
-    return affine_transform(image, back, middle - back @ middle, order=1, output=np.float32)
+    offset = middle - back @ middle
+    return np.asarray(affine_transform(image, back, offset, order=1), np.float32)  # pyright: ignore[reportArgumentType]
 
 
-def _shift(correlation: NDArray[np.float32], offset: int) -> tuple[float, float, float]:
+def _shift(correlation: NDArray[np.float64], offset: int) -> tuple[float, float, float]:
     """Greatest correlation within half the radius, and the shift there in cells along x and y."""
     reach = SIZE // 4
     near = np.arange(-reach, reach + 1)

@@ -26,8 +26,8 @@ class Measurement:
     ----------
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
-    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both ways, of
-        the share that either map has with itself
+    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both ways,
+        divided by the share that either map has with itself
     """
 
     match: Match

@@ -55,7 +55,7 @@ def write_closures(
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
         "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
         "proposed_by": "position: near by odometry; place: looked alike wherever odometry has it",
-        "chi2_before chi2_after": "of its edge, before it entered the graph and at the end; null where it never did",
+        "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
         "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
     }
     pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.data import Matrix
 from pipeline.simulate.solids import Scenery, Solids
 from pipeline.simulate.walls import CEILING_M, Wall, build_wall
 
@@ -13,17 +14,24 @@ _HALF_M = 1.0  # of a corridor's width
 _CORRIDORS_Y_M = (0.0, 14.0, 28.0)  # their middles; rooms lie back to back between them
 _WEST_M, _EAST_M = -_HALF_M, _LENGTH_M + _HALF_M  # middles of the two corridors that join them
 
-# Along each corridor and through rooms of each, then back through the first one, the other way.
+# Along each corridor and through rooms of each, back through the first one, and round by two rooms to the start.
 ROUTE = np.array([
-    [0.0, 0.0], [7.5, 0.0], [7.5, 4.0], [12.5, 4.0], [12.5, 0.0], [27.5, 0.0], [27.5, -4.0], [32.5, -4.0],
-    [32.5, 0.0], [_EAST_M, 0.0], [_EAST_M, 14.0], [22.5, 14.0], [22.5, 10.0], [17.5, 10.0], [17.5, 14.0],
-    [_WEST_M, 14.0], [_WEST_M, 28.0], [7.5, 28.0], [7.5, 32.0], [12.5, 32.0], [12.5, 28.0], [_EAST_M, 28.0],
-    [_EAST_M, 0.0], [32.5, 0.0], [32.5, -4.0], [27.5, -4.0], [27.5, 0.0], [_WEST_M, 0.0],
+    [7.5, 0.0], [27.5, 0.0], [27.5, -4.0], [32.5, -4.0], [32.5, 0.0], [_EAST_M, 0.0], [_EAST_M, 14.0],
+    [22.5, 14.0], [22.5, 10.0], [17.5, 10.0], [17.5, 14.0], [_WEST_M, 14.0], [_WEST_M, 28.0], [7.5, 28.0],
+    [7.5, 32.0], [12.5, 32.0], [12.5, 28.0], [_EAST_M, 28.0], [_EAST_M, 0.0], [32.5, 0.0], [32.5, -4.0],
+    [27.5, -4.0], [27.5, 0.0], [12.5, 0.0], [12.5, 4.0], [7.5, 4.0],
+])  # fmt: skip
+
+# In every room: where the middle of a piece stands, from the room's, and how long, wide and high it is.
+_FURNITURE_M = np.array([
+    [1.7, 2.4, 1.4, 0.8, 0.74], [1.5, 1.6, 0.45, 0.45, 0.9], [-1.75, 2.65, 1.2, 0.4, 1.9],
+    [-2.15, -1.8, 0.4, 1.2, 1.2], [2.15, -2.0, 0.5, 0.6, 2.0],
 ])  # fmt: skip
 
 
 def identical(rng: np.random.Generator) -> Solids:
-    """The floor; nothing in it is drawn at random."""
+    """The floor; what ``rng`` draws is the same in all rooms."""
+    furniture = _FURNITURE_M + rng.uniform(-0.1, 0.1, _FURNITURE_M.shape)
     scenery = Scenery()
     middle = (0.5 * _LENGTH_M, _CORRIDORS_Y_M[1])
     scenery.box(middle, (_LENGTH_M + 6.0, 46.0), (CEILING_M, CEILING_M + 0.2))
@@ -32,7 +40,7 @@ def identical(rng: np.random.Generator) -> Solids:
     for y in _CORRIDORS_Y_M:
         for side in (-1.0, 1.0):
             for room in range(_ROOMS):
-                _furnish(scenery, (room + 0.5) * _ROOM_M, y + side * (_HALF_M + 0.5 * _DEPTH_M), side)
+                _furnish(scenery, (room + 0.5) * _ROOM_M, y + side * (_HALF_M + 0.5 * _DEPTH_M), side, furniture)
     return scenery.finish()
 
 
@@ -55,14 +63,8 @@ def _walls() -> list[Wall]:
     return walls
 
 
-def _furnish(scenery: Scenery, x: float, y: float, side: float) -> None:
+def _furnish(scenery: Scenery, x: float, y: float, side: float, furniture: Matrix) -> None:
     """The same pieces in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
     yaw_rad = 0.0 if side > 0.0 else np.pi
-    for u, v, size, height in (
-        (1.7, 2.4, (1.4, 0.8), 0.74),
-        (1.5, 1.6, (0.45, 0.45), 0.9),
-        (-1.8, 2.7, (1.2, 0.4), 1.9),
-        (-2.2, -1.8, (0.4, 1.2), 1.2),
-        (2.2, -2.0, (0.5, 0.6), 2.0),
-    ):
-        scenery.box((x + side * u, y + side * v), size, (0.0, height), yaw_rad)
+    for u, v, length, width, height in furniture:
+        scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)

@@ -23,15 +23,18 @@ class Wall(NamedTuple):
     leaves: int = 0
 
     def at(self, along_m: float, left_m: float = 0.0) -> tuple[float, float]:
+        """The place so far along the wall and to its left."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return float(self.x0 + c * along_m - s * left_m), float(self.y0 + s * along_m + c * left_m)
 
     @property
     def length_m(self) -> float:
+        """From end to end."""
         return float(np.hypot(self.x1 - self.x0, self.y1 - self.y0))
 
     @property
     def yaw_rad(self) -> float:
+        """Which way it runs."""
         return float(np.arctan2(self.y1 - self.y0, self.x1 - self.x0))
 
 

@@ -1,16 +1,17 @@
 """Loop closure in 3D with drift turned up: how many revisits are found, how many are false, what the map gains.
 
-    python -m tests.benchmarks.loops3d [--sensors hdl-64,...] [--worlds rounds] [--scale 0.01] [--turn 0.0002] [--false 0.3]
+    python -m tests.benchmarks.loops3d [--sensors hdl-64,...] [--worlds rounds] [--scale 0.01]
+        [--turn 0.0002] [--false 0.3]
 
 A world is driven with every sensor; what odometry says of each motion is made longer by ``--scale`` of itself and
 turned left by ``--turn`` and up by a quarter of that, radians a metre, before the rest of the chain sees it.
 
 A keyframe is a revisit where the truth has it within 5 m of an older one that lies 100 m or more of the way back,
 and an opposite one where all those were driven the other way (headings 135° apart or more). It is found where an
-accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 2 m and
-3° of the truth (odometry bends the local maps, too): precision is the share of true ones among those accepted in the end. ATE is over all scans, after
-alignment, with drift and after closure. With ``--false``, wrong closures make up so large a share of those that go
-into the last optimisation; "named" is the share of them that end as rejected.
+accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 2 m
+and 3° of the truth (drift bends the local maps, too): precision is the share of true ones among those accepted in
+the end. ATE is over all scans, after alignment, with drift and after closure. With ``--false``, wrong closures make
+up so large a share of those that go into the last optimisation; "named" is the share of them that end as rejected.
 """
 
 from __future__ import annotations
