@@ -7,7 +7,7 @@ from pipeline import lie
 
 def heights(points, T, cell_m, size):
     """Occupied heights above the lowest one, (size, size), row along y."""
-    cubes = np.floor(lie.transform(T, points) / cell_m).astype(int) + [size // 2, size // 2, 32]
+    cubes = np.floor(lie.transform(T, points) / cell_m).astype(int) + np.array([size // 2, size // 2, 32])
     inside = np.all((cubes >= 0) & (cubes < [size, size, 64]), axis=1)
     columns = {}
     for x, y, z in cubes[inside]:

@@ -25,8 +25,10 @@ RADIUS_M = 32.0
 
 
 def pose(x=0.0, y=0.0, z=0.0, yaw=0.0, pitch=0.0):
-    return lie.exp(np.array([x, y, z, 0, 0, 0.0])) @ lie.exp(np.array([0, 0, 0, 0, 0, yaw])) @ lie.exp(
-        np.array([0, 0, 0, 0, pitch, 0.0])
+    return (
+        lie.exp(np.array([x, y, z, 0, 0, 0.0]))
+        @ lie.exp(np.array([0, 0, 0, 0, 0, yaw]))
+        @ lie.exp(np.array([0, 0, 0, 0, pitch, 0.0]))
     )
 
 
@@ -192,7 +194,7 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
 
 @cache
 def there_and_back(lost_m=0.0):
-    """Keyframes of a street driven, a way elsewhere, and the street again the other way, so far off by odometry."""
+    """Keyframes of a street, and of it again the other way after a detour, odometry so far off."""
     there = passage(street())
     back = passage(street(4.0, True), len(there), there[-1].travelled_m + 120.0)
     shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)

@@ -13,7 +13,7 @@ from pipeline.data import Keyframe, Points, Pose
 
 FUTURE = 1.0  # radii of the way after the anchor
 PAST = 2.0  # and before it: a lidar that looks ahead sees a place from far off
-_POINTS = 200_000  # gathered at most, of keyframes evenly spread over the way
+_POINTS = 80_000  # gathered at most, of keyframes evenly spread over the way
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,9 @@ A keyframe is a revisit where the truth has it within 5 m of an older one that l
 and an opposite one where all those were driven the other way (headings 135° apart or more). It is found where an
 accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 2 m
 and 3° of the truth (drift bends the local maps, too): precision is the share of true ones among those accepted in
-the end. ATE is over all scans, after alignment, with drift and after closure. With ``--false``, wrong closures make
-up so large a share of those that go into the last optimisation; "named" is the share of them that end as rejected.
+the end. ATE is over all scans, after alignment, with drift and after closure. With ``--false``, wrong closures
+make up so large a share of those that go into the last optimisation; "named" is the share of them that end as
+rejected.
 """
 
 from __future__ import annotations
