@@ -113,8 +113,9 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     In 3D, places are also recognised by their looks from above, as far as ``place_radius_m`` around where voxels
     have their full size, wherever odometry has them within ``place_drift`` metres a metre. They look alike from
-    ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces and
-    ``min_agreement`` of as many of those in sight do so as within either view alone.
+    ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
+    ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
+    direction by ``min_place_information``.
     """
 
     enabled: bool = True

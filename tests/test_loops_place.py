@@ -16,6 +16,7 @@ from pipeline.loops.gallery import Gallery
 from pipeline.loops.local_map import local_map
 from pipeline.loops.place import compare, describe
 from pipeline.loops.place_closer import PlaceCloser
+from pipeline.loops.submaps import Submaps
 from pipeline.loops.upright import level_frame
 from pipeline.loops.verification import Verifier
 from pipeline.simulate import plan
@@ -190,6 +191,14 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
     own = here.points()[::20]
     assert free_space_agreement(here, own, lie.identity(3), 1.0) > 0.75
     assert free_space_agreement(here, wall, lie.identity(3), 1.0) < 0.2
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
+    points, T = scan_from(50.0, -2.0, 0.0)
+    submaps = Submaps(3, 5, configured(3).local_map)
+    submap = submaps.around(0, [Keyframe(0, 0, 0, points, T, 0.0, scale)], 0)
+    assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
 
 @cache

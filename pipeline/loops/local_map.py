@@ -46,7 +46,7 @@ def local_map(keyframes: Sequence[Keyframe], anchor: int, radius_m: float) -> Lo
     here_m = keyframes[anchor].travelled_m
     first = bisect_left(keyframes, here_m - PAST * radius_m, key=_travelled_m)
     last = bisect_left(keyframes, here_m + FUTURE * radius_m, key=_travelled_m)
-    return LocalMap(keyframes[anchor], keyframes[first : last + 1], radius_m)
+    return LocalMap(keyframes[anchor], keyframes[first:last], radius_m)
 
 
 def _travelled_m(keyframe: Keyframe) -> float:
