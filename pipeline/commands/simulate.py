@@ -46,7 +46,7 @@ def simulate(
       hall       flat floor, few pillars, from standstill to 5 m/s
       turns      turns on the spot at 120 deg/s and short moves in a yard
       gap        the town, but one second of scans is missing in a bend, and one on a straight
-    All but these of a 2D laser scanner are driven with a 3D lidar unless --sensor says otherwise.
+    All but office and identical are driven with a 3D lidar unless --sensor says otherwise.
 
     \b
     Examples:
