@@ -113,6 +113,12 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     The search radius is what odometry may have drifted since the place was seen, ``drift`` metres a metre, at
     least ``min_radius_m`` and at most ``max_radius_m``.
+
+    In 3D, places are also recognised by their looks from above, as far as ``place_radius_m`` around where voxels
+    have their full size, wherever odometry has them within ``place_drift`` metres a metre. They look alike from
+    ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
+    ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
+    direction by ``min_place_information``.
     """
 
     enabled: bool = True
@@ -126,6 +132,13 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     edge_sigma_m: Positive = 0.05
     edge_sigma_rad: Positive = 0.005
     optimise_every: Count = 10
+    recognise_places: bool = True
+    place_radius_m: Positive = 32.0
+    place_drift: Positive = 0.1
+    min_likeness: Share = 0.45
+    min_place_overlap: Share = 0.4
+    min_place_information: NonNegative = 0.005
+    min_agreement: Share = 0.87
 
 
 class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -130,6 +130,7 @@ class Keyframe:
     points : (M, d) deskewed points, lidar frame
     T_odom_lidar : pose in the odometry frame
     travelled_m : length of the way up to it, by odometry
+    scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
     index: int
@@ -138,6 +139,7 @@ class Keyframe:
     points: Points
     T_odom_lidar: Pose
     travelled_m: float
+    scale: float = 1.0
 
 
 class Verdict(StrEnum):
@@ -147,12 +149,20 @@ class Verdict(StrEnum):
     REJECTED = "rejected"
 
 
+class Proposal(StrEnum):
+    """What a loop closure was tried for."""
+
+    POSITION = "position"
+    PLACE = "place"
+
+
 @dataclass(frozen=True, slots=True)
 class Closure:
     """A proposed loop closure: the later keyframe ``source`` seen from the earlier ``target``.
 
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
-    ``overlap`` is the share of source points that lie on the target's surfaces after matching.
+    ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``chi2_before`` is
+    its χ² in the graph as it was before it became an edge, NaN if it never did.
     """
 
     target: int
@@ -161,6 +171,8 @@ class Closure:
     overlap: float
     verdict: Verdict
     reason: str
+    proposed_by: Proposal = Proposal.POSITION
+    chi2_before: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +187,7 @@ class GraphState:
     is_loop : (E,) bool
     weight : (E,) robust weight in [0, 1] that the optimiser left to each edge; 1 for odometry
     chi2 : Σ eᵀΩe
+    edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
     """
 
     poses: Matrix
@@ -183,6 +196,7 @@ class GraphState:
     is_loop: NDArray[np.bool_]
     weight: NDArray[np.float64]
     chi2: float
+    edge_chi2: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,7 +98,9 @@ class Slam:
         )
 
     def finish(self) -> SlamResult:
-        """Optimise once more and spread the corrections over all scans."""
+        """Close what is left, optimise once more and spread the corrections over all scans."""
+        if self.config.loops.enabled:
+            self._take(self.closer.finish(self.keyframes, self.graph.poses))
         state = self._optimise()
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
@@ -131,6 +133,7 @@ class Slam:
             points=tracked.points,
             T_odom_lidar=tracked.T_odom_lidar,
             travelled_m=self.travelled_m,
+            scale=self.odometry.local_map.scale,
         )
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
         if self.keyframes:
@@ -154,21 +157,28 @@ class Slam:
         return distance_m > config.keyframe_distance_m or float(lie.rotation_angle(T)) > config.keyframe_angle_rad
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        closures = self.closer.close(self.keyframes, self.graph)
+        return self._take(self.closer.close(self.keyframes, self.graph))
+
+    def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """Keep closures; those accepted become edges of the graph."""
+        taken = tuple(
+            self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
+        )
+        self.closures += taken
+        return taken
+
+    def _add(self, closure: Closure) -> Closure:
+        """Make an edge of a closure, which is returned with what the graph said of it before."""
         config = self.config.loops
-        for closure in closures:
-            self.closures.append(closure)
-            if closure.verdict is Verdict.ACCEPTED:
-                self.waiting_closures += 1
-                self.surprising |= self._moves_the_map(closure)
-                self.graph.add_edge(
-                    closure.target,
-                    closure.source,
-                    closure.match.T_target_source,
-                    edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad),
-                    is_loop=True,
-                )
-        return closures
+        information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
+        Z_ij = closure.match.T_target_source
+        error = lie.log(
+            lie.inverse(Z_ij) @ lie.inverse(self.graph.poses[closure.target]) @ self.graph.poses[closure.source]
+        )
+        self.waiting_closures += 1
+        self.surprising |= self._moves_the_map(closure)
+        self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
+        return replace(closure, chi2_before=float(error @ information @ error))
 
     def _moves_the_map(self, closure: Closure) -> bool:
         """Whether the closure is further from what the graph says than its own error explains."""

@@ -77,7 +77,15 @@ def graph_of(steps, last_keyframe):
     is_loop = np.array([False] * last_keyframe + [True] * len(loops))
     weight = np.where(is_loop, 0.3, 1.0)
     weight[-1] = 0.9
-    return GraphState(np.array(poses), np.zeros(len(poses), np.int64), np.array(edges), is_loop, weight, 1.0)
+    return GraphState(
+        np.array(poses),
+        np.zeros(len(poses), np.int64),
+        np.array(edges),
+        is_loop,
+        weight,
+        1.0,
+        np.zeros(len(edges)),
+    )
 
 
 def record(path, steps, dimension, sinks=("save",), config=None, **ports):

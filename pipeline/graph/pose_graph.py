@@ -180,13 +180,15 @@ class PoseGraph:
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
         order, problem = self._order(), self._prepared()
+        chi2 = problem.chi2(problem.errors(self.poses))
         return GraphState(
             poses=self.poses,
             stamps_ns=self.stamps_ns,
             edges=self.edges[order],
             is_loop=self.is_loop[order],
             weight=self.weight[order],
-            chi2=float(problem.chi2(problem.errors(self.poses)).sum()),
+            chi2=float(chi2.sum()),
+            edge_chi2=chi2[order],
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:

@@ -1,91 +1,31 @@
-"""Loop closures: places seen before, where they may be by position and drift, verified by matching."""
+"""Loop closures: where a keyframe may be by position and drift and, in 3D, places recognised by their looks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Match, Points, Pose, Verdict
+from pipeline.data import Closure, Keyframe, Matrix
 from pipeline.graph.pose_graph import PoseGraph
-from pipeline.kernels.association import associate
-from pipeline.loops.doubt import Doubt
-from pipeline.loops.planar_search import PlanarSearch
-from pipeline.loops.submaps import Submaps
-from pipeline.matching import PointToShapeMatcher, VoxelMap
-from pipeline.preprocess import downsample
+from pipeline.loops.near_closer import NearCloser
+from pipeline.loops.place_closer import PlaceCloser
 
 
 class LoopCloser:
     """Looks from each new keyframe for an older place and measures where it lies."""
 
     def __init__(self, config: Config, dimension: int) -> None:
-        self.config = config.loops
-        self.match_voxel_m = config.preprocess.match_voxel_m
-        self.matcher = PointToShapeMatcher(config.matching)
-        self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map)
-        self.doubt = Doubt(config.loops.drift)
-        self.search = PlanarSearch(self.submaps) if dimension == 2 else None
+        self.near = NearCloser(config, dimension)
+        self.places = PlaceCloser(config) if dimension == 3 and config.loops.recognise_places else None
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to older places, accepted or not.
+        """Closures of the newest keyframe to an older place near it, and of places recognised; accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are joined
         """
-        old = self._old(keyframes)
-        if not old:
-            return ()
-        T_world, config = graph.poses, self.config
-        doubts_m = self.doubt.between(graph, len(keyframes) - 1, config.max_radius_m)[:old]
-        away_m = np.linalg.norm(T_world[:old, :-1, -1] - T_world[-1, :-1, -1], axis=1)
-        near = np.flatnonzero(away_m <= np.maximum(doubts_m, config.min_radius_m))
-        if not len(near):
-            return ()
-        target = self.submaps.anchor_of(int(near[np.argmin(away_m[near])]))
-        closure = self._measured(keyframes, old, target, lie.inverse(T_world[target]) @ T_world[-1])
-        if closure.verdict is Verdict.ACCEPTED or self.search is None:
-            return (closure,)
-        found = self.search.find(keyframes, T_world, near, doubts_m)
-        if found is None:
-            return (closure,)
-        return closure, self._measured(keyframes, old, found.anchor, found.T_anchor_source)
+        places = () if self.places is None else self.places.close(keyframes, graph.poses)
+        return self.near.close(keyframes, graph) + places
 
-    def _old(self, keyframes: Sequence[Keyframe]) -> int:
-        """How many of the first keyframes lie far enough back along the way to count as revisited."""
-        limit_m = keyframes[-1].travelled_m - self.config.min_travel_m
-        old = len(keyframes)
-        while old > 0 and keyframes[old - 1].travelled_m > limit_m:
-            old -= 1
-        return old
-
-    def _measured(self, keyframes: Sequence[Keyframe], old: int, target: int, T_first: Pose) -> Closure:
-        """The closure of the newest keyframe to the submap of an anchor, from a first guess of where it lies."""
-        submap = self.submaps.around(target, keyframes, old - 1)
-        points = downsample(keyframes[-1].points, self.match_voxel_m)
-        match = self.matcher.align(points, submap, T_first, wide=True)
-        overlap = _overlap(points, match.T_target_source, submap)
-        moved_m = float(np.linalg.norm((lie.inverse(T_first) @ match.T_target_source)[:-1, -1]))
-        problem = self._problem(match, overlap, moved_m)
-        verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
-        return Closure(target, keyframes[-1].index, match, overlap, verdict, problem or "verified by matching")
-
-    def _problem(self, match: Match, overlap: float, moved_m: float) -> str:
-        """Why the match is no closure, empty if it is one."""
-        limits, information = self.config, match.degeneracy_eigenvalue
-        if not match.converged:
-            return match.reason
-        if overlap < limits.min_overlap:
-            return f"overlap {overlap:.2f} < loops.min_overlap ({limits.min_overlap:g})"
-        if information < limits.min_information:
-            return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
-        if moved_m > limits.max_radius_m:
-            return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
-        return ""
-
-
-def _overlap(points: Points, T: Pose, submap: VoxelMap) -> float:
-    """Share of the points that lie within a voxel of the submap's surfaces."""
-    partner = np.empty(len(points), np.int32)
-    return associate(submap.voxels, points, T, 1, submap.config.voxel_size_m, partner) / len(points)
+    def finish(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
+        """Closures of the places that waited for more of their surroundings to be seen."""
+        return () if self.places is None else self.places.close(keyframes, T_world_keyframes, finish=True)

@@ -14,7 +14,7 @@ _HELD = 64  # submaps in memory; the one unused for longest goes first
 
 
 class Submaps:
-    """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame.
+    """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame, its voxels of the size used there.
 
     Neighbouring keyframes are placed by odometry, which over so short a way is as good as any pose known later.
     """
@@ -41,7 +41,7 @@ class Submaps:
         return submap
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
-        submap = VoxelMap(self.dimension, self.config)
+        submap = VoxelMap(self.dimension, self.config, anchor.scale)
         T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
         for keyframe in members:
             submap.insert(keyframe.points, T_anchor_odom @ keyframe.T_odom_lidar)

@@ -30,9 +30,12 @@ def write_closures(
         "source_scan": pa.array([keyframes[closure.source].scan_index for closure in closures], pa.int64()),
         "target_stamp_ns": pa.array([keyframes[closure.target].stamp_ns for closure in closures], pa.int64()),
         "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
+        "proposed_by": pa.array([str(closure.proposed_by) for closure in closures], pa.string()),
         "verdict": pa.array([str(item.verdict) for item in judged], pa.string()),
         "reason": pa.array([item.reason for item in judged], pa.string()),
         "weight": pa.array([item.weight for item in judged], pa.float64()),
+        "chi2_before": pa.array([closure.chi2_before for closure in closures], pa.float64(), from_pandas=True),
+        "chi2_after": pa.array([item.chi2_after for item in judged], pa.float64(), from_pandas=True),
         **{
             name: pa.array(values, pa.float64())
             for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()
@@ -51,6 +54,8 @@ def write_closures(
     notes = {
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
         "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
+        "proposed_by": "position: near by odometry; place: looked alike wherever odometry has it",
+        "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
         "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
     }
     pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")

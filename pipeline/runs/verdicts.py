@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,27 +13,37 @@ _REJECTED_WEIGHT = 0.1  # robust weight below which an edge has no say
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
-    """A closure with its last word: by the matcher, or by the graph that it contradicts."""
+    """A closure with its last word: by the matcher, or by the graph that it contradicts.
+
+    ``weight`` and ``chi2_after`` are what the optimiser left to its edge: 0 and NaN if it never became one.
+    """
 
     closure: Closure
     verdict: Verdict
     reason: str
     weight: float
+    chi2_after: float
 
 
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[JudgedClosure, ...]:
-    """Every closure with the robust weight of its edge; those the graph contradicts are rejected after all."""
-    weights = {
-        (int(i), int(j)): float(weight)
-        for (i, j), is_loop, weight in zip(state.edges, state.is_loop, state.weight, strict=True)
-        if is_loop
-    }
+    """Every closure with what became of its edge; those the graph contradicts are rejected after all."""
+    edges = _loop_edges(state)
     judged = []
     for closure in closures:
-        weight = weights.get((closure.target, closure.source), 0.0)
-        if closure.verdict is Verdict.ACCEPTED and weight < _REJECTED_WEIGHT:
-            reason = f"contradicts the rest of the graph: robust weight {weight:.3f} < {_REJECTED_WEIGHT}"
-            judged.append(JudgedClosure(closure, Verdict.REJECTED, reason, weight))
-        else:
-            judged.append(JudgedClosure(closure, closure.verdict, closure.reason, weight))
+        verdict, reason, weight, chi2 = closure.verdict, closure.reason, 0.0, float("nan")
+        if verdict is Verdict.ACCEPTED:
+            weight, chi2 = edges[closure.target, closure.source].popleft()
+            if weight < _REJECTED_WEIGHT:
+                verdict = Verdict.REJECTED
+                reason = f"contradicts the rest of the graph: robust weight {weight:.3f} < {_REJECTED_WEIGHT}"
+        judged.append(JudgedClosure(closure, verdict, reason, weight, chi2))
     return tuple(judged)
+
+
+def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[float, float]]]:
+    """Weight and χ² of the loop edges between each pair, in the order they were added."""
+    edges: defaultdict[tuple[int, int], deque[tuple[float, float]]] = defaultdict(deque)
+    loops = state.is_loop
+    for (i, j), weight, chi2 in zip(state.edges[loops], state.weight[loops], state.edge_chi2[loops], strict=True):
+        edges[int(i), int(j)].append((float(weight), float(chi2)))
+    return edges

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pipeline.data import Matrix
 from pipeline.simulate.furniture import Furnisher, Room
 from pipeline.simulate.motion import Vehicle
 from pipeline.simulate.solids import Scenery, Solids
+from pipeline.simulate.walls import CEILING_M, Wall, build_wall
 
-_WIDTH_M, _DEPTH_M, _CEILING_M = 26.0, 18.0, 2.8
-_WALL_M, _DOOR_M = 0.12, 1.0
-
+_WIDTH_M, _DEPTH_M = 26.0, 18.0
 ROBOT = Vehicle(
     speed_m_s=1.0,
     acceleration_m_s2=0.5,
@@ -34,38 +31,15 @@ ROUTE = np.array([
 ])  # fmt: skip
 
 
-class _Wall(NamedTuple):
-    """A wall with doorways ``doors`` metres along it; the leaves open to its left (1), right (−1) or are off."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-    doors: tuple[float, ...] = ()
-    leaves: int = 0
-
-    def at(self, along_m: float, left_m: float = 0.0) -> tuple[float, float]:
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        return float(self.x0 + c * along_m - s * left_m), float(self.y0 + s * along_m + c * left_m)
-
-    @property
-    def length_m(self) -> float:
-        return float(np.hypot(self.x1 - self.x0, self.y1 - self.y0))
-
-    @property
-    def yaw_rad(self) -> float:
-        return float(np.arctan2(self.y1 - self.y0, self.x1 - self.x0))
-
-
 _WALLS = (
-    _Wall(0, 0, 26, 0), _Wall(26, 0, 26, 18), _Wall(26, 18, 0, 18), _Wall(0, 18, 0, 0),
-    _Wall(0, 4, 26, 4, (4.5, 8.0, 13.0, 18.2, 21.6), -1), _Wall(0, 14, 26, 14, (4.4, 9.0, 17.0, 21.4), 1),
-    _Wall(4, 4, 4, 14, (2.2, 7.6), 1), _Wall(22, 4, 22, 14, (3.0, 6.4), -1),
-    _Wall(5.6, 0, 5.6, 4), _Wall(10.3, 0, 10.3, 4, (2.0,)), _Wall(15.9, 0, 15.9, 4), _Wall(20.4, 0, 20.4, 4),
-    _Wall(5.2, 14, 5.2, 18), _Wall(12.6, 14, 12.6, 18, (2.0,)), _Wall(20.2, 14, 20.2, 18),
-    _Wall(0, 8.7, 4, 8.7), _Wall(22, 9.4, 26, 9.4),
-    _Wall(6, 6, 20, 6, (6.7, 12.4), 1), _Wall(6, 12, 20, 12, (6.7,), -1),
-    _Wall(6, 6, 6, 12), _Wall(20, 6, 20, 12, (1.6,)), _Wall(10.5, 6, 10.5, 12), _Wall(15.2, 6, 15.2, 12),
+    Wall(0, 0, 26, 0), Wall(26, 0, 26, 18), Wall(26, 18, 0, 18), Wall(0, 18, 0, 0),
+    Wall(0, 4, 26, 4, (4.5, 8.0, 13.0, 18.2, 21.6), -1), Wall(0, 14, 26, 14, (4.4, 9.0, 17.0, 21.4), 1),
+    Wall(4, 4, 4, 14, (2.2, 7.6), 1), Wall(22, 4, 22, 14, (3.0, 6.4), -1),
+    Wall(5.6, 0, 5.6, 4), Wall(10.3, 0, 10.3, 4, (2.0,)), Wall(15.9, 0, 15.9, 4), Wall(20.4, 0, 20.4, 4),
+    Wall(5.2, 14, 5.2, 18), Wall(12.6, 14, 12.6, 18, (2.0,)), Wall(20.2, 14, 20.2, 18),
+    Wall(0, 8.7, 4, 8.7), Wall(22, 9.4, 26, 9.4),
+    Wall(6, 6, 20, 6, (6.7, 12.4), 1), Wall(6, 12, 20, 12, (6.7,), -1),
+    Wall(6, 6, 6, 12), Wall(20, 6, 20, 12, (1.6,)), Wall(10.5, 6, 10.5, 12), Wall(15.2, 6, 15.2, 12),
 )  # fmt: skip
 
 _ROOMS = (
@@ -79,10 +53,10 @@ _ROOMS = (
 def office(rng: np.random.Generator) -> Solids:
     """The floor; walls and doorways stand where they stand, furniture and door leaves are drawn from ``rng``."""
     scenery = Scenery()
-    scenery.box((0.5 * _WIDTH_M, 0.5 * _DEPTH_M), (_WIDTH_M + 1.0, _DEPTH_M + 1.0), (_CEILING_M, _CEILING_M + 0.2))
+    scenery.box((0.5 * _WIDTH_M, 0.5 * _DEPTH_M), (_WIDTH_M + 1.0, _DEPTH_M + 1.0), (CEILING_M, CEILING_M + 0.2))
     for wall in _WALLS:
-        _build(scenery, wall, rng)
-    scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, _CEILING_M))  # lift shaft in the closed part of the core
+        build_wall(scenery, wall, rng)
+    scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, CEILING_M))  # lift shaft in the closed part of the core
     _line_corridor(scenery, rng)
     doors = np.array([wall.at(place) for wall in _WALLS for place in wall.doors])
     furnisher = Furnisher(scenery, _sampled_route(), doors, rng)
@@ -91,31 +65,10 @@ def office(rng: np.random.Generator) -> Solids:
     return scenery.finish()
 
 
-def _build(scenery: Scenery, wall: _Wall, rng: np.random.Generator) -> None:
-    """The pieces of a wall between its doorways, a lintel over each, and the leaves, open at 90 to 110 degrees."""
-    edges = [
-        0.0,
-        *(e for place in wall.doors for e in (place - 0.5 * _DOOR_M, place + 0.5 * _DOOR_M)),
-        wall.length_m,
-    ]
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        size = (last - first + _WALL_M * (first == 0.0 or last == wall.length_m), _WALL_M)
-        scenery.box(wall.at(0.5 * (first + last)), size, (0.0, _CEILING_M), wall.yaw_rad)
-    for place in wall.doors:
-        scenery.box(wall.at(place), (_DOOR_M, _WALL_M), (2.1, _CEILING_M), wall.yaw_rad)
-        if wall.leaves:
-            turn_rad = np.deg2rad(rng.uniform(90.0, 110.0))  # 0 is shut, hinged at the far jamb
-            half = 0.5 * (_DOOR_M - 0.05)
-            middle = wall.at(
-                place + 0.53 * _DOOR_M - half * np.cos(turn_rad), wall.leaves * half * np.sin(turn_rad)
-            )
-            scenery.box(middle, (2.0 * half, 0.04), (0.01, 2.1), wall.yaw_rad - wall.leaves * turn_rad)
-
-
 def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
     """Pillars at the corners of the core, cupboards, a copier and plants along the corridor's walls."""
     for x, y in ((6.0, 6.0), (20.0, 6.0), (6.0, 12.0), (20.0, 12.0)):
-        scenery.box((x, y), (0.4, 0.4), (0.0, _CEILING_M))
+        scenery.box((x, y), (0.4, 0.4), (0.0, CEILING_M))
     for x, y, size_x, size_y in (
         (10.6, 4.26, 1.2, 0.4), (16.0, 5.74, 1.6, 0.4), (11.2, 12.26, 0.9, 0.4), (18.9, 12.28, 0.7, 0.45),
         (4.26, 10.2, 0.4, 1.0), (21.74, 9.0, 0.4, 1.6), (7.2, 13.76, 1.5, 0.36), (5.76, 8.4, 0.36, 1.2),

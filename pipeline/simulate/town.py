@@ -32,18 +32,21 @@ ROUTE = np.array([[50.0, 4.0], [50.0, 40.0], [0.0, 40.0], [0.0, 0.0], [50.0, 0.0
                   [100.0, 0.0], [50.0, 0.0]])  # fmt: skip
 
 
-def town(rng: np.random.Generator) -> Solids:
-    """The town; streets and blocks stand where they stand, everything else is drawn from ``rng``."""
+def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
+    """The town; streets and blocks stand where they stand, everything else is drawn from ``rng``.
+
+    parked : share of the places at the kerb that have a car on them
+    """
     scenery = Scenery(_relief(rng))
     for west, east in pairwise(_STREETS_X_M):
         for south, north in pairwise(_STREETS_Y_M):
             _block(scenery, west, east, south, north, rng)
     for y in _STREETS_Y_M:
         for west, east in pairwise(_STREETS_X_M):
-            _street(scenery, np.array([west, y]), np.array([east, y]), rng)
+            _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
     for x in _STREETS_X_M:
         for south, north in pairwise(_STREETS_Y_M):
-            _street(scenery, np.array([x, south]), np.array([x, north]), rng)
+            _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
 
 
@@ -107,7 +110,11 @@ def _house(
 
 
 def _street(
-    scenery: Scenery, start: NDArray[np.float64], end: NDArray[np.float64], rng: np.random.Generator
+    scenery: Scenery,
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    parked: float,
+    rng: np.random.Generator,
 ) -> None:
     """Both sides of one street between two crossings: parked cars, trees, lamps, signs, bins."""
     length = float(np.linalg.norm(end - start))
@@ -117,7 +124,7 @@ def _street(
     for side in (-1.0, 1.0):
         place = 12.0 + rng.uniform(0.0, 3.0)
         while place < length - 12.0:
-            if rng.random() < 0.55:
+            if rng.random() < parked:
                 x, y = start + place * along + side * (_PARKED_M + rng.normal(0.0, 0.08)) * aside
                 parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
             place += rng.uniform(5.2, 7.5)

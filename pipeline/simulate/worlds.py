@@ -9,7 +9,19 @@ import numpy as np
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
-from pipeline.simulate import corridor, field, forest, hall, highway, office, staircase, town, yard
+from pipeline.simulate import (
+    corridor,
+    field,
+    forest,
+    hall,
+    highway,
+    identical,
+    office,
+    rounds,
+    staircase,
+    town,
+    yard,
+)
 from pipeline.simulate.laps import Laps
 from pipeline.simulate.motion import Motion, Vehicle
 from pipeline.simulate.pivots import Pivot, Pivots
@@ -48,6 +60,8 @@ _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle o
 WORLDS: dict[str, World] = {
     "office": World(office.office, office.ROUTE, office.ROBOT, "lms-270", 240.0),
     "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0),
+    "rounds": World(rounds.rounds, rounds.ROUTE, rounds.CAR, "hdl-64", 160.0),
+    "identical": World(identical.identical, identical.ROUTE, office.ROBOT, "lms-270", 300.0),
     "highway": World(highway.highway, highway.ROUTE, highway.CAR, "hdl-64", 30.0),
     "corridor": World(corridor.corridor, corridor.ROUTE, corridor.ROBOT, "os1-32", 40.0, corridor.SIGHT_M),
     "field": World(field.field, field.ROUTE, field.TRACTOR, "hdl-64", 40.0, field.SIGHT_M),

@@ -1,0 +1,41 @@
+"""Slow, clear twins of the loop-closure kernels; every kernel test says fast == naive."""
+
+import numpy as np
+
+from pipeline import lie
+
+
+def heights(points, T, cell_m, size):
+    """Occupied heights above the lowest one, (size, size), row along y."""
+    cubes = np.floor(lie.transform(T, points) / cell_m).astype(int) + np.array([size // 2, size // 2, 32])
+    inside = np.all((cubes >= 0) & (cubes < [size, size, 64]), axis=1)
+    columns = {}
+    for x, y, z in cubes[inside]:
+        columns.setdefault((y, x), set()).add(z)
+    counts = np.zeros((size, size), int)
+    for place, levels in columns.items():
+        counts[place] = len(levels) - 1
+    return counts
+
+
+def bin_of(point, shape):
+    range_m = np.linalg.norm(point)
+    row = int((np.arcsin(point[2] / range_m) / np.pi + 0.5) * shape[0])
+    column = int((np.arctan2(point[1], point[0]) / (2 * np.pi) + 0.5) * shape[1])
+    return (min(row, shape[0] - 1), min(column, shape[1] - 1)), range_m
+
+
+def agreement(seen, points, T, shape, margin_m, margin_share):
+    """Points that lie where the lidar saw something, and points that it looked through."""
+    nearest = {}
+    for point in seen:
+        place, range_m = bin_of(point, shape)
+        nearest[place] = min(nearest.get(place, np.inf), range_m)
+    yes = no = 0
+    for point in lie.transform(T, points):
+        place, range_m = bin_of(point, shape)
+        if place in nearest:
+            margin = margin_m + margin_share * nearest[place]
+            yes += abs(range_m - nearest[place]) <= margin
+            no += range_m < nearest[place] - margin
+    return yes, no
