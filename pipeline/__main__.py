@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from pipeline.commands.compare import compare
 from pipeline.commands.config import config
 from pipeline.commands.evaluate import evaluate
 from pipeline.commands.info import info
@@ -36,13 +37,13 @@ def scanchain() -> None:
     """
 
 
-for _command in (run, view, info, simulate, evaluate, config, sequence):
+for _command in (run, view, compare, info, simulate, evaluate, config, sequence):
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show, _draw)
+    viewing = Viewing(_record, _show, _draw, _report, _present_comparison)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -92,6 +93,20 @@ def _draw(directory: Path, picture: Path) -> None:
     from viz.run_picture import draw_run
 
     draw_run(directory, picture)
+
+
+def _report(directory: Path) -> None:
+    from viz.run_report import write_run_report
+
+    write_run_report(directory)
+
+
+def _present_comparison(directory: Path) -> None:
+    from viz.compare_recording import record_comparison
+    from viz.compare_report import write_compare_report
+
+    write_compare_report(directory)
+    record_comparison(directory)
 
 
 if __name__ == "__main__":

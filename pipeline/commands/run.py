@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
@@ -71,7 +72,7 @@ def run(
     from pipeline.runs.run import Job
     from pipeline.runs.run import run as run_log
 
-    truth_file, truth_topic = _ground_truth(gt)
+    truth_file, truth_topic = ground_truth(gt)
     job = Job(
         logs=logs,
         out=out,
@@ -123,12 +124,3 @@ def _sinks(text: str) -> frozenset[SinkName]:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
 
-
-def _ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
-    if text is None:
-        return None, ()
-    path = Path(text)
-    if text.startswith("/") and not path.exists() and not path.suffix:
-        return None, (Override("log.ground_truth_topic", text, "--gt"),)
-    return path, ()

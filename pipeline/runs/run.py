@@ -209,9 +209,7 @@ def _complete(
         replaced = msgspec.structs.replace(provenance, stopped=stopped, duration_s=duration_s)
         replaced.write(directory.path / RUN_FILE)
         return
-    digests = zip(provenance.logs, hashing.digests(), strict=True)
-    logs = [msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
-    replaced = msgspec.structs.replace(provenance, complete=True, duration_s=duration_s, logs=logs)
+    replaced = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=duration_s)
     replaced.write(directory.path / RUN_FILE)
     directory.complete()
 

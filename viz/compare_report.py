@@ -1,0 +1,1 @@
+def write_compare_report(directory): pass
