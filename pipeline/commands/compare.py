@@ -27,7 +27,9 @@ _MIB_PER_GIB = 1024.0
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
 @click.option("--settings", metavar="FILE", type=_PATH, help="TOML: a table of settings a method.")
-@click.option("--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, in turn.")
+@click.option(
+    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, in turn."
+)
 @click.option(
     "--time-limit",
     type=click.FloatRange(0.0, min_open=True),

@@ -123,4 +123,3 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
-

@@ -94,27 +94,45 @@ COLUMNS = (
     Column("rpe_1_s_m", "RPE 1 s", "mm", 1e3, 1, "low", True, "rmse of the motion over 1 s"),
     Column("rpe_10_m_m", "RPE 10 m", "mm", 1e3, 1, "low", False, "rmse of the motion over 10 m of the true path"),
     Column("rpe_100_m_m", "RPE 100 m", "mm", 1e3, 1, "low", False, "rmse of the motion over 100 m"),
-    Column("kitti_share", "KITTI", "%", 100.0, 3, "low", True, "mean drift over 100 to 800 m, short paths 10 to 40 m"),
-    Column("kitti_rad_per_m", "KITTI rot.", "deg/m", _DEGREES, 4, "low", False, "mean turn per metre over the same"),
+    Column(
+        "kitti_share", "KITTI", "%", 100.0, 3, "low", True, "mean drift over 100 to 800 m, short paths 10 to 40 m"
+    ),
+    Column(
+        "kitti_rad_per_m", "KITTI rot.", "deg/m", _DEGREES, 4, "low", False, "mean turn per metre over the same"
+    ),
     Column("paired_share", "paired", "%", 100.0, 1, "", False, "share of the poses that a true one belongs to"),
     Column("relations_m", "relations", "m", 1.0, 4, "low", True, "mean absolute error over relations set by hand"),
     Column("relations_rad", "relations", "deg", _DEGREES, 3, "low", True, "the same, of the angle"),
     Column("nees", "NEES", "", 1.0, 2, "one", False, "squared error of a motion over its covariance; 1 is exact"),
-    Column("thickness_m", "surfaces", "mm", 1e3, 2, "low", True, "thickness of the map's surfaces; no ground truth"),
+    Column(
+        "thickness_m", "surfaces", "mm", 1e3, 2, "low", True, "thickness of the map's surfaces; no ground truth"
+    ),
     Column("entropy", "entropy", "nats", 1.0, 3, "low", False, "mean map entropy; not ground truth either"),
-    Column("disagreement_m", "to others", "mm", 1e3, 1, "", True, "median distance of a motion to that of the others"),
+    Column(
+        "disagreement_m", "to others", "mm", 1e3, 1, "", True, "median distance of a motion to that of the others"
+    ),
     Column("median_s", "median", "ms", 1e3, 2, "low", True, "time of a scan, all but the first"),
     Column("p95_s", "p95", "ms", 1e3, 2, "low", True, "95th percentile of the same"),
-    Column("first_s", "first", "ms", 1e3, 1, "low", False, "time of the first scan, everything compiled and loaded"),
+    Column(
+        "first_s", "first", "ms", 1e3, 1, "low", False, "time of the first scan, everything compiled and loaded"
+    ),
     Column("scans_per_s", "rate", "scans/s", 1.0, 1, "high", False, "scans over the sum of their times"),
-    Column("preprocess_s", "prepare", "ms", 1e3, 2, "", False, "median of cropping and thinning out; ours alone tells"),
+    Column(
+        "preprocess_s", "prepare", "ms", 1e3, 2, "", False, "median of cropping and thinning out; ours alone tells"
+    ),
     Column("match_s", "match", "ms", 1e3, 2, "", False, "median of matching"),
     Column("map_s", "map", "ms", 1e3, 2, "", False, "median of extending the local map"),
     Column("loops_s", "loops", "ms", 1e3, 2, "", False, "mean of keyframes, loop closures and optimisations"),
-    Column("start_s", "start", "s", 1.0, 1, "", False, "import, compilation or loading what is compiled, warming up"),
+    Column(
+        "start_s", "start", "s", 1.0, 1, "", False, "import, compilation or loading what is compiled, warming up"
+    ),
     Column("finish_s", "finish", "s", 1.0, 2, "", False, "after the last scan: optimisation, tables"),
-    Column("peak_mib", "memory", "MiB", 1.0, 0, "low", True, "peak of the process, interpreter and packages included"),
-    Column("repeats_apart_m", "repeats", "m", 1.0, 4, "low", False, "largest distance between runs of the same method"),
+    Column(
+        "peak_mib", "memory", "MiB", 1.0, 0, "low", True, "peak of the process, interpreter and packages included"
+    ),
+    Column(
+        "repeats_apart_m", "repeats", "m", 1.0, 4, "low", False, "largest distance between runs of the same method"
+    ),
 )
 
 

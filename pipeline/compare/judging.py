@@ -97,7 +97,8 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     kitti = _or_none(lambda: kitti_error(pairs, lengths_m, every=every))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
     stretches = [
-        _or_none(lambda length_m=length_m: relative_error_over_distance(pairs, length_m)) for length_m in (10.0, 100.0)
+        _or_none(lambda length_m=length_m: relative_error_over_distance(pairs, length_m))
+        for length_m in (10.0, 100.0)
     ]
     nees = _nees(outcome, truth)
     place = pairs.indices[:, 0]

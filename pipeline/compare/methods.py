@@ -62,7 +62,9 @@ def resolve(
     tables = {} if file is None else _tables(file)
     unused = [name for name in tables if name not in names]
     if unused:
-        raise InputError(f"{file}: [{unused[0]}] is not among the methods: {', '.join(names)}; add it to --methods")
+        raise InputError(
+            f"{file}: [{unused[0]}] is not among the methods: {', '.join(names)}; add it to --methods"
+        )
     if len(set(names)) < len(names):
         raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --settings instead")
     return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
@@ -82,7 +84,9 @@ def _method(
         try:
             settings = msgspec.convert(msgspec.to_builtins(defaults) | own, type(defaults))
         except msgspec.ValidationError as error:
-            raise InputError(f"{where}: {error}; its keys are {', '.join(type(defaults).__struct_fields__)}") from None
+            raise InputError(
+                f"{where}: {error}; its keys are {', '.join(type(defaults).__struct_fields__)}"
+            ) from None
         return Method(name, base, msgspec.to_builtins(settings))
     if isinstance(base, str) and base.count(":") == 1:
         return Method(name, base, own)

@@ -118,11 +118,14 @@ def text(table: Table) -> str:
     names = max(len(line[0]) for line in grid)
     widths = [max(len(line[i]) for line in grid if len(line) > 2) for i in range(1, len(columns) + 1)]
     lines = [
-        f"{line[0]:<{names}}  " + "  ".join(f"{cell:>{width}}" for cell, width in zip(line[1:], widths, strict=False))
+        f"{line[0]:<{names}}  "
+        + "  ".join(f"{cell:>{width}}" for cell, width in zip(line[1:], widths, strict=False))
         for line in grid
     ]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
-    against = f"errors against {table.truth}" if table.truth else "no ground truth: surfaces and to others are none"
+    against = (
+        f"errors against {table.truth}" if table.truth else "no ground truth: surfaces and to others are none"
+    )
     return "\n".join([*(line.rstrip() for line in lines), f"* best of its column; {against}", *endings]) + "\n"
 
 

@@ -58,7 +58,11 @@ def _watch(process: subprocess.Popen[bytes], limits: Limits) -> tuple[Status, st
     while process.poll() is None:
         peak = max(peak, resident_mib(process.pid))
         if peak > limits.memory_mib:
-            return Status.OUT_OF_MEMORY, f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)", peak
+            return (
+                Status.OUT_OF_MEMORY,
+                f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)",
+                peak,
+            )
         if monotonic() - began > limits.time_s:
             return Status.TIMED_OUT, f"took longer than --time-limit ({limits.time_s:.3g} s)", peak
         sleep(_LOOK_S)
