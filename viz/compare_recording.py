@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -90,7 +91,7 @@ def _blueprint(courses: Sequence[Course]) -> rrb.Blueprint:
         ]
     )
     names = [rr.escape_entity_path_part(course.name) for course in courses]
-    overrides: dict[str, list] = {f"world/{name}/way": [so_far] for name in names}
+    overrides: dict[Any, Any] = {f"world/{name}/way": [so_far] for name in names}
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
     scene = rrb.Spatial3DView(
         origin="world", name="ways and maps", overrides=overrides, line_grid=rrb.LineGrid3D(visible=False)

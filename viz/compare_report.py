@@ -26,7 +26,7 @@ from viz.report import Cell, Drawing, Fold, Grid, Head, Page, Row, Section, writ
 
 REPORT_FILE = "report.html"
 _NEARLY = 1.25  # times the thickness of the sharpest map
-_AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around the way
+AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around the way
 
 
 def write_compare_report(directory: Path) -> None:
@@ -51,9 +51,7 @@ def _subtitle(table: Table) -> str:
     against = (
         f"Errors are against {table.truth}."
         if table.truth
-        else (
-            "There is no ground truth: surfaces and disagreement tell who is sharp and who is alone, not who is right."
-        )
+        else ("There is no ground truth: surfaces and disagreement tell who is sharp or alone, not who is right.")
     )
     return f"The same {table.scans:,} decoded scans through each method, each in a process of its own. {against}"
 
@@ -104,7 +102,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         yield from error_section(drawn, table.truth)
         yield from time_section(drawn)
         yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
-        yield from _map_section(directory, drawn, figures.frame(framing, truth), _AROUND_M[table.dimension])
+        yield from _map_section(directory, drawn, figures.frame(framing, truth), AROUND_M[table.dimension])
     for course in courses:
         yield from loop_section(course, method_folder(directory, course.name) / CLOSURES_FILE)
     if len(table.rows) > 1:
@@ -112,7 +110,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
 
 
 def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
-    """Those whose maps are nearly as sharp as the best: what pictures must show whole. All, where none has a map."""
+    """Those whose maps are nearly as sharp as the best: what pictures must show whole; all without maps."""
     thickness_m = {row.name: row.figures.thickness_m or np.inf for row in table.rows}
     limit_m = _NEARLY * min(thickness_m[course.name] for course in courses)
     return [course for course in courses if thickness_m[course.name] <= limit_m]
@@ -151,8 +149,8 @@ def _disagreement(table: Table) -> Section:
     ]
     return Section(
         "Disagreement",
-        "Median distance between the motions that two methods find for a scan, in millimetres. Not ground truth: two "
-        "that err alike agree.",
+        "Median distance between the motions that two methods find for a scan, in millimetres. "
+        "Not ground truth: two that err alike agree.",
         grid=Grid((Head("mm"), *(Head(name) for name in names)), tuple(rows)),
     )
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.compare.evidence import SCANS_FILE
@@ -23,7 +22,8 @@ def read_courses(directory: Path) -> list[Course]:
 
 
 def _course(scans: pa.Table, row: Row, place: int) -> Course:
-    chosen = scans.filter(pc.and_(pc.equal(scans["method"], row.name), pc.equal(scans["repeat"], 0)))
+    is_first_run = scans["repeat"].to_numpy() == 0
+    chosen = scans.filter(pa.array(is_first_run & (np.array(scans["method"].to_pylist()) == row.name)))
     return Course(
         name=row.name,
         colour=colour_of(place),

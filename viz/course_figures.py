@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _MAX_POINTS = 1500  # of a line
 _WINDOWS = 250  # that a value a scan is averaged over
 _MARGIN = 0.25
+_FEW_DECADES = 60.0
 
 
 def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
@@ -57,7 +58,7 @@ def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
             known = np.isfinite(course.error_m)
             x, y = _windowed(course.distance_m[known], course.error_m[known])
             sheet.axes.plot(x, np.maximum(y, 1e-4), **course.style)
-        sheet.axes.set_yscale("log")
+        _logarithmic(sheet.axes, "y")
         _label(sheet.axes, "distance travelled [m]", "position error [m]")
         return sheet.svg()
 
@@ -71,7 +72,7 @@ def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: flo
             shares = np.linspace(0.0, 100.0, len(values))
             rows = np.unique(np.linspace(0, len(values) - 1, min(len(values), 400)).astype(int))
             sheet.axes.plot(np.maximum(values[rows], 1e-6), shares[rows], **course.style)
-        sheet.axes.set_xscale("log")
+        _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
         _label(sheet.axes, label, "scans below [%]")
         return sheet.svg()
@@ -83,7 +84,7 @@ def time_per_scan(name: str, courses: Sequence[Course]) -> Markup:
         for course in _known(courses, "seconds"):
             x, y = _windowed(np.arange(len(course.seconds), dtype=np.float64), 1e3 * course.seconds)
             sheet.axes.plot(x, y, **{**course.style, "linewidth": 0.9})
-        sheet.axes.set_yscale("log")
+        _logarithmic(sheet.axes, "y")
         _label(sheet.axes, "scan", "time of a scan [ms]")
         return sheet.svg()
 
@@ -97,7 +98,7 @@ def consistency(name: str, courses: Sequence[Course], degrees_of_freedom: int) -
         shares = np.linspace(0.001, 0.999, 200)
         ideal = chi2.ppf(shares, degrees_of_freedom) / degrees_of_freedom
         sheet.axes.plot(ideal, 100.0 * shares, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        sheet.axes.set_xscale("log")
+        _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
         _label(sheet.axes, "squared error over covariance (1 is exact on average)", "motions below [%]")
         return sheet.svg()
@@ -110,7 +111,7 @@ def degeneracy(name: str, courses: Sequence[Course], limit: float) -> Markup:
             x = np.arange(len(course.eigenvalue), dtype=np.float64)
             sheet.axes.plot(*_windowed(x, np.maximum(course.eigenvalue, 1e-9), np.min), **course.style)
         sheet.axes.axhline(limit, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        sheet.axes.set_yscale("log")
+        _logarithmic(sheet.axes, "y")
         _label(sheet.axes, "scan", "information per inlier")
         return sheet.svg()
 
@@ -164,6 +165,18 @@ def _label(axes: Axes, x: str, y: str) -> None:
     axes.set_ylabel(y)
     axes.grid(visible=True, which="major")
     axes.tick_params(which="minor", color=LINE)
+
+
+def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """Plain numbers at 1, or at 1, 2 and 5 where there are few decades; so that labels have room."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _thinned(values: Floats) -> Floats:

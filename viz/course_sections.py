@@ -94,16 +94,16 @@ def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: boo
         drawings.append(
             Drawing(
                 "Covariance consistency",
-                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it they "
-                "are too large, to the right too small.",
+                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
+                "they are too large, to the right too small.",
                 figures.consistency("nees", judged, 3 if is_planar else 6),
             )
         )
     drawings.append(
         Drawing(
             "Degeneracy along the way",
-            "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 is seen by "
-            "every residual. Below the dotted line a scan is called degenerate.",
+            "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
+            "by every residual. Below the dotted line a scan is called degenerate.",
             figures.degeneracy("degeneracy", told, limit),
         )
     )
@@ -140,8 +140,8 @@ def loop_section(course: Course, path: Path) -> Iterator[Section]:
 
 def _closure_grid(closures: list[dict]) -> Grid:
     heads = (
-        Head("scans"), Head("overlap", "%"), Head("residual", "mm"), Head("weight", "", "left by the robust graph"),
-        Head("verdict"), Head("reason", is_text=True),
+        Head("scans"), Head("overlap", "%"), Head("residual", "mm"),
+        Head("weight", "", "left by the robust graph"), Head("verdict"), Head("reason", is_text=True),
     )  # fmt: skip
     rows = tuple(
         Row(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class Course:
     eigenvalue: Floats
 
     @property
-    def style(self) -> dict[str, object]:
+    def style(self) -> dict[str, Any]:
         """For matplotlib."""
         return {"color": self.colour, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
 

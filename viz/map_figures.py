@@ -7,7 +7,6 @@ from markupsafe import Markup
 
 from pipeline.data import Points
 from viz.courses import Course, Floats
-from viz.plots import GridPicture
 from viz.sheet import INK, Sheet
 
 _ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
@@ -33,13 +32,6 @@ def map_picture(name: str, points: Points, low: Floats, high: Floats, inches: fl
             )  # fmt: skip
         _frame(sheet, low, high)
         return sheet.svg()
-
-
-def grid_picture(name: str, grid: GridPicture, low: Floats, high: Floats, inches: float) -> Markup:
-    """The occupied cells of a grid, within corners."""
-    rows, columns = np.nonzero(grid.cells >= 50)
-    centres = (np.stack([columns, rows], axis=-1) + 0.5) * grid.resolution_m + np.array(grid.origin_m)
-    return map_picture(name, np.column_stack([centres, np.zeros(len(centres))]), low, high, inches)
 
 
 def loops_picture(

@@ -1,10 +1,10 @@
-"""A small drawing that becomes an SVG inside a page: it takes the page's colours, light or dark, as CSS variables."""
+"""A small drawing that becomes an SVG inside a page and takes the page's colours, light or dark."""
 
 from __future__ import annotations
 
 import io
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 from markupsafe import Markup
 
@@ -16,7 +16,7 @@ WIDTH_INCHES = 4.6
 INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
 _DPI = 170  # of what is drawn as pixels
-_SETTINGS = {
+_SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.size": 8.0,
     "axes.edgecolor": LINE,
@@ -46,7 +46,7 @@ class Sheet:
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
-        self._context = mpl.rc_context({**_SETTINGS, "svg.hashsalt": name})
+        self._context = mpl.rc_context(cast("Any", _SETTINGS | {"svg.hashsalt": name}))
         self._context.__enter__()
         self.figure: Figure = Figure(figsize=(WIDTH_INCHES, height_inches), layout="constrained")
         self.axes: Axes = self.figure.add_subplot()

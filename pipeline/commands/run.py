@@ -85,7 +85,7 @@ def run(
     )
     viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
-        finished = run_log(job, viewing.record, terminal)
+        finished = run_log(job, viewing.record, terminal, viewing.report)
     for warning in finished.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)

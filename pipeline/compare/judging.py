@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline import lie
 from pipeline.compare.figures import Figures
 from pipeline.compare.outcome import Outcome
 from pipeline.compare.runner import STEPS_FILE
@@ -26,12 +25,12 @@ from pipeline.evaluate import (
     absolute_error,
     kitti_error,
     lengths_for,
-    motion_nees,
     pair,
     relation_error,
     relative_error_over_distance,
     relative_error_over_time,
 )
+from pipeline.runs.consistency import COLUMNS, nees_of_steps
 
 Answer = TypeVar("Answer")
 
@@ -130,29 +129,17 @@ def _absolute(pairs: Pairs) -> AbsoluteError:
 
 
 def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
-    """(N,) of the motion up to each scan that is neither degenerate nor lost; NaN elsewhere."""
-    result = np.full(len(outcome.seconds), np.nan)
+    """(N,) of the motion up to each scan; NaN where the method does not tell."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
-        return result
-    table = pq.read_table(path, columns=["covariance", "state"])
-    d = outcome.odometry.shape[-1] - 1
-    k = lie.twist_size(outcome.odometry[0])
-    unknown = [np.nan] * (k * k)
-    covariances = np.array([row or unknown for row in table["covariance"].to_pylist()]).reshape(-1, k, k)
-    covariances[[state != "ok" for state in table["state"].to_pylist()]] = np.nan
-    pairs = pair(Trajectory(outcome.trajectory.stamps_ns, outcome.odometry), truth)
-    place = pairs.indices[:, 0]
-    estimate, reference = outcome.odometry[place], pairs.reference if d == 3 else lie.flatten(pairs.reference)
-    nees = motion_nees(estimate, covariances[place], reference)
-    nees[np.diff(place) != 1] = np.nan
-    result[place[1:]] = nees
-    return result
+        return np.full(len(outcome.seconds), np.nan)
+    odometry = Trajectory(outcome.trajectory.stamps_ns, outcome.odometry)
+    return nees_of_steps(pq.read_table(path, columns=list(COLUMNS)), odometry, truth)
 
 
 def _speed(outcomes: Sequence[Outcome]) -> Figures:
     """From all runs that came to their end; the first scan of each stands apart."""
-    whole = [outcome for outcome in outcomes if not outcome.report.status.is_failure and len(outcome.trajectory)]
+    whole = [outcome for outcome in outcomes if outcome.is_whole]
     if not whole:
         peak = max(outcome.report.peak_mib for outcome in outcomes)
         return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)

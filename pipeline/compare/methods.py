@@ -25,7 +25,8 @@ class Method(Struct, frozen=True):
     Attributes
     ----------
     name : what the tables call it
-    base : one of OURS or BASELINES, or MODULE:CLASS with the verbs of a Baseline
+    base : one of OURS or BASELINES, or MODULE:CLASS with the verb of a Baseline (in 2D of points (N, 2) and poses
+        (3, 3)), which is given the settings as keywords
     settings : as TOML holds them; for ours keys of the configuration by section
     """
 

@@ -139,6 +139,6 @@ def _description(config: Config) -> str:
     deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
     size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
     return (
-        f"ours, {config.matching.matcher}, {config.matching.optimiser}, scan to map, voxels of {size_m} m, one thread, "
-        f"{wheels}, {deskewing}"
+        f"ours, {config.matching.matcher}, {config.matching.optimiser}, scan to map, voxels of {size_m} m, "
+        f"one thread, {wheels}, {deskewing}"
     )

@@ -6,7 +6,7 @@ memory of a method would grow with the log. Straight after decoding the files li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -69,10 +69,8 @@ class StoredScans:
                 )
 
 
-def store(
-    scans: Iterable[Scan], T_base_lidar: Pose, folder: Path, *, count: Callable[[int], object] = lambda _: None
-) -> StoredScans:
-    """Write scans into an empty folder; ``count`` is told how many there are so far."""
+def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScans:
+    """Write scans into an empty folder."""
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
     unknown = np.full(T_base_lidar.shape, np.nan)
@@ -85,7 +83,6 @@ def store(
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
             points.write(np.ascontiguousarray(scan.points, np.float32).data)
             times.write(np.ascontiguousarray(scan.times_s, np.float32).data)
-            count(len(rows))
     np.savez(folder / _TABLE, rows=np.array(rows, np.int64), wheels=np.array(wheels), T_base_lidar=T_base_lidar)
     return open_store(folder)
 
@@ -93,8 +90,11 @@ def store(
 def open_store(folder: Path) -> StoredScans:
     """What ``store`` wrote."""
     with np.load(folder / _TABLE) as table:
-        columns: Sequence[NDArray[np.int64]] = table["rows"].T.copy()
-        return StoredScans(folder, *columns, table["wheels"], table["T_base_lidar"])
+        first_point, points, first_time, times, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
+        return StoredScans(
+            folder, first_point, points, first_time, times, stamps_ns, log_times_ns, dropped, table["wheels"],
+            table["T_base_lidar"],
+        )  # fmt: skip
 
 
 def _read(file: BinaryIO, first: int, count: int, width: int) -> NDArray[np.float32]:

@@ -18,8 +18,8 @@ from pipeline.runs.step_table import pose_columns
 
 SCANS_FILE = "per_scan.parquet"
 _NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar as the method has it in the end; aligned_*: the same position in the frame of "
-    "the ground truth (as for the ATE)",
+    "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
+    "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
     "seconds": "tracking the scan, on the clock",
     "distance_m": "travelled up to the scan, by the method itself",
     "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
@@ -49,8 +49,8 @@ def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.i
 def final_poses(outcome: Outcome) -> Matrix:
     """(M, 4, 4) the last word, or what there is of a run that failed."""
     poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
-    known = np.isfinite(poses).all(axis=(1, 2))
-    return lie.lift(poses[: int(known.argmin()) if not known.all() else len(known)])
+    broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
+    return lie.lift(poses[: broken[0]] if len(broken) else poses)
 
 
 def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object]:

@@ -99,5 +99,5 @@ def _own_report(code: int, folder: Path) -> EndReport:
 def _where(folder: Path) -> str:
     """How far it came."""
     if not (folder / SECONDS_FILE).exists():
-        return "before the first scan"
+        return "while starting, or on the first scans, where it gets warm"
     return f"at scan {np.isfinite(np.load(folder / SECONDS_FILE)).sum()}"

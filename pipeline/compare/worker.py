@@ -1,6 +1,6 @@
 """``python -m pipeline.compare.worker SCANS FOLDER``: one method over all scans, in this process alone.
 
-FOLDER holds method.msgpack; poses and times are written into it scan by scan, so that those until a crash are there.
+FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there.
 """
 
 from __future__ import annotations
@@ -48,8 +48,10 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     for scan in scans.scans():
         asked = perf_counter()
         pose = racer.track(scan)
-        seconds[scan.index] = perf_counter() - asked
-        poses[scan.index] = pose
+        took_s = perf_counter() - asked
+        if not np.isfinite(pose).all():
+            raise ValueError("a pose that is not finite")
+        seconds[scan.index], poses[scan.index] = took_s, pose
     ended = perf_counter()
     trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
     np.save(folder / TRAJECTORY_FILE, trajectory.poses)

@@ -45,7 +45,7 @@ def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
     None for a map that has fallen apart: it would leave too few points to judge the others by.
     """
     eigenvalues = np.array([_eigenvalues(points) for points in maps])
-    good = np.isfinite(eigenvalues).all(axis=2) & (eigenvalues > 0.0).all(axis=2)
+    good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
     held = good.sum(axis=1) >= _HELD * good.sum(axis=1).max(initial=0)
     counts = good[held].all(axis=0)
     if not counts.any():
