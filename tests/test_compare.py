@@ -231,6 +231,7 @@ def test_written_settings_can_be_given_back(good):
 def test_what_does_not_exist_is_refused_by_name(tmp_path):
     refused(("plicp", "icp"), 3, match=r"no method 'icp'; choose among plicp, svd")
     refused(("genz-icp",), 2, match="made for 3D")
+    refused(("plicp", "open3d-p2l"), 2, match="open3d-p2l is made for 3D")
     refused(("plicp", "plicp"), 3, match="twice")
     kiss = toml(tmp_path / "a.toml", "[kiss-icp]\nvoxel_size = 0.5\n")
     refused(("kiss-icp",), 3, kiss, match=r"a\.toml: \[kiss-icp\].*voxel_size.*voxel_size_m")

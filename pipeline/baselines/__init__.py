@@ -28,7 +28,8 @@ class Entry:
     ----------
     make : of its settings; the package is imported there and not before
     package : what versions are known by
-    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these
+    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing tells point-to-
+        plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
     is_raised : whether a 2D scan must be given height, because surfaces are looked for
     forgets : whether a second instance in a process knows nothing of the first
     """
@@ -41,14 +42,14 @@ class Entry:
     forgets: bool = True
 
 
-def _open3d(residual: Residual, *, is_raised: bool) -> Entry:
-    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, PLANAR_OPEN3D, is_raised)
+def _open3d(residual: Residual, planar: Struct | None, *, is_raised: bool = False) -> Entry:
+    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, planar, is_raised)
 
 
 BASELINES: dict[str, Entry] = {
-    "open3d-p2p": _open3d("point-to-point", is_raised=False),
-    "open3d-p2l": _open3d("point-to-plane", is_raised=True),
-    "open3d-gicp": _open3d("plane-to-plane", is_raised=True),
+    "open3d-p2p": _open3d("point-to-point", PLANAR_OPEN3D),
+    "open3d-p2l": _open3d("point-to-plane", None),
+    "open3d-gicp": _open3d("plane-to-plane", PLANAR_OPEN3D, is_raised=True),
     "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
     "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),

@@ -70,8 +70,8 @@ def compare(
     Methods:
       plicp, svd               ours, odometry alone
       plicp+loops, svd+loops   ours, loops closed
-      open3d-p2p, open3d-p2l, open3d-gicp, kiss-icp, small-gicp, small-vgicp
-      genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
+      open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
+      open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
     A table of --settings sets a method, or makes a variant of one, or of a class of yours with the verb of
     pipeline.baselines.Baseline:
 
