@@ -27,6 +27,7 @@ class Figures(Struct, frozen=True):
     disagreement_m: float | None = None
     median_s: float | None = None
     p95_s: float | None = None
+    cpu_s: float | None = None
     first_s: float | None = None
     scans_per_s: float | None = None
     preprocess_s: float | None = None
@@ -113,6 +114,7 @@ COLUMNS = (
     ),
     Column("median_s", "median", "ms", 1e3, 2, "low", True, "time of a scan, all but the first"),
     Column("p95_s", "p95", "ms", 1e3, 2, "low", True, "95th percentile of the same"),
+    Column("cpu_s", "CPU", "ms", 1e3, 2, "low", True, "median CPU time of a scan, all threads together"),
     Column(
         "first_s", "first", "ms", 1e3, 1, "low", False, "time of the first scan, everything compiled and loaded"
     ),

@@ -145,10 +145,12 @@ def _speed(outcomes: Sequence[Outcome]) -> Figures:
         return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)
     rest = np.concatenate([outcome.seconds[1:] for outcome in whole])
     rest = rest if len(rest) else np.concatenate([outcome.seconds for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[min(1, len(outcome.cpu_seconds) - 1) :] for outcome in whole])
     stages = _stages(whole[0])
     return Figures(
         median_s=float(np.median(rest)),
         p95_s=float(np.percentile(rest, 95.0)),
+        cpu_s=float(np.median(cpu)),
         first_s=float(np.median([outcome.seconds[0] for outcome in whole])),
         scans_per_s=float(len(rest) / rest.sum()),
         preprocess_s=stages[0],

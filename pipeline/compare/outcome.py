@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix, Trajectory
 
-POSES_FILE, SECONDS_FILE, TRAJECTORY_FILE, REPORT_FILE = "poses.npy", "seconds.npy", "trajectory.npy", "end.json"
+POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"
+TRAJECTORY_FILE, REPORT_FILE = "trajectory.npy", "end.json"
 
 
 class Status(StrEnum):
@@ -59,7 +60,7 @@ class Outcome:
     report : how it ended
     odometry : (N, d+1, d+1) pose of each scan straight after it came; NaN from where it failed on
     trajectory : the last word, equal to ``odometry`` but for loop closing; empty where it did not come to its end
-    seconds : (N,) on the clock, tracking a scan; NaN like the poses
+    seconds, cpu_seconds : (N,) tracking a scan, on the clock and spent by all threads; NaN like the poses
     folder : where its tables lie
     """
 
@@ -67,6 +68,7 @@ class Outcome:
     odometry: Matrix
     trajectory: Trajectory
     seconds: NDArray[np.float64]
+    cpu_seconds: NDArray[np.float64]
     folder: Path
 
     @property
@@ -80,7 +82,9 @@ def read_outcome(folder: Path, report: EndReport, stamps_ns: NDArray[np.int64], 
     size = dimension + 1
     empty = np.full((len(stamps_ns), size, size), np.nan)
     odometry = np.load(folder / POSES_FILE) if (folder / POSES_FILE).exists() else empty
-    seconds = np.load(folder / SECONDS_FILE) if (folder / SECONDS_FILE).exists() else empty[:, 0, 0]
+    seconds, cpu_seconds = (
+        np.load(folder / file) if (folder / file).exists() else empty[:, 0, 0] for file in (SECONDS_FILE, CPU_FILE)
+    )
     is_whole = report.status is Status.OK
     poses = np.load(folder / TRAJECTORY_FILE) if is_whole else empty[:0]
-    return Outcome(report, odometry, Trajectory(stamps_ns[: len(poses)], poses), seconds, folder)
+    return Outcome(report, odometry, Trajectory(stamps_ns[: len(poses)], poses), seconds, cpu_seconds, folder)

@@ -20,7 +20,7 @@ SCANS_FILE = "per_scan.parquet"
 _NOTES = {
     "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
-    "seconds": "tracking the scan, on the clock",
+    "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
     "distance_m": "travelled up to the scan, by the method itself",
     "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
     "nees": "of the motion up to the scan; null where the method does not tell its covariance",
@@ -64,6 +64,7 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
     travelled_m = path_length(poses) if count else np.empty(0)
     numbers = {
         "seconds": run.outcome.seconds[:count],
+        "cpu_seconds": run.outcome.cpu_seconds[:count],
         **pose_columns(poses),
         **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
         "distance_m": travelled_m,

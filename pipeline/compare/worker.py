@@ -10,7 +10,7 @@ import traceback
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 
 import msgspec
 import numpy as np
@@ -20,6 +20,7 @@ from pipeline.compare import runner
 from pipeline.compare.memory import die_first, peak_mib
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import (
+    CPU_FILE,
     POSES_FILE,
     REPORT_FILE,
     SECONDS_FILE,
@@ -44,14 +45,15 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     size = scans.dimension + 1
     poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
     seconds = open_memmap(folder / SECONDS_FILE, "w+", np.float64, (len(scans),))
-    poses[:], seconds[:] = np.nan, np.nan
+    cpu_seconds = open_memmap(folder / CPU_FILE, "w+", np.float64, (len(scans),))
+    poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
     for scan in scans.scans():
-        asked = perf_counter()
+        asked, cpu_asked = perf_counter(), process_time()
         pose = racer.track(scan)
-        took_s = perf_counter() - asked
+        took_s, cpu_took_s = perf_counter() - asked, process_time() - cpu_asked
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
-        seconds[scan.index], poses[scan.index] = took_s, pose
+        seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose
     ended = perf_counter()
     trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
     np.save(folder / TRAJECTORY_FILE, trajectory.poses)
