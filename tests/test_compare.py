@@ -277,7 +277,7 @@ def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_p
 
 def test_without_truth_there_is_sharpness_and_disagreement_and_it_is_said_that_they_are_none(tmp_path):
     log = shared_data("3d/kitti_0005_first60.mcap")
-    table = run(log, tmp_path, "plicp", "svd", "mine", overrides=(Override("log.every", "6", ""),),
+    table = run(log, tmp_path, "plicp", "svd", "mine", overrides=(Override("log.end_s", "1.6", ""),),
         settings_file=toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:StandsStill"\n'))  # fmt: skip
     assert table.truth == "" and all(each.figures.ate_m is None for each in table.rows)
     sharp = [row(table, name).figures for name in ("plicp", "mine")]
