@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.compare import compare
 from pipeline.commands.config import config
 from pipeline.commands.convert import convert
 from pipeline.commands.doctor import doctor
@@ -43,13 +44,14 @@ def scanchain() -> None:
     """
 
 
-for _command in (run, view, info, doctor, convert, simulate, evaluate, optimize, config, sequence):
+_COMMANDS = (run, view, compare, info, doctor, convert, simulate, evaluate, optimize, config, sequence)
+for _command in _COMMANDS:
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show, _draw, _draw_graph, _record_graph)
+    viewing = Viewing(_record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -111,6 +113,20 @@ def _record_graph(change: GraphChange, path: Path) -> None:
     from viz.graph_recording import record_graph
 
     record_graph(change, path)
+
+
+def _report(directory: Path) -> None:
+    from viz.run_report import write_run_report
+
+    write_run_report(directory)
+
+
+def _present_comparison(directory: Path) -> None:
+    from viz.compare_recording import record_comparison
+    from viz.compare_report import write_compare_report
+
+    write_compare_report(directory)
+    record_comparison(directory)
 
 
 if __name__ == "__main__":

@@ -20,13 +20,14 @@ from pipeline.trajectory import read_tum
 
 PACKAGES = {
     "kiss-icp": "kiss_icp",
+    "small-vgicp": "small_gicp",
     "small-gicp": "small_gicp",
-    "small-gicp-pairs": "small_gicp",
     "genz-icp": "genz_icp",
     "genz-icp-indoor": "genz_icp",
     "genz-icp-kitti": "genz_icp",
     "open3d-p2l": "open3d",
     "open3d-p2p": "open3d",
+    "open3d-gicp": "open3d",
 }
 FAST = [name for name in PACKAGES if name != "genz-icp-indoor"]  # which does not keep up with a car
 NO_TIMES = np.empty(0, np.float32)
@@ -117,7 +118,7 @@ def test_a_missing_package_is_named_with_its_extra(name, monkeypatch):
 
 
 def test_an_unknown_baseline_is_refused_with_the_names_there_are():
-    with pytest.raises(InputError, match="kiss-icp, small-gicp"):
+    with pytest.raises(InputError, match="kiss-icp, small-gicp, small-vgicp"):
         baselines.create("kissicp")
 
 

@@ -543,7 +543,7 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tmp_path):
     assert (code, errors) == (0, "")
     says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE rmse", "over 10 m along the reference", "KITTI: translation")
     tree = json.loads(call("evaluate", estimate, truth, "--align", "first", "--json")[1])
-    assert set(tree) == {"ate", "rpe_1_pose", "rpe_10_m", "kitti"}
+    assert set(tree) == {"ate", "rpe_1_pose", "rpe_1_s", "rpe_10_m", "rpe_100_m", "kitti"}
     assert tree["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)
     assert tree["ate"]["translation_m"]["maximum"] == pytest.approx(0.1 * 20.0 * 2**0.5, rel=1e-6)
     assert tree["kitti"]["translation_share"] == pytest.approx(0.1, rel=0.05)

@@ -29,6 +29,7 @@ from viz import entities
 FILES = {
     "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
     "recording.rrd", "steps.parquet", "loops.parquet", "metrics.json", "summary.txt", "config.toml", "run.json",
+    "report.html", "ground_truth.tum",
 }  # fmt: skip
 NOT_TIMED = (
     "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",

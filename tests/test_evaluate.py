@@ -6,7 +6,7 @@ import re
 import naive_evaluate as naive
 import numpy as np
 import pytest
-from scenes import shared_data
+from scenes import configured, kitti_scans, shared_data
 
 from pipeline import lie
 from pipeline.data import Trajectory
@@ -24,6 +24,7 @@ from pipeline.evaluate import (
     relative_error_over_time,
 )
 from pipeline.evaluate.pairing import nearest
+from pipeline.odometry import Odometry
 from pipeline.trajectory import parse_stamp_ns, read_tum
 
 
@@ -134,6 +135,35 @@ def test_kitti_metric_equals_naive(pairs, every):
     ours = kitti_error(pairs, lengths_m, every=every)
     shares, turns = naive.kitti(pairs.reference, pairs.estimate, lengths_m, every)
     assert ours.stretches == len(shares) == sum(part.stretches for part in ours.by_length)
+    assert ours.translation_share == pytest.approx(np.mean(shares), abs=1e-12)
+    assert ours.rotation_rad_per_m == pytest.approx(np.mean(turns), abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def published():
+    """A real drive: the positions of a GPS/INS and what our odometry makes of the first 30 sweeps."""
+    odometry = Odometry(configured(3), np.eye(4))
+    scans = kitti_scans(30)
+    poses = np.array([odometry.track(scan).T_odom_lidar for scan in scans])
+    estimate = Trajectory(np.array([scan.stamp_ns for scan in scans]), poses)
+    return pair(estimate, read_tum(shared_data("3d/kitti_0001_first54.tum")))
+
+
+def test_ate_and_rpe_of_a_real_drive_equal_evo(published):
+    metrics = pytest.importorskip("evo.core.metrics")
+    reference, estimate = evo_trajectories(published)
+    theirs = metrics.RPE(metrics.PoseRelation.translation_part, 1, metrics.Unit.frames, all_pairs=True)
+    theirs.process_data((reference, estimate))
+    np.testing.assert_allclose(relative_error_over_frames(published, 1).errors_m, theirs.error, atol=1e-9)
+    estimate.align(reference)
+    theirs = metrics.APE(metrics.PoseRelation.translation_part)
+    theirs.process_data((reference, estimate))
+    np.testing.assert_allclose(absolute_error(published).errors_m, theirs.error, atol=1e-9)
+
+
+def test_the_kitti_metric_of_a_real_drive_is_that_of_the_development_kit(published):
+    ours = kitti_error(published, (10.0, 20.0), every=1)
+    shares, turns = naive.kitti(published.reference, published.estimate, (10.0, 20.0), 1)
     assert ours.translation_share == pytest.approx(np.mean(shares), abs=1e-12)
     assert ours.rotation_rad_per_m == pytest.approx(np.mean(turns), abs=1e-9)
 

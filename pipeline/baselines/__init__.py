@@ -3,35 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from msgspec import Struct
 
 from pipeline.baselines.baseline import Baseline
-from pipeline.baselines.genz import GenzIcp
-from pipeline.baselines.gicp import SmallGicpModel, SmallGicpPairs
-from pipeline.baselines.kiss import KissIcp
-from pipeline.baselines.open3d_pairs import Open3dPairs
+from pipeline.baselines.genz import GENZ, GenzIcp, GenzSettings
+from pipeline.baselines.gicp import GICP, PLANAR_GICP, PLANAR_VGICP, VGICP, SmallGicpModel, SmallGicpPairs
+from pipeline.baselines.in_plane import InPlane
+from pipeline.baselines.kiss import KISS, PLANAR_KISS, KissIcp
+from pipeline.baselines.open3d_pairs import OPEN3D, PLANAR_OPEN3D, Open3dPairs, Residual
 from pipeline.errors import InputError
 
-__all__ = ["Baseline", "create", "names"]
+__all__ = ["BASELINES", "Baseline", "Entry", "InPlane", "create", "find", "names"]
 
-_MAKERS: dict[str, Callable[[], Baseline]] = {
-    "kiss-icp": KissIcp,
-    "small-gicp": SmallGicpModel,
-    "small-gicp-pairs": SmallGicpPairs,
-    "genz-icp": GenzIcp,
-    "genz-icp-indoor": lambda: GenzIcp("indoor"),
-    "genz-icp-kitti": lambda: GenzIcp("kitti"),
-    "open3d-p2l": lambda: Open3dPairs("point-to-plane"),
-    "open3d-p2p": lambda: Open3dPairs("point-to-point"),
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A baseline that can be had.
+
+    Attributes
+    ----------
+    make : of its settings; the package is imported there and not before
+    package : what versions are known by
+    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing tells point-to-
+        plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
+    is_raised : whether a 2D scan must be given height, because surfaces are looked for
+    forgets : whether a second instance in a process knows nothing of the first
+    """
+
+    make: Callable[[Any], Baseline]
+    package: str
+    settings: Struct
+    planar: Struct | None
+    is_raised: bool = False
+    forgets: bool = True
+
+
+def _open3d(residual: Residual, planar: Struct | None, *, is_raised: bool = False) -> Entry:
+    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, planar, is_raised)
+
+
+BASELINES: dict[str, Entry] = {
+    "open3d-p2p": _open3d("point-to-point", PLANAR_OPEN3D),
+    "open3d-p2l": _open3d("point-to-plane", None),
+    "open3d-gicp": _open3d("plane-to-plane", PLANAR_OPEN3D, is_raised=True),
+    "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
+    "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
+    "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
+    "genz-icp": Entry(GenzIcp, "genz-icp", GENZ, None, forgets=False),
+    "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
+    "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
 }
 
 
 def names() -> tuple[str, ...]:
-    """The baselines there are, for 3D scans."""
-    return tuple(_MAKERS)
+    """The baselines there are."""
+    return tuple(BASELINES)
+
+
+def find(name: str) -> Entry:
+    """What is known of a baseline. Raises InputError where there is none of that name."""
+    if name not in BASELINES:
+        raise InputError(f"there is no baseline {name!r}; choose among {', '.join(BASELINES)}")
+    return BASELINES[name]
 
 
 def create(name: str) -> Baseline:
-    """A fresh baseline; its package is imported here and not before."""
-    if name not in _MAKERS:
-        raise InputError(f"there is no baseline {name!r}; choose among {', '.join(_MAKERS)}")
-    return _MAKERS[name]()
+    """A fresh baseline for 3D scans, as its authors recommend it."""
+    entry = find(name)
+    return entry.make(entry.settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from pipeline.baselines.at_stamp import AtStamp
@@ -20,6 +21,15 @@ _OUTDOOR = {"voxel_size": 0.6, "desired_num_voxelized_points": 3000, "max_points
 _MAPPING = {"outdoor": _OUTDOOR, "indoor": {}, "kitti": _OUTDOOR | {"planarity_threshold": 0.18}}
 
 
+class GenzSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """The kind of place that its authors tuned it for."""
+
+    place: Place = "outdoor"
+
+
+GENZ = GenzSettings()
+
+
 class GenzIcp:
     """GenZ-ICP as its authors tuned it for a kind of place.
 
@@ -27,7 +37,8 @@ class GenzIcp:
     static variable: a second odometry in the same process goes on with the voxels of the first.
     """
 
-    def __init__(self, place: Place = "outdoor") -> None:
+    def __init__(self, settings: GenzSettings = GENZ) -> None:
+        place = settings.place
         try:
             from genz_icp.config import load_config
             from genz_icp.genz_icp import GenZICP

@@ -5,29 +5,54 @@ from __future__ import annotations
 import importlib
 import os
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.baselines.at_stamp import AtStamp
 from pipeline.baselines.baseline import finite, middle
+from pipeline.config import Count, Positive
 from pipeline.data import Pose, RawPoints
 from pipeline.errors import MissingExtraError
 
-_THINNING_M, _VOXEL_M = 0.25, 1.0  # of small_gicp's own odometry example, as is the rest
-_HORIZON, _CLEAR_CYCLE = 100, 10
+_CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults below
+
+
+class GicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the scan-to-scan odometry. Threads: 0 are all."""
+
+    thinning_m: Positive = 0.25
+    max_distance_m: Positive = 1.0
+    neighbours: Count = 20
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+class VgicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the scan-to-map odometry; voxels not seen for ``horizon`` scans are forgotten. Threads: 0 are all."""
+
+    thinning_m: Positive = 0.25
+    voxel_size_m: Positive = 1.0
+    horizon: Count = 100
+    neighbours: Count = 20
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+GICP, PLANAR_GICP = GicpSettings(), GicpSettings(thinning_m=0.05, max_distance_m=0.5)
+VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(thinning_m=0.05, voxel_size_m=0.3)
 
 
 class SmallGicpModel:
     """Scan to a map of Gaussian voxels (VGICP), started at constant velocity."""
 
-    def __init__(self, threads: int = 0) -> None:
+    def __init__(self, settings: VgicpSettings = VGICP) -> None:
         self.library = _import_small_gicp()
-        self.threads = threads or os.cpu_count() or 1
-        self.map: Any = self.library.GaussianVoxelMap(_VOXEL_M)
-        self.map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
+        self.settings = settings
+        self.threads = settings.threads or os.cpu_count() or 1
+        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
+        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
         self.started = False
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
@@ -37,7 +62,8 @@ class SmallGicpModel:
     def description(self) -> str:
         """What it does and with which parameters."""
         return (
-            f"small_gicp VGICP, scan to map, thinned to {_THINNING_M:g} m, voxels of {_VOXEL_M:g} m, "
+            f"small_gicp VGICP, scan to map, thinned to {self.settings.thinning_m:g} m, voxels of "
+            f"{self.settings.voxel_size_m:g} m, "
             f"{self.threads} threads, constant velocity, no deskewing"
         )
 
@@ -45,7 +71,10 @@ class SmallGicpModel:
         """Register one scan against the map, then add it."""
         frame, times = finite(points, times_s)
         cloud, _ = self.library.preprocess_points(
-            frame, downsampling_resolution=_THINNING_M, num_threads=self.threads
+            frame,
+            downsampling_resolution=self.settings.thinning_m,
+            num_neighbors=self.settings.neighbours,
+            num_threads=self.threads,
         )
         if self.started:
             guess = self.T_odom_lidar @ self.T_previous_current
@@ -61,9 +90,10 @@ class SmallGicpModel:
 class SmallGicpPairs:
     """GICP from each scan to the one before, started at constant velocity."""
 
-    def __init__(self, threads: int = 0) -> None:
+    def __init__(self, settings: GicpSettings = GICP) -> None:
         self.library = _import_small_gicp()
-        self.threads = threads or os.cpu_count() or 1
+        self.settings = settings
+        self.threads = settings.threads or os.cpu_count() or 1
         self.previous: Any = None
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
@@ -73,20 +103,28 @@ class SmallGicpPairs:
     def description(self) -> str:
         """What it does and with which parameters."""
         return (
-            f"small_gicp GICP, scan to scan, thinned to {_THINNING_M:g} m, {self.threads} threads, "
-            "constant velocity, no deskewing"
+            f"small_gicp GICP, scan to scan, thinned to {self.settings.thinning_m:g} m, pairs within "
+            f"{self.settings.max_distance_m:g} m, {self.threads} threads, constant velocity, no deskewing"
         )
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """Register one scan against the last and chain the motions."""
         frame, times = finite(points, times_s)
         cloud, tree = self.library.preprocess_points(
-            frame, downsampling_resolution=_THINNING_M, num_threads=self.threads
+            frame,
+            downsampling_resolution=self.settings.thinning_m,
+            num_neighbors=self.settings.neighbours,
+            num_threads=self.threads,
         )
         if self.previous is not None:
             target, target_tree = self.previous
             answer = self.library.align(
-                target, cloud, target_tree, self.T_previous_current, num_threads=self.threads
+                target,
+                cloud,
+                target_tree,
+                self.T_previous_current,
+                max_correspondence_distance=self.settings.max_distance_m,
+                num_threads=self.threads,
             )
             self.T_previous_current = np.array(answer.T_target_source)
             self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)

@@ -2,33 +2,55 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from pipeline.baselines.at_stamp import AtStamp
 from pipeline.baselines.baseline import finite, middle
+from pipeline.config import Count, NonNegative, Positive
 from pipeline.data import Pose, RawPoints
 from pipeline.errors import MissingExtraError
 
 _DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
 
 
-class KissIcp:
-    """KISS-ICP with its defaults: voxels of max_range / 100, adaptive threshold, all threads."""
+class KissSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Its defaults; its own rule for voxels is a hundredth of the largest range. Threads: 0 are all."""
 
-    def __init__(self, max_range_m: float = 100.0) -> None:
+    min_range_m: NonNegative = 0.0
+    max_range_m: Positive = 100.0
+    voxel_size_m: Positive = 1.0
+    max_points_per_voxel: Count = 20
+    max_iterations: Count = 500
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+KISS = KissSettings()
+PLANAR_KISS = KissSettings(max_range_m=40.0, voxel_size_m=0.4)
+
+
+class KissIcp:
+    """KISS-ICP: point-to-point, scan to map, adaptive threshold."""
+
+    def __init__(self, settings: KissSettings = KISS) -> None:
         try:
             from kiss_icp.config.parser import load_config
             from kiss_icp.kiss_icp import KissICP
         except ImportError:
             raise MissingExtraError("kiss-icp", "baselines") from None
         config = load_config(None)
-        config.data.max_range = max_range_m
-        config.mapping.voxel_size = max_range_m / 100.0
+        config.data.min_range, config.data.max_range = settings.min_range_m, settings.max_range_m
+        config.mapping.voxel_size = settings.voxel_size_m
+        config.mapping.max_points_per_voxel = settings.max_points_per_voxel
+        config.registration.max_num_iterations = settings.max_iterations
+        config.registration.max_num_threads = settings.threads
         self.description = (
-            f"KISS-ICP, point-to-point scan to map, its defaults: max_range {max_range_m:g} m, min_range "
-            f"{config.data.min_range:g} m, voxels of {config.mapping.voxel_size:g} m, all threads, its own "
-            "deskewing where the log has times"
+            f"KISS-ICP, point-to-point scan to map, {settings.min_range_m:g} to {settings.max_range_m:g} m, "
+            f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
+            "the log has times"
         )
         self.odometry = KissICP(config)
         self.at_stamp = AtStamp()

@@ -4,40 +4,48 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.baselines.at_stamp import AtStamp
 from pipeline.baselines.baseline import finite, middle
+from pipeline.config import Count, Positive
 from pipeline.data import Pose, RawPoints
 from pipeline.errors import MissingExtraError
 
-Residual = Literal["point-to-plane", "point-to-point"]
+Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
 
-_VOXEL_M = 0.5
-_MAX_DISTANCE_M = 1.0
-_NORMAL_RADIUS_M, _NORMAL_NEIGHBOURS = 1.5, 20
-_ITERATIONS = 30  # Open3D's default
+
+class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Voxels that scans are thinned out with, how far partners may lie apart, and where normals come from."""
+
+    voxel_size_m: Positive = 0.5
+    max_distance_m: Positive = 1.0
+    normal_radius_m: Positive = 1.5
+    normal_neighbours: Count = 20
+    max_iterations: Count = 30
+
+
+OPEN3D = Open3dSettings()
+PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_radius_m=0.5)
 
 
 class Open3dPairs:
     """Scan-to-scan ICP on thinned clouds, started at constant velocity."""
 
-    def __init__(self, residual: Residual) -> None:
+    def __init__(self, residual: Residual, settings: Open3dSettings = OPEN3D) -> None:
         self.open3d = _import_open3d()
         self.residual = residual
-        estimation = self.open3d.pipelines.registration
-        planes = residual == "point-to-plane"
-        self.estimation: Any = (
-            estimation.TransformationEstimationPointToPlane()
-            if planes
-            else estimation.TransformationEstimationPointToPoint()
-        )
-        self.criteria: Any = estimation.ICPConvergenceCriteria(max_iteration=_ITERATIONS)
+        self.settings = settings
+        registration = self.open3d.pipelines.registration
+        self.register, self.estimation = _means(registration, residual)
+        self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
         self.previous: Any = None
         self.T_odom_lidar = np.eye(4)
         self.T_previous_current = np.eye(4)
@@ -47,8 +55,9 @@ class Open3dPairs:
     def description(self) -> str:
         """What it does and with which parameters."""
         return (
-            f"Open3D registration_icp, {self.residual}, scan to scan, voxels of {_VOXEL_M:g} m, pairs within "
-            f"{_MAX_DISTANCE_M:g} m, {_ITERATIONS} iterations, constant velocity, no deskewing"
+            f"Open3D {self.register.__name__}, {self.residual}, scan to scan, voxels of "
+            f"{self.settings.voxel_size_m:g} m, pairs within {self.settings.max_distance_m:g} m, "
+            f"{self.settings.max_iterations} iterations, constant velocity, no deskewing"
         )
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -56,8 +65,13 @@ class Open3dPairs:
         frame, times = finite(points, times_s)
         cloud = self._cloud(frame)
         if self.previous is not None:
-            answer = self.open3d.pipelines.registration.registration_icp(
-                cloud, self.previous, _MAX_DISTANCE_M, self.T_previous_current, self.estimation, self.criteria
+            answer = self.register(
+                cloud,
+                self.previous,
+                self.settings.max_distance_m,
+                self.T_previous_current,
+                self.estimation,
+                self.criteria,
             )
             self.T_previous_current = np.array(answer.transformation)
             self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)
@@ -66,12 +80,26 @@ class Open3dPairs:
 
     def _cloud(self, points: NDArray[np.float64]) -> Any:
         cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
-        cloud = cloud.voxel_down_sample(_VOXEL_M)
-        if self.residual == "point-to-plane":
+        cloud = cloud.voxel_down_sample(self.settings.voxel_size_m)
+        if self.residual != "point-to-point":
             cloud.estimate_normals(
-                self.open3d.geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS_M, _NORMAL_NEIGHBOURS)
+                self.open3d.geometry.KDTreeSearchParamHybrid(
+                    self.settings.normal_radius_m, self.settings.normal_neighbours
+                )
             )
         return cloud
+
+
+def _means(registration: Any, residual: Residual) -> tuple[Callable[..., Any], Any]:
+    """Open3D's function for a residual, and the estimation that it takes."""
+    if residual == "plane-to-plane":
+        return (
+            registration.registration_generalized_icp,
+            registration.TransformationEstimationForGeneralizedICP(),
+        )
+    if residual == "point-to-plane":
+        return registration.registration_icp, registration.TransformationEstimationPointToPlane()
+    return registration.registration_icp, registration.TransformationEstimationPointToPoint()
 
 
 def _import_open3d() -> ModuleType:

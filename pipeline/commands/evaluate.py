@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +17,7 @@ from pipeline.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.data import Trajectory
-    from pipeline.evaluate import AbsoluteError, KittiError, RelationError, RelativeError
+    from pipeline.evaluate import AbsoluteError, KittiError, Pairs, RelationError, RelativeError
 
     Result = AbsoluteError | RelativeError | KittiError | RelationError
 
@@ -34,6 +36,13 @@ _PATH = click.Path(path_type=Path)
     help="How the frames are brought together for the ATE.",
 )
 @click.option("--max-difference", type=float, metavar="SECONDS", help="Between stamps that pair. [default: 0.01]")
+@click.option(
+    "--rpe",
+    default="1pose,1s,10m,100m",
+    show_default=True,
+    metavar="LIST",
+    help="Stretches of the RPE: poses, seconds or metres, with commas.",
+)
 @click.option("--kitti", is_flag=True, help="Both files are KITTI's, 12 numbers a line; poses pair line by line.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def evaluate(
@@ -42,6 +51,7 @@ def evaluate(
     relations: Path | None,
     align: str,
     max_difference: float | None,
+    rpe: str,
     kitti: bool,
     as_json: bool,
 ) -> None:
@@ -53,7 +63,7 @@ def evaluate(
     Examples:
       scanchain evaluate runs/log/trajectory.tum truth.tum
       scanchain evaluate runs/intel/trajectory.tum --relations intel.relations
-      scanchain evaluate runs/log/trajectory.tum truth.tum --align first --json
+      scanchain evaluate runs/log/trajectory.tum truth.tum --align first --rpe 5s,50m --json
     """
     from pipeline.evaluate import PAIRING_LIMIT_S, read_relations, relation_error
     from pipeline.trajectory import read_kitti, read_tum
@@ -67,7 +77,7 @@ def evaluate(
         limit_s = PAIRING_LIMIT_S if max_difference is None else max_difference
         if not 0.0 <= limit_s < inf:
             raise InputError(f"--max-difference is {limit_s:g} s; choose a number from 0 up")
-        results = _against(trajectory, read(reference), align, limit_s)
+        results = _against(trajectory, read(reference), align, limit_s, _stretches(rpe))
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     click.echo(_json(results) if as_json else _text(results))
@@ -81,7 +91,44 @@ class Results:
     missing: dict[str, str]
 
 
-def _against(trajectory: Trajectory, reference: Trajectory, align: str, limit_s: float) -> Results:
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """What an RPE is taken over: so many ``pose``, ``s`` or ``m``."""
+
+    size: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """Of its figures."""
+        return f"rpe_{self.size:g}_{self.unit}"
+
+    def error(self, pairs: Pairs) -> RelativeError:
+        """Raises InputError where it does not fit."""
+        from pipeline import evaluate as metrics
+
+        if self.unit == "pose":
+            return metrics.relative_error_over_frames(pairs, int(self.size))
+        if self.unit == "s":
+            return metrics.relative_error_over_time(pairs, self.size)
+        return metrics.relative_error_over_distance(pairs, self.size)
+
+
+_STRETCH = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
+
+
+def _stretches(text: str) -> list[Stretch]:
+    """Of ``1pose,0.5s,10m``."""
+    found = [(word, _STRETCH.fullmatch(word.strip())) for word in text.split(",")]
+    for word, match in found:
+        if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
+            raise InputError(f"--rpe has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
+    return [Stretch(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
+
+
+def _against(
+    trajectory: Trajectory, reference: Trajectory, align: str, limit_s: float, stretches: list[Stretch]
+) -> Results:
     """Every metric that the trajectories allow."""
     from pipeline.evaluate import (
         Alignment,
@@ -89,15 +136,12 @@ def _against(trajectory: Trajectory, reference: Trajectory, align: str, limit_s:
         kitti_error,
         lengths_for,
         pair,
-        relative_error_over_distance,
-        relative_error_over_frames,
     )
 
     pairs = pair(trajectory, reference, limit_s=limit_s)
     absolute = absolute_error(pairs, Alignment(align))
     metrics: dict[str, Callable[[], Result]] = {
-        "rpe_1_pose": lambda: relative_error_over_frames(pairs),
-        "rpe_10_m": lambda: relative_error_over_distance(pairs, 10.0),
+        **{stretch.name: partial(stretch.error, pairs) for stretch in stretches},
         "kitti": lambda: kitti_error(pairs, lengths_for(absolute.path_length_m)),
     }
     results = Results({"ate": absolute}, {})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
@@ -73,7 +74,7 @@ def run(
     from pipeline.runs.run import Job
     from pipeline.runs.run import run as run_log
 
-    truth_file, truth_topic = _ground_truth(gt)
+    truth_file, truth_topic = ground_truth(gt)
     job = Job(
         logs=logs,
         out=out,
@@ -86,7 +87,7 @@ def run(
     )
     viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
-        finished = run_log(job, viewing.record, terminal)
+        finished = run_log(job, viewing.record, terminal, viewing.report)
     for warning in finished.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
@@ -124,13 +125,3 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
-
-
-def _ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
-    if text is None:
-        return None, ()
-    path = Path(text)
-    if text.startswith("/") and not path.exists() and not path.suffix:
-        return None, (Override("log.ground_truth_topic", text, "--gt"),)
-    return path, ()

@@ -1,7 +1,9 @@
-"""How good a trajectory is: ATE, RPE, the KITTI metric, relations; each result says what it measures."""
+"""How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
 
 from pipeline.evaluate.absolute import AbsoluteError, absolute_error
 from pipeline.evaluate.alignment import Alignment, align
+from pipeline.evaluate.consistency import motion_nees
+from pipeline.evaluate.disagreement import disagreement
 from pipeline.evaluate.kitti import (
     KITTI_LENGTHS_M,
     SHORT_LENGTHS_M,
@@ -11,6 +13,7 @@ from pipeline.evaluate.kitti import (
     lengths_for,
 )
 from pipeline.evaluate.pairing import PAIRING_LIMIT_S, Pairs, pair
+from pipeline.evaluate.reference import read_reference
 from pipeline.evaluate.relations import (
     RELATION_LIMIT_S,
     RelationError,
@@ -24,6 +27,7 @@ from pipeline.evaluate.relative import (
     relative_error_over_frames,
     relative_error_over_time,
 )
+from pipeline.evaluate.sharpness import Sharpness, sampled_map, sampling_step, sharpness
 from pipeline.evaluate.statistics import Statistics
 
 __all__ = [
@@ -39,15 +43,22 @@ __all__ = [
     "RelationError",
     "Relations",
     "RelativeError",
+    "Sharpness",
     "Statistics",
     "absolute_error",
     "align",
+    "disagreement",
     "kitti_error",
     "lengths_for",
+    "motion_nees",
     "pair",
+    "read_reference",
     "read_relations",
     "relation_error",
     "relative_error_over_distance",
     "relative_error_over_frames",
     "relative_error_over_time",
+    "sampled_map",
+    "sampling_step",
+    "sharpness",
 ]

@@ -140,8 +140,10 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"accepted; chi2 {m.chi2:.4g}",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {1e3 * m.median_residual_m:.1f} mm, {m.median_iterations:.0f} iterations (medians)",
-        f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time; "
-        f"median ms a scan: " + ", ".join(f"{stage} {m.median_ms[stage]:.2f}" for stage in STAGES),
+        f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
+        "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
+        "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
+        "  95 % below   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
     ]
     if m.ground_truth is not None:
         lines += _accuracy_lines(m.ground_truth)

@@ -50,6 +50,13 @@ class Provenance(Struct, frozen=True):
         """Write as JSON."""
         path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
+    def hashed(self, hashing: Hashing) -> Provenance:
+        """With the hashes of its logs, waited for."""
+        digests = zip(self.logs, hashing.digests(), strict=True)
+        return msgspec.structs.replace(
+            self, logs=[msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
+        )
+
 
 def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: str) -> Provenance:
     """What is known when a run starts."""
@@ -64,7 +71,7 @@ def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: 
         python=platform.python_version(),
         platform=platform.platform(),
         cores=os.cpu_count() or 0,
-        versions={name: _version(name) for name in _PACKAGES},
+        versions={name: package_version(name) for name in _PACKAGES},
     )
 
 
@@ -110,7 +117,8 @@ class Hashing:
                 digest.update(block)
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str:
+    """The installed version of a distribution, empty where there is none."""
     try:
         return version(package)
     except PackageNotFoundError:

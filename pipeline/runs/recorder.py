@@ -87,11 +87,14 @@ class Viewing:
     """What the commands ask of a viewer.
 
     ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
+    ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
     ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording.
     """
 
     record: OpenRecorder
     show: Callable[[Path, bool], None]
     draw: Callable[[Path, Path], None]
+    report: Callable[[Path], None]
+    present_comparison: Callable[[Path], None]
     draw_graph: Callable[[GraphChange, Path], None]
     record_graph: Callable[[GraphChange, Path], None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -28,6 +29,12 @@ from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
 from pipeline.trajectory import read_tum, write_tum
+
+TRUTH_FILE = "ground_truth.tum"
+
+
+def _no_report(folder: Path) -> None:
+    """Nobody wants one: for scripts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +77,10 @@ class PartialRunError(ScanchainError):
     """A run that failed after some scans; what there is lies in a directory marked partial."""
 
 
-def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
-    """Open the log, process it, write the run directory.
+def run(
+    job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None] = _no_report
+) -> Finished:
+    """Open the log, process it, write the run directory, to which ``report`` adds its page in the end.
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
@@ -91,7 +100,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
         (directory.path / "config.toml").write_text(dump(settings.config), encoding="utf-8")
         try:
             recorded = _process(job, log, settings.config, directory.path, record, progress, steps)
-            truth, note = _judge(job, log, recorded.result, reference)
+            truth, note = _judge(job, log, recorded.result, reference, directory.path)
             warnings = (*log.damage, *recorded.warnings, *note)
             run_s = perf_counter() - started - recorded.held_s
             metrics = measure(steps, recorded.result, recorded.judged, run_s=run_s, ground_truth=truth)
@@ -99,7 +108,7 @@ def run(job: Job, record: OpenRecorder, progress: Progress) -> Finished:
             text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
             metrics.write(directory.path / "metrics.json")
             (directory.path / "summary.txt").write_text(text, encoding="utf-8")
-            _complete(directory, provenance, hashing, stopped, run_s)
+            warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
         except (Exception, KeyboardInterrupt) as error:
             raise _rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
@@ -176,7 +185,7 @@ def _hold(recording: Recorder, progress: Progress) -> float:
 
 
 def _judge(
-    job: Job, log: Log, result: SlamResult, reference: Trajectory | None
+    job: Job, log: Log, result: SlamResult, reference: Trajectory | None, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
     """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
     source = str(job.ground_truth) if reference is not None else log.config.ground_truth_topic
@@ -185,7 +194,9 @@ def _judge(
     if reference is None:
         return None, ()
     try:
-        return judge(result, reference, source), ()
+        truth = judge(result, reference, source)
+        write_tum(folder / TRUTH_FILE, reference)
+        return truth, ()
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
 
@@ -201,19 +212,33 @@ def _heading(log: Log, stopped: str) -> str:
 
 
 def _complete(
-    directory: RunDirectory, provenance: Provenance, hashing: Hashing, stopped: str, duration_s: float
-) -> None:
-    """Give a whole run its name; one that was stopped stays marked partial."""
+    directory: RunDirectory,
+    provenance: Provenance,
+    hashing: Hashing,
+    stopped: str,
+    duration_s: float,
+    report: Callable[[Path], None],
+) -> tuple[str, ...]:
+    """Give a whole run its name; one that was stopped stays marked partial. What went wrong with the report."""
     if stopped:
         directory.worth_keeping()
         replaced = msgspec.structs.replace(provenance, stopped=stopped, duration_s=duration_s)
         replaced.write(directory.path / RUN_FILE)
-        return
-    digests = zip(provenance.logs, hashing.digests(), strict=True)
-    logs = [msgspec.structs.replace(file, sha256=sha256) for file, sha256 in digests]
-    replaced = msgspec.structs.replace(provenance, complete=True, duration_s=duration_s, logs=logs)
+        return _report(directory.path, report)
+    replaced = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=duration_s)
     replaced.write(directory.path / RUN_FILE)
+    warnings = _report(directory.path, report)
     directory.complete()
+    return warnings
+
+
+def _report(folder: Path, report: Callable[[Path], None]) -> tuple[str, ...]:
+    """A report that fails must not fail the run."""
+    try:
+        report(folder)
+    except Exception as error:
+        return (f"no report.html: {type(error).__name__}: {error}",)
+    return ()
 
 
 def _rescued(

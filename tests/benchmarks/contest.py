@@ -88,7 +88,7 @@ def read(path: Path, count: int) -> Recording:
 def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
     """Ours and all others that are worth a row; GenZ-ICP as its authors tuned it for such a log."""
     genz = "genz-icp-indoor" if indoor else "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
-    return (*OURS, "kiss-icp", "small-gicp", "small-gicp-pairs", genz, "open3d-p2l")
+    return (*OURS, "kiss-icp", "small-vgicp", "small-gicp", genz, "open3d-p2l")
 
 
 def create(name: str) -> Baseline:

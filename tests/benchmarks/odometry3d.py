@@ -23,10 +23,19 @@ import numpy as np
 from pipeline import lie
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
-from pipeline.evaluate import SHORT_LENGTHS_M, absolute_error, kitti_error, pair, relative_error_over_frames
+from pipeline.evaluate import (
+    SHORT_LENGTHS_M,
+    Sharpness,
+    absolute_error,
+    kitti_error,
+    pair,
+    relative_error_over_frames,
+    sampled_map,
+    sampling_step,
+    sharpness,
+)
 from tests.benchmarks.contest import OURS, Recording, Run, default_methods, in_fresh_process, read, run_all
 from tests.benchmarks.peak_memory import PeakMemory, measure
-from tests.benchmarks.sharpness import Sharpness, sharpness
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data")) / "3d"
@@ -35,7 +44,7 @@ LEGEND = """\
   x: over the same of the first row of ours; CPU ms: median, all threads together
   peak: resident memory of a process that reads the log and runs this method only; growth: of it, after one scan
   ATE: rmse after rigid alignment; RPE: rmse from scan to scan; KITTI: mean over all stretches of 10, 20 and 40 m
-  entropy, planes: mean map entropy and plane thickness, lower is sharper (defined in sharpness.py)
+  entropy, planes: mean map entropy and plane thickness, lower is sharper (pipeline.evaluate.sharpness)
   to KISS: median distance between the motion of a scan and that which KISS-ICP finds"""
 
 
@@ -76,10 +85,11 @@ def run_log(path: Path, methods: tuple[str, ...], scans: int, quick: bool) -> No
     recording = read(path, scans)
     runs = run_all(recording, methods)
     whole = [run for run in runs if run.is_whole]
-    sharp: dict[str, Sharpness] = {}
+    sharp: dict[str, Sharpness | None] = {}
     memory: dict[str, PeakMemory | None] = {}
     if not quick:
-        answers = sharpness(recording, [run.trajectory for run in whole])
+        step = sampling_step(sum(len(scan.points) for scan in recording.scans))
+        answers = sharpness([sampled_map(recording.scans, run.trajectory, step) for run in whole])
         sharp = {run.name: answer for run, answer in zip(whole, answers, strict=True)}
         memory = {run.name: measure(path, run.name, len(recording.scans)) for run in runs}
     report(path, recording, runs, sharp, memory)
@@ -89,7 +99,7 @@ def report(
     path: Path,
     recording: Recording,
     runs: list[Run],
-    sharp: dict[str, Sharpness],
+    sharp: dict[str, Sharpness | None],
     memory: dict[str, PeakMemory | None],
 ) -> None:
     """One line a method, then what each one did."""
@@ -145,7 +155,7 @@ def _memory(memory: PeakMemory | None) -> tuple[float, float]:
 
 
 def _sharpness(sharp: Sharpness | None) -> tuple[float, float]:
-    return (sharp.mean_map_entropy, 1e3 * sharp.plane_thickness_m) if sharp else (np.nan, np.nan)
+    return (sharp.mean_map_entropy, 1e3 * sharp.thickness_m) if sharp else (np.nan, np.nan)
 
 
 def main() -> None:

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
 from pipeline.config import LogConfig
-from pipeline.data import Matrix, Pose, State
+from pipeline.data import Matrix, State
+from pipeline.evaluate import motion_nees
 from pipeline.logs import open_log
-from pipeline.odometry import Odometry, Tracked
+from pipeline.odometry import Odometry
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import Drive, plan
 from pipeline.simulate.information import information, spectrum
@@ -69,18 +69,10 @@ def trust(path: Path, drive: Drive) -> Trust:
             angles[k] = _angle_deg(step.match.degeneracy_direction, twists[all_shares < BLIND_SHARE], H)
     judged = np.arange(len(steps)) >= WARM_UP_SCANS
     blind, sound = judged & (shares < BLIND_SHARE), judged & (shares > SOUND_SHARE)
-    pairs = [k for k in range(WARM_UP_SCANS, len(steps)) if not (flags[k] or flags[k - 1])]
-    nees = [_nees(steps[k - 1], steps[k], truth.poses[k - 1], truth.poses[k]) for k in pairs]
-    return Trust(np.array(nees), angles[blind & flags], flags[blind], flags[sound])
-
-
-def _nees(before: Tracked, now: Tracked, T_before: Pose, T_now: Pose) -> float:
-    """ξᵀ Σ⁻¹ ξ of the motion between two scans, each of which errs by itself."""
-    motion = lie.inverse(before.T_odom_lidar) @ now.T_odom_lidar
-    error = lie.log(lie.inverse(lie.inverse(T_before) @ T_now) @ motion)
-    Ad = lie.adjoint(lie.inverse(motion))
-    covariance = np.linalg.pinv(now.match.information) + Ad @ np.linalg.pinv(before.match.information) @ Ad.T
-    return float(error @ np.linalg.pinv(covariance) @ error)
+    covariances = np.linalg.pinv(np.array([step.match.information for step in steps]), hermitian=True)
+    nees = motion_nees(np.array([step.T_odom_lidar for step in steps]), covariances, truth.poses)
+    sure = judged[1:] & ~flags[1:] & ~flags[:-1]
+    return Trust(6.0 * nees[sure], angles[blind & flags], flags[blind], flags[sound])
 
 
 def _angle_deg(named: NDArray[np.float64], blind: Matrix, H: Matrix) -> float:

@@ -1,0 +1,122 @@
+"""``scanchain compare``: which method is better on a log."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.errors import ScanchainError
+from pipeline.settings import Override
+
+if TYPE_CHECKING:
+    from pipeline.runs.recorder import Viewing
+
+_PATH = click.Path(path_type=Path)
+_MIB_PER_GIB = 1024.0
+
+
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
+@click.option("--methods", metavar="LIST", help="Names with commas. [default: all that make sense for the log]")
+@click.option("--out", metavar="DIR", type=_PATH, help="Directory to make. [default: runs/compare-LOG]")
+@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
+@click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
+@click.option("--settings", metavar="FILE", type=_PATH, help="TOML: a table of settings a method.")
+@click.option(
+    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, in turn."
+)
+@click.option(
+    "--time-limit",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="SECONDS",
+    help="What a run may take. [default: 300 and one a scan]",
+)
+@click.option(
+    "--memory-limit",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="GIB",
+    help="What a run may take. [default: three quarters of what is free]",
+)
+@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
+@click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
+@click.pass_context
+def compare(
+    ctx: click.Context,
+    logs: tuple[Path, ...],
+    methods: str | None,
+    out: Path | None,
+    gt: str | None,
+    relations: Path | None,
+    settings: Path | None,
+    repeat: int,
+    time_limit: float | None,
+    memory_limit: float | None,
+    topic: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Run several odometries over the same decoded scans: accuracy, speed, memory, a report, a recording.
+
+    Every method has a process of its own; one that crashes, hangs or takes all memory is a row that says so, and
+    the exit code is 1. Ours get no wheel odometry unless --odometry.prior auto says so, since no other has it.
+
+    \b
+    Methods:
+      plicp, svd               ours, odometry alone
+      plicp+loops, svd+loops   ours, loops closed
+      open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
+      open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
+    A table of --settings sets a method, or makes a variant of one, or of a class of yours with the verb of
+    pipeline.baselines.Baseline:
+
+    \b
+      [kiss-icp]
+      voxel_size_m = 0.5
+      [plicp-fine]
+      method = "plicp"
+      local_map.voxel_size_m = 0.5
+      [mine]
+      method = "my_package.odometry:MyOdometry"
+
+    \b
+    Examples:
+      scanchain compare log.mcap
+      scanchain compare log.mcap --methods plicp,svd,kiss-icp --repeat 5 --out runs/three
+      scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
+      scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --log.end_s 600
+    """
+    from pipeline.commands.terminal import Terminal
+    from pipeline.compare.compare import Contest
+    from pipeline.compare.compare import compare as run_contest
+    from pipeline.compare.table import TABLE_FILE, text
+
+    truth_file, truth_topic = ground_truth(gt)
+    shortcuts = (Override("log.topic", topic, "--topic"),) if topic else ()
+    contest = Contest(
+        logs=logs,
+        out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
+        methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
+        settings_file=settings,
+        overrides=(*shortcuts, *truth_topic, *overrides(ctx)),
+        ground_truth=truth_file,
+        relations=relations,
+        repeat=repeat,
+        time_s=time_limit,
+        memory_mib=None if memory_limit is None else _MIB_PER_GIB * memory_limit,
+        force=force,
+        command=tuple(sys.argv),
+    )
+    viewing: Viewing = ctx.obj
+    with Terminal("scans") as terminal:
+        compared = run_contest(contest, viewing.present_comparison, terminal)
+    click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
+    if not as_json:
+        click.echo(f"written {contest.out}: report.html, compare.rrd, tables")
+    if compared.failures:
+        raise ScanchainError(f"did not come to their end: {', '.join(compared.failures)}; the table says how")

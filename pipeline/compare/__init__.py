@@ -1,0 +1,1 @@
+"""Several odometries on the very same decoded scans, each in a process of its own."""

@@ -1,0 +1,127 @@
+"""Which method is better on a log: scans decoded once, every method over them, figures, tables, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import msgspec
+import numpy as np
+
+from pipeline import lie
+from pipeline.compare.evidence import Evidence, Reference, write_evidence
+from pipeline.compare.judging import judge
+from pipeline.compare.maps import maps_of
+from pipeline.compare.methods import default_names, resolve
+from pipeline.compare.race import limits_for, race
+from pipeline.compare.scan_store import StoredScans, store
+from pipeline.compare.summary import summarise
+from pipeline.compare.table import Table, write_table
+from pipeline.data import Trajectory
+from pipeline.errors import InputError
+from pipeline.evaluate import pair, read_reference, read_relations, relation_error
+from pipeline.logs import Log, open_log
+from pipeline.runs.directory import RUN_FILE, RunDirectory
+from pipeline.runs.progress import Progress
+from pipeline.runs.provenance import Hashing, describe_start
+from pipeline.settings import Override, load_settings
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """What is to be compared.
+
+    Attributes
+    ----------
+    logs : the files of one log
+    out : the directory to make
+    methods : names; none are all that make sense
+    settings_file : a table a method; overrides : keys of the configuration, for the log and all of ours
+    ground_truth : a TUM or KITTI file; None where the log's own is good
+    relations : a file of relations
+    repeat : runs of every method, in turn
+    time_s, memory_mib : limits of a run; None for the default ones
+    force : whether a directory of that name is replaced
+    command : the command line, for the report
+    """
+
+    logs: tuple[Path, ...]
+    out: Path
+    methods: tuple[str, ...] = ()
+    settings_file: Path | None = None
+    overrides: tuple[Override, ...] = ()
+    ground_truth: Path | None = None
+    relations: Path | None = None
+    repeat: int = 1
+    time_s: float | None = None
+    memory_mib: float | None = None
+    force: bool = False
+    command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A comparison that came to its end, failed methods or not."""
+
+    path: Path
+    table: Table
+
+    @property
+    def failures(self) -> list[str]:
+        """Names of the methods that began and did not end well."""
+        return [row.name for row in self.table.rows if row.status.is_failure]
+
+
+def compare(contest: Contest, present: Callable[[Path], None], progress: Progress) -> Compared:
+    """Run the contest and write its directory; ``present`` adds report and recording to what lies there.
+
+    Raises InputError for bad input before anything is run.
+    """
+    began = perf_counter()
+    log = open_log(contest.logs, load_settings(overrides=contest.overrides).config.log)
+    names = contest.methods or default_names(log.dimension)
+    methods = resolve(names, log.dimension, file=contest.settings_file, overrides=contest.overrides)
+    directory = RunDirectory(contest.out, force=contest.force)
+    provenance = describe_start(contest.command, contest.logs, ", ".join(names))
+    with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
+        scans = store(progress.track(log.scans(), log.scan_count), log.T_base_lidar, Path(shared))
+        reference = _reference(contest, log, scans)
+        limits = limits_for(len(scans), contest.time_s, contest.memory_mib)
+        outcomes = race(methods, scans, Path(shared), repeat=contest.repeat, limits=limits, progress=progress)
+        progress.say("judging and drawing")
+        judged = {name: judge(runs, reference.truth, reference.relations) for name, runs in outcomes.items()}
+        evidence = Evidence(methods, scans, outcomes, judged, maps_of(scans, outcomes), reference)
+        write_evidence(directory.path, evidence)
+        provenance = msgspec.structs.replace(provenance.hashed(hashing), complete=True)
+        provenance = msgspec.structs.replace(provenance, duration_s=perf_counter() - began)
+        provenance.write(directory.path / RUN_FILE)
+        table = summarise(evidence, log, limits, provenance)
+        write_table(directory.path, table)
+        present(directory.path)
+        directory.complete()
+    return Compared(directory.path, table)
+
+
+def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
+    """What errors are against, checked to fit the log before any method is run."""
+    standing = Trajectory(scans.stamps_ns, np.tile(lie.identity(scans.dimension), (len(scans), 1, 1)))
+    relations, note = None, ""
+    if contest.relations is not None:
+        relations = read_relations(contest.relations)
+        relation_error(standing, relations)
+    truth, source = log.ground_truth(), log.ground_truth_topic
+    if contest.ground_truth is not None:
+        truth, source = read_reference(contest.ground_truth, scans.stamps_ns), str(contest.ground_truth)
+    if truth is not None:
+        try:
+            pair(standing, truth)
+        except InputError as error:
+            if contest.ground_truth is not None:
+                raise
+            truth, note = None, f"no accuracy against {source}: {error}"
+    sources = [source] if truth is not None else []
+    sources += [str(contest.relations)] if relations is not None else []
+    return Reference(truth, relations, " and ".join(sources), note)

@@ -1,0 +1,81 @@
+"""What a comparison found, and its files beside the table."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tomli_w
+
+from pipeline.compare.judging import Judged, representative
+from pipeline.compare.maps import picture_points
+from pipeline.compare.methods import Method
+from pipeline.compare.outcome import Outcome
+from pipeline.compare.runner import CLOSURES_FILE, STEPS_FILE
+from pipeline.compare.scan_store import StoredScans
+from pipeline.compare.scan_table import RunOfMethod, write_scans
+from pipeline.data import Points, Trajectory
+from pipeline.evaluate import Relations
+from pipeline.maps import write_ply
+from pipeline.trajectory import write_tum
+
+SCANS_FILE, SETTINGS_FILE, TRUTH_FILE = "per_scan.parquet", "settings.toml", "ground_truth.tum"
+METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tum"
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What errors are against: poses, relations, both or nothing; ``source`` says where they come from."""
+
+    truth: Trajectory | None
+    relations: Relations | None
+    source: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """All runs of all methods by name, what was found of each, and the map (M, d) of each that came to its end."""
+
+    methods: Sequence[Method]
+    scans: StoredScans
+    outcomes: Mapping[str, list[Outcome]]
+    judged: Mapping[str, Judged]
+    maps: Mapping[str, Points]
+    reference: Reference
+
+
+def write_evidence(folder: Path, evidence: Evidence) -> None:
+    """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
+    runs = [
+        RunOfMethod(name, repeat, outcome, evidence.judged[name])
+        for name, outcomes in evidence.outcomes.items()
+        for repeat, outcome in enumerate(outcomes)
+    ]
+    write_scans(folder / SCANS_FILE, runs, evidence.scans.stamps_ns)
+    if evidence.reference.truth is not None:
+        write_tum(folder / TRUTH_FILE, evidence.reference.truth)
+    settings = {method.name: {"method": method.base} | method.settings for method in evidence.methods}
+    (folder / SETTINGS_FILE).write_text(tomli_w.dumps(settings), encoding="utf-8")
+    for method in evidence.methods:
+        _write_method(method_folder(folder, method.name), evidence, method.name)
+
+
+def method_folder(folder: Path, name: str) -> Path:
+    """Where the files of a method lie."""
+    return folder / METHODS_FOLDER / name.replace("/", "_")
+
+
+def _write_method(own: Path, evidence: Evidence, name: str) -> None:
+    outcome, judged = representative(evidence.outcomes[name]), evidence.judged[name]
+    own.mkdir(parents=True)
+    if outcome.is_whole:
+        write_tum(own / TRAJECTORY_FILE, outcome.trajectory)
+    if name in evidence.maps:
+        write_ply(own / MAP_FILE, picture_points(evidence.maps[name], judged))
+    for file in (STEPS_FILE, CLOSURES_FILE, "output.txt"):
+        source = outcome.folder / file
+        if source.exists() and source.stat().st_size:
+            shutil.copy(source, own / file)

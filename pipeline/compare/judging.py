@@ -1,0 +1,193 @@
+"""Figures of what methods did: against the truth, against relations, against each other, and by the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from pipeline.compare.figures import Figures
+from pipeline.compare.outcome import Outcome
+from pipeline.compare.runner import STEPS_FILE
+from pipeline.data import Matrix, Pose, Trajectory
+from pipeline.errors import InputError
+from pipeline.evaluate import (
+    KITTI_LENGTHS_M,
+    AbsoluteError,
+    Alignment,
+    Pairs,
+    Relations,
+    absolute_error,
+    kitti_error,
+    lengths_for,
+    pair,
+    relation_error,
+    relative_error_over_distance,
+    relative_error_over_time,
+)
+from pipeline.runs.consistency import COLUMNS, nees_of_steps
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A method against the truth, scan by scan.
+
+    Attributes
+    ----------
+    figures : what it amounts to
+    T_reference_estimate : (4, 4) the alignment of the ATE, the identity without truth
+    errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
+    definitions : what was computed, in words
+    """
+
+    figures: Figures
+    T_reference_estimate: Pose
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    nees: NDArray[np.float64]
+    definitions: tuple[str, ...]
+
+
+def judge(outcomes: Sequence[Outcome], truth: Trajectory | None, relations: Relations | None) -> Judged:
+    """A method's runs; the first whole one stands for all, times are those of all."""
+    outcome = representative(outcomes)
+    figures = _speed(outcomes)
+    blank = np.full(len(outcome.seconds), np.nan)
+    judged = Judged(figures, np.eye(4), blank, blank, blank, ())
+    if not outcome.is_whole:
+        return judged
+    figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
+    definitions: tuple[str, ...] = ()
+    if relations is not None:
+        error = relation_error(outcome.trajectory, relations)
+        definitions = (error.definition,)
+        figures = msgspec.structs.replace(
+            figures, relations_m=error.translation_m.mean, relations_rad=error.rotation_rad.mean
+        )
+    judged = Judged(figures, np.eye(4), blank, blank, blank, definitions)
+    return judged if truth is None else _against(truth, outcome, judged)
+
+
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """The first whole run, else the first."""
+    return next((outcome for outcome in outcomes if outcome.is_whole), outcomes[0])
+
+
+def degeneracy(outcome: Outcome) -> NDArray[np.float64]:
+    """(N,) smallest eigenvalue of the information per inlier; empty where the method does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.empty(0)
+    return pq.read_table(path, columns=["degeneracy_eigenvalue"])["degeneracy_eigenvalue"].to_numpy()
+
+
+def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
+    pairs = pair(outcome.trajectory, truth)
+    ate = _absolute(pairs)
+    lengths_m = lengths_for(ate.path_length_m)
+    every = 10 if lengths_m == KITTI_LENGTHS_M else 1
+    kitti = _or_none(lambda: kitti_error(pairs, lengths_m, every=every))
+    second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
+    stretches = [
+        _or_none(lambda length_m=length_m: relative_error_over_distance(pairs, length_m))
+        for length_m in (10.0, 100.0)
+    ]
+    nees = _nees(outcome, truth)
+    place = pairs.indices[:, 0]
+    errors_m, errors_rad = judged.errors_m.copy(), judged.errors_rad.copy()
+    errors_m[place], errors_rad[place] = ate.errors_m, ate.errors_rad
+    figures = msgspec.structs.replace(
+        judged.figures,
+        ate_m=ate.translation_m.rmse,
+        ate_share=ate.share_of_path if ate.path_length_m else None,
+        ate_rotation_rad=ate.rotation_rad.rmse,
+        rpe_1_s_m=None if second is None else second.translation_m.rmse,
+        rpe_10_m_m=None if stretches[0] is None else stretches[0].translation_m.rmse,
+        rpe_100_m_m=None if stretches[1] is None else stretches[1].translation_m.rmse,
+        kitti_share=None if kitti is None else kitti.translation_share,
+        kitti_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
+        paired_share=pairs.share,
+        nees=float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
+    )
+    found = [ate.definition, *(each.definition for each in (second, *stretches, kitti) if each is not None)]
+    definitions = (*judged.definitions, *found)
+    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, definitions)
+
+
+def _absolute(pairs: Pairs) -> AbsoluteError:
+    try:
+        return absolute_error(pairs)
+    except InputError:  # a way on a line leaves the alignment a free rotation
+        return absolute_error(pairs, Alignment.FIRST)
+
+
+def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
+    """(N,) of the motion up to each scan; NaN where the method does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.full(len(outcome.seconds), np.nan)
+    odometry = Trajectory(outcome.trajectory.stamps_ns, outcome.odometry)
+    return nees_of_steps(pq.read_table(path, columns=list(COLUMNS)), odometry, truth)
+
+
+def _speed(outcomes: Sequence[Outcome]) -> Figures:
+    """From all runs that came to their end; the first scan of each stands apart."""
+    whole = [outcome for outcome in outcomes if outcome.is_whole]
+    if not whole:
+        peak = max(outcome.report.peak_mib for outcome in outcomes)
+        return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)
+    rest = np.concatenate([outcome.seconds[1:] for outcome in whole])
+    rest = rest if len(rest) else np.concatenate([outcome.seconds for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[min(1, len(outcome.cpu_seconds) - 1) :] for outcome in whole])
+    stages = _stages(whole[0])
+    return Figures(
+        median_s=float(np.median(rest)),
+        p95_s=float(np.percentile(rest, 95.0)),
+        cpu_s=float(np.median(cpu)),
+        first_s=float(np.median([outcome.seconds[0] for outcome in whole])),
+        scans_per_s=float(len(rest) / rest.sum()),
+        preprocess_s=stages[0],
+        match_s=stages[1],
+        map_s=stages[2],
+        loops_s=stages[3],
+        start_s=float(np.median([outcome.report.start_s for outcome in whole])),
+        finish_s=float(np.median([outcome.report.finish_s for outcome in whole])),
+        peak_mib=max(outcome.report.peak_mib for outcome in whole),
+    )
+
+
+def _stages(outcome: Outcome) -> tuple[float | None, float | None, float | None, float | None]:
+    """Seconds by stage of a method that tells; the mean for loops, most scans of which take nothing."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return None, None, None, None
+    table = pq.read_table(path, columns=["preprocess_s", "match_s", "map_s", "loops_s"])
+    preprocess, match, extend, loops = (column.to_numpy()[1:] for column in table.itercolumns())
+    if not len(loops):
+        return None, None, None, None
+    closing = float(loops.mean()) if loops.any() else None
+    return float(np.median(preprocess)), float(np.median(match)), float(np.median(extend)), closing
+
+
+def _apart(outcomes: Sequence[Outcome]) -> float | None:
+    """Largest distance between the positions of a scan in two runs."""
+    whole: list[Matrix] = [outcome.trajectory.poses for outcome in outcomes if outcome.is_whole]
+    if len(whole) < 2:
+        return None
+    first = whole[0][:, :-1, -1]
+    return max(float(np.linalg.norm(poses[:, :-1, -1] - first, axis=1).max()) for poses in whole[1:])
+
+
+def _or_none(metric: Callable[[], Answer]) -> Answer | None:
+    """The metric, or None where the path is too short for it."""
+    try:
+        return metric()
+    except InputError:
+        return None

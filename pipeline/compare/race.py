@@ -1,0 +1,56 @@
+"""Every method over the stored scans, run by run, in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.compare.memory import available_mib
+from pipeline.compare.methods import Method
+from pipeline.compare.outcome import Outcome, Status, read_outcome
+from pipeline.compare.scan_store import StoredScans
+from pipeline.compare.watch import Limits, run_watched
+from pipeline.runs.progress import Progress
+
+_LEAST_S, _SCAN_S = 300.0, 1.0  # of the time limit
+_SHARE = 0.75  # of the memory that is free
+
+
+def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
+    """The limits asked for, else 300 s and one more a scan, and three quarters of the memory that is free."""
+    return Limits(
+        _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
+        _SHARE * available_mib() if memory_mib is None else memory_mib,
+    )
+
+
+def race(
+    methods: Sequence[Method],
+    scans: StoredScans,
+    folder: Path,
+    *,
+    repeat: int,
+    limits: Limits,
+    progress: Progress,
+) -> dict[str, list[Outcome]]:
+    """``repeat`` runs of every method, each round starting with another one; one not installed is tried once."""
+    outcomes: dict[str, list[Outcome]] = {method.name: [] for method in methods}
+    for turn in range(repeat):
+        for place in range(len(methods)):
+            method = methods[(place + turn) % len(methods)]
+            if any(outcome.report.status is Status.MISSING for outcome in outcomes[method.name]):
+                continue
+            own = folder / method.name.replace("/", "_") / f"run_{turn}"
+            own.mkdir(parents=True)
+            report = run_watched(method, scans.folder, own, limits)
+            outcome = read_outcome(own, report, scans.stamps_ns, scans.dimension)
+            outcomes[method.name].append(outcome)
+            progress.say(_said(method.name, turn, repeat, outcome))
+    return outcomes
+
+
+def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
+    which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
+    if outcome.report.status is Status.OK:
+        return f"{name}{which}: {outcome.seconds.sum():.1f} s"
+    return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"

@@ -1,0 +1,82 @@
+"""per_scan.parquet: one row a scan, a method and a run of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.compare.judging import Judged, degeneracy
+from pipeline.compare.outcome import Outcome
+from pipeline.data import Matrix
+from pipeline.evaluate.absolute import path_length
+from pipeline.runs.step_table import pose_columns
+
+SCANS_FILE = "per_scan.parquet"
+_NOTES = {
+    "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
+    "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
+    "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
+    "distance_m": "travelled up to the scan, by the method itself",
+    "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
+    "nees": "of the motion up to the scan; null where the method does not tell its covariance",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunOfMethod:
+    """A run of a method, and what was found of it."""
+
+    name: str
+    repeat: int
+    outcome: Outcome
+    judged: Judged
+
+
+def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.int64]) -> None:
+    """Write the scans of all runs, those that failed up to where they came."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    tables = [pa.table(_columns(run, stamps_ns)) for run in runs]
+    pq.write_table(pa.concat_tables(tables).replace_schema_metadata(_NOTES), path, compression="zstd")
+
+
+def final_poses(outcome: Outcome) -> Matrix:
+    """(M, 4, 4) the last word, or what there is of a run that failed."""
+    poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
+    broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
+    return lie.lift(poses[: broken[0]] if len(broken) else poses)
+
+
+def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object]:
+    import pyarrow as pa
+
+    poses = final_poses(run.outcome)
+    count = len(poses)
+    aligned = (run.judged.T_reference_estimate @ poses)[:, :3, 3]
+    eigenvalues = degeneracy(run.outcome)
+    eigenvalues = eigenvalues[:count] if len(eigenvalues) else np.full(count, np.nan)
+    travelled_m = path_length(poses) if count else np.empty(0)
+    numbers = {
+        "seconds": run.outcome.seconds[:count],
+        "cpu_seconds": run.outcome.cpu_seconds[:count],
+        **pose_columns(poses),
+        **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
+        "distance_m": travelled_m,
+        "error_m": run.judged.errors_m[:count],
+        "error_rad": run.judged.errors_rad[:count],
+        "nees": run.judged.nees[:count],
+        "degeneracy_eigenvalue": eigenvalues,
+    }
+    return {
+        "method": pa.array([run.name] * count, pa.string()),
+        "repeat": pa.array([run.repeat] * count, pa.int64()),
+        "index": pa.array(np.arange(count)),
+        "stamp_ns": pa.array(stamps_ns[:count]),
+        **{name: pa.array(values, pa.float64(), from_pandas=True) for name, values in numbers.items()},
+    }

@@ -1,0 +1,91 @@
+"""``python -m pipeline.compare.worker SCANS FOLDER``: one method over all scans, in this process alone.
+
+FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from time import perf_counter, process_time
+
+import msgspec
+import numpy as np
+from numpy.lib.format import open_memmap
+
+from pipeline.compare import runner
+from pipeline.compare.memory import die_first, peak_mib
+from pipeline.compare.methods import Method
+from pipeline.compare.outcome import (
+    CPU_FILE,
+    POSES_FILE,
+    REPORT_FILE,
+    SECONDS_FILE,
+    TRAJECTORY_FILE,
+    EndReport,
+    Status,
+)
+from pipeline.compare.scan_store import StoredScans, open_store
+from pipeline.data import Trajectory
+from pipeline.errors import MissingExtraError
+
+METHOD_FILE = "method.msgpack"
+WARM_UP_SCANS = 4
+
+
+def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
+    """Track every scan, then finish."""
+    began = perf_counter()
+    _warm_up(scans, method)
+    racer = runner.start(method, scans.T_base_lidar)
+    start_s = perf_counter() - began
+    size = scans.dimension + 1
+    poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
+    seconds = open_memmap(folder / SECONDS_FILE, "w+", np.float64, (len(scans),))
+    cpu_seconds = open_memmap(folder / CPU_FILE, "w+", np.float64, (len(scans),))
+    poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
+    for scan in scans.scans():
+        asked, cpu_asked = perf_counter(), process_time()
+        pose = racer.track(scan)
+        took_s, cpu_took_s = perf_counter() - asked, process_time() - cpu_asked
+        if not np.isfinite(pose).all():
+            raise ValueError("a pose that is not finite")
+        seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose
+    ended = perf_counter()
+    trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
+    np.save(folder / TRAJECTORY_FILE, trajectory.poses)
+    return EndReport(Status.OK, "", racer.description, start_s, perf_counter() - ended, peak_mib())
+
+
+def _warm_up(scans: StoredScans, method: Method) -> None:
+    """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
+    if not runner.can_start_again(method):
+        return
+    racer = runner.start(method, scans.T_base_lidar)
+    with suppress(Exception):
+        for scan in islice(scans.scans(), WARM_UP_SCANS):
+            racer.track(scan)
+
+
+def main() -> None:
+    """Run, and say how it ended."""
+    store, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    die_first()
+    method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
+    try:
+        report = work(open_store(store), method, folder)
+    except MissingExtraError as error:
+        report = EndReport(Status.MISSING, str(error), "", 0.0, 0.0, peak_mib())
+    except MemoryError as error:
+        report = EndReport(Status.OUT_OF_MEMORY, f"MemoryError: {error}", "", 0.0, 0.0, peak_mib())
+    except Exception as error:  # others' code may raise anything
+        traceback.print_exc()
+        report = EndReport(Status.CRASHED, f"{type(error).__name__}: {error}", "", 0.0, 0.0, peak_mib())
+    (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
+
+
+if __name__ == "__main__":
+    main()

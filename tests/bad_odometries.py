@@ -1,0 +1,74 @@
+"""Odometries that a comparison must survive: each stands still for ten scans, then shows its nature."""
+
+import os
+import signal
+import time
+
+import numpy as np
+
+
+class StandsStill:
+    description = "stands still"
+
+    def __init__(self):
+        self.scans = 0
+
+    def track(self, points, times_s, stamp_ns):
+        self.scans += 1
+        if self.scans > 10:
+            self.misbehave()
+        return np.eye(points.shape[1] + 1)
+
+    def misbehave(self):
+        pass
+
+
+class Raises(StandsStill):
+    def misbehave(self):
+        raise ValueError("no more <b>patience</b>")
+
+
+class Hangs(StandsStill):
+    def misbehave(self):
+        time.sleep(600.0)
+
+
+class Eats(StandsStill):
+    def __init__(self):
+        super().__init__()
+        self.hoard = []
+
+    def misbehave(self):
+        while True:
+            self.hoard.append(np.ones(1 << 20))
+
+
+class Dies(StandsStill):
+    def misbehave(self):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class LosesItself(StandsStill):
+    def track(self, points, times_s, stamp_ns):
+        pose = super().track(points, times_s, stamp_ns)
+        return np.nan * pose if self.scans > 10 else pose
+
+
+class DiesEarly(Dies):
+    def track(self, points, times_s, stamp_ns):
+        self.misbehave()
+
+
+class Shifted(StandsStill):
+    """Ten centimetres forward a scan, or whatever it is told."""
+
+    def __init__(self, step_m=0.1):
+        super().__init__()
+        self.step_m = step_m
+        self.description = f"moves {step_m} m a scan"
+
+    def track(self, points, times_s, stamp_ns):
+        pose = np.eye(points.shape[1] + 1)
+        pose[0, -1] = self.step_m * self.scans
+        self.scans += 1
+        return pose

@@ -1,0 +1,174 @@
+"""Reports in a real browser: everything is there, nothing overlaps or is cut, nothing of a log is ever obeyed."""
+
+import html
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import look
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rerun.chunk import RrdReader
+
+from pipeline.__main__ import main
+from pipeline.compare.table import read_table
+from pipeline.simulate import simulate
+from viz.course_figures import plan
+from viz.courses import Course
+from viz.report import Chip, Drawing, Grid, Head, Page, Row, Section, write_page
+
+EVIL = "<script>alert(1)</script>"
+TESTS = Path(__file__).parent
+SIZES = [(1200, False), (1200, True), (500, False), (500, True)]
+
+
+def renamed(source, destination, old, new):
+    """A copy of a log with one topic called otherwise."""
+    with source.open("rb") as read, destination.open("wb") as written:
+        writer = Writer(written)
+        writer.start()
+        channels = {}
+        for schema, channel, message in make_reader(read).iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                topic = new if channel.topic == old else channel.topic
+                channels[channel.id] = writer.register_channel(topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def evil(tmp_path_factory):
+    """Twelve seconds in the office, of a log whose lidar topic is a script."""
+    folder = tmp_path_factory.mktemp("log")
+    simulate("office", folder / "office.mcap", duration_s=12.0)
+    renamed(folder / "office.mcap", folder / "evil.mcap", "/scan", EVIL)
+    return folder / "evil.mcap"
+
+
+@pytest.fixture(scope="module")
+def comparison(evil, tmp_path_factory):
+    """The directory of a comparison of ours, a variant of an evil name, and one that raises evil words."""
+    folder = tmp_path_factory.mktemp("compared")
+    (folder / "a.toml").write_text(
+        f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
+        code = main(
+            [
+                "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),
+                "--methods", f"plicp,plicp+loops,{EVIL},raises",
+            ]
+        )  # fmt: skip
+    assert code == 1
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def one_run(evil, tmp_path_factory):
+    """The directory of a run."""
+    folder = tmp_path_factory.mktemp("run") / "out"
+    arguments = ["--odometry.prior", "constant-velocity", "--loops.min_travel_m", "5", "--rerun", "off"]
+    assert main(["run", str(evil), "--out", str(folder), *arguments]) == 0
+    return folder
+
+
+@pytest.mark.parametrize(("width", "dark"), SIZES)
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, request, tmp_path):
+    seen = look(request.getfixturevalue(which) / "report.html", tmp_path, width=width, dark=dark)
+    assert seen["wide"] <= seen["width"] and seen["outside"] == []
+    for number, drawing in enumerate(seen["svgs"]):
+        assert drawing["cut"] == [] and drawing["overlapping"] == [], number
+        assert drawing["width"] > 200 and drawing["height"] > 80
+    assert seen["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+
+
+def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, tmp_path):
+    seen, table = look(comparison / "report.html", tmp_path, width=1200), read_table(comparison)
+    for title in (
+        "Trajectories", "Plan", "Error", "Over the distance", "Distribution", "Time per scan", "Along the log",
+        "Covariance consistency", "Degeneracy along the way", "Maps", "Loop closures of plicp+loops",
+        "Disagreement", "Command", "Versions", "Settings",
+    ):  # fmt: skip
+        assert title in seen["text"], title
+    assert len(seen["svgs"]) >= 11 and seen["tables"] >= 2 and seen["bold"] >= 5
+    for row in table.rows:
+        assert row.name in seen["text"]
+    assert "raises crashed: ValueError: no more <b>patience</b>" in seen["text"]
+    for column in table.columns:
+        assert column.show(table.rows[0].figures) in seen["text"], column.key
+
+
+def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
+    seen = look(one_run / "report.html", tmp_path, width=1200)
+    for title in (
+        "Trajectories",
+        "Map",
+        "Error",
+        "Time per scan",
+        "Degeneracy",
+        "Loop closures",
+        "Versions",
+        "ATE",
+    ):
+        assert title in seen["text"], title
+    assert len(seen["svgs"]) >= 8
+
+
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_a_topic_that_is_a_script_is_shown_as_text_and_not_run(which, request, tmp_path):
+    page = request.getfixturevalue(which) / "report.html"
+    seen = look(page, tmp_path, width=1200)
+    assert EVIL in seen["text"]
+    assert seen["scripts"] == 1  # that of the probe itself
+    text = page.read_text(encoding="utf-8")
+    assert "<script" not in text and html.escape(EVIL) in text
+
+
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_a_page_needs_nothing_but_itself(which, request):
+    text = (request.getfixturevalue(which) / "report.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    linked = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\')\s>]+)', text)
+    assert linked and all(link.startswith(("data:", "#")) for link in linked), set(linked)
+    assert len(text) < 10_000_000
+
+
+def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
+    from viz.compare_report import write_compare_report
+
+    before = (comparison / "report.html").read_bytes()
+    write_compare_report(comparison)
+    assert (comparison / "report.html").read_bytes() == before
+
+
+def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparison):
+    entities = {str(chunk.entity_path) for chunk in RrdReader(comparison / "compare.rrd").stream()}
+    for method in ("plicp", "plicp\\+loops"):
+        for part in ("world/{}/way", "world/{}/lidar", "world/{}/map", "plots/error/{}", "plots/time/{}"):
+            assert "/" + part.format(method) in entities
+    assert "/world/ground_truth" in entities
+
+
+def course(positions, **known):
+    count = len(positions)
+    unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "eigenvalue")}
+    return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
+
+
+def test_a_drawing_takes_the_colours_of_its_page():
+    positions = np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=0)
+    svg = plan("a", [course(positions)], None, positions.min(axis=0), positions.max(axis=0))
+    assert "var(--ink)" in svg and "var(--line)" in svg and "#010203" not in svg
+    assert re.search(r"<svg[^>]* viewBox=", svg) and not re.search(r"<svg[^>]* width=", svg)
+
+
+def test_every_text_of_a_page_is_escaped(tmp_path):
+    chip, drawing = Chip(EVIL, "red"), Drawing(EVIL, EVIL, svg="<svg></svg>")
+    grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),))
+    section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
+    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), grid, (EVIL,), (section,)))
+    assert "<script" not in (tmp_path / "a.html").read_text()

@@ -1,0 +1,121 @@
+"""The recording of a comparison: every method's way and map on one timeline, each to be switched on and off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import rerun as rr
+import rerun.blueprint as rrb
+
+from pipeline.compare.evidence import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
+from pipeline.compare.table import read_table
+from pipeline.maps import read_ply
+from pipeline.trajectory import read_tum
+from viz import entities, shapes
+from viz.compared_courses import read_courses
+from viz.courses import Course
+from viz.messages import Message, Times
+
+RECORDING_FILE = "compare.rrd"
+_MAP_POINTS = 60_000
+_PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
+
+
+def record_comparison(directory: Path) -> None:
+    """Write compare.rrd into a comparison's directory."""
+    table, courses = read_table(directory), read_courses(directory)
+    stream = rr.RecordingStream(f"scanchain comparison {table.dimension}D")
+    stream.set_log_time_enabled(False)
+    stream.set_sinks(rr.FileSink(directory / RECORDING_FILE), default_blueprint=_blueprint(courses))
+    stream.send_recording_name(directory.name)
+    stamps_ns = _stamps(directory)
+    for message in _messages(directory, courses, stamps_ns):
+        message.send(stream)
+    stream.flush(timeout_sec=60.0)
+    stream.disconnect()
+
+
+def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray) -> list[Message]:
+    messages = [Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
+    truth_file = directory / TRUTH_FILE
+    if truth_file.exists():
+        way = shapes.positions(read_tum(truth_file).poses)
+        line = rr.LineStrips3D([way], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
+        messages.append(Message("world/ground_truth", line))
+    for place, course in enumerate(courses):
+        messages += _of(course, place, method_folder(directory, course.name) / MAP_FILE, stamps_ns)
+    return messages
+
+
+def _of(course: Course, place: int, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
+    """The way piece by piece, the lidar on it, the map, and the plots."""
+    name = rr.escape_entity_path_part(course.name)
+    colour, positions = _rgb(course.colour), course.positions.astype(np.float32)
+    times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
+    before = np.concatenate([positions[:1], positions[:-1]])
+    strips = rr.LineStrips3D.columns(strips=shapes.segments(before, positions))
+    messages = [
+        Message(f"world/{name}/way", rr.LineStrips3D.from_fields(colors=[colour], radii=[entities.pixels(1.5)])),
+        Message(f"world/{name}/way", strips, times),
+        Message(f"world/{name}/lidar", rr.Points3D.from_fields(colors=[colour], radii=[entities.pixels(5.0)])),
+        Message(
+            f"world/{name}/lidar", rr.Points3D.columns(positions=positions).partition([1] * len(positions)), times
+        ),
+    ]
+    if map_file.exists():
+        points = shapes.in_space(shapes.at_most(read_ply(map_file), _MAP_POINTS))
+        archetype = rr.Points3D(points, colors=[colour], radii=[entities.pixels(0.75)])
+        messages.append(Message(f"world/{name}/map", archetype))
+    for plot, values in (("error", course.error_m), ("time", 1e3 * course.seconds)):
+        known = np.isfinite(values)
+        if known.any():
+            series = rr.SeriesLines(colors=[colour], names=[course.name], widths=[1.0])
+            messages.append(Message(f"plots/{plot}/{name}", series))
+            columns = rr.Scalars.columns(scalars=values[known])
+            messages.append(Message(f"plots/{plot}/{name}", columns, times[known]))
+    return messages
+
+
+def _blueprint(courses: Sequence[Course]) -> rrb.Blueprint:
+    """The ways above, maps of all but the first method switched off; plots below."""
+    so_far = rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange(
+                timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+            )
+            for timeline in ("scan", "sensor_time")
+        ]
+    )
+    names = [rr.escape_entity_path_part(course.name) for course in courses]
+    overrides: dict[Any, Any] = {f"world/{name}/way": [so_far] for name in names}
+    overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
+    scene = rrb.Spatial3DView(
+        origin="world", name="ways and maps", overrides=overrides, line_grid=rrb.LineGrid3D(visible=False)
+    )
+    whole = rrb.TimeAxis(
+        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    )
+    shown = [plot for plot in _PLOTS if plot != "error" or any(np.isfinite(c.error_m).any() for c in courses)]
+    plots = [rrb.TimeSeriesView(origin=f"plots/{plot}", name=_PLOTS[plot], axis_x=whole) for plot in shown]
+    return rrb.Blueprint(
+        rrb.Vertical(scene, rrb.Horizontal(*plots), row_shares=[3, 1]),
+        rrb.TimePanel(timeline="scan", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _stamps(directory: Path) -> np.ndarray:
+    """(N,) of all scans, from the method that came furthest."""
+    table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
+    indices, first = np.unique(table["index"].to_numpy(), return_index=True)
+    return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """The parts of #rrggbb."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue

@@ -1,0 +1,178 @@
+"""report.html of a comparison, made of what lies in its directory."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
+from pipeline.compare.figures import Column
+from pipeline.compare.outcome import Status
+from pipeline.compare.runner import CLOSURES_FILE
+from pipeline.compare.table import Table, read_table
+from pipeline.config import MatchingConfig
+from pipeline.maps import read_ply
+from pipeline.runs.provenance import Provenance
+from pipeline.trajectory import read_tum
+from viz import course_figures as figures
+from viz.compared_courses import read_courses
+from viz.course_sections import chip, error_section, knowledge_section, loop_section, time_section, way_section
+from viz.courses import Course, Floats
+from viz.map_figures import map_picture
+from viz.report import Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+
+REPORT_FILE = "report.html"
+_NEARLY = 1.25  # times the thickness of the sharpest map
+AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around the way
+
+
+def write_compare_report(directory: Path) -> None:
+    """Draw and write the page."""
+    table, courses = read_table(directory), read_courses(directory)
+    truth_file = directory / TRUTH_FILE
+    truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
+    page = Page(
+        title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
+        subtitle=_subtitle(table),
+        facts=_facts(table),
+        warnings=tuple(_warnings(table)),
+        grid=_summary(table, courses),
+        legend=tuple(f"{_head(column)}: {column.definition}" for column in table.columns),
+        sections=tuple(_sections(directory, table, courses, truth)),
+        folds=tuple(_folds(directory, table)),
+    )
+    write_page(directory / REPORT_FILE, page)
+
+
+def _subtitle(table: Table) -> str:
+    against = (
+        f"Errors are against {table.truth}."
+        if table.truth
+        else ("There is no ground truth: surfaces and disagreement tell who is sharp or alone, not who is right.")
+    )
+    return f"The same {table.scans:,} decoded scans through each method, each in a process of its own. {against}"
+
+
+def _facts(table: Table) -> tuple[tuple[str, str], ...]:
+    made = table.provenance
+    return (
+        ("log", table.log),
+        ("topic", table.topic),
+        ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
+        ("runs of a method", str(table.repeats)),
+        ("machine", f"{made.platform}, {made.cores} cores"),
+        ("made", f"{made.started}, in {made.duration_s:.0f} s"),
+    )
+
+
+def _warnings(table: Table) -> Iterator[str]:
+    for row in table.rows:
+        if row.status.is_failure:
+            yield f"{row.name} {row.status}: {row.reason}"
+
+
+def _summary(table: Table, courses: Sequence[Course]) -> Grid:
+    columns = table.columns
+    chips = {course.name: chip(course) for course in courses}
+    best = [column.best(table.figures) for column in columns]
+    rows = []
+    for place, row in enumerate(table.rows):
+        cells = [
+            Cell(column.show(row.figures), is_best=best[index][place]) for index, column in enumerate(columns)
+        ]
+        if row.status is not Status.OK:
+            cells = [Cell(f"{row.status}: {row.reason}", is_wide=True)]
+        rows.append(Row(row.name, tuple(cells), chips.get(row.name)))
+    heads = (Head("method"), *(Head(column.head, column.unit, column.definition) for column in columns))
+    return Grid(heads, tuple(rows))
+
+
+def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
+    is_planar = table.dimension == 2
+    drawn = [course for course in courses if len(course.positions)]
+    if drawn:
+        framing = _sharpest(table, drawn)
+        text = "Each moved onto the truth as for the ATE."
+        if truth is None:
+            text = f"All start in the same place; framed by {', '.join(course.name for course in framing)}."
+        yield way_section(drawn, framing, truth, is_planar=is_planar, text=text)
+        yield from error_section(drawn, table.truth)
+        yield from time_section(drawn)
+        yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
+        yield from _map_section(directory, drawn, figures.frame(framing, truth), AROUND_M[table.dimension])
+    for course in courses:
+        yield from loop_section(course, method_folder(directory, course.name) / CLOSURES_FILE)
+    if len(table.rows) > 1:
+        yield _disagreement(table)
+
+
+def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
+    """Those whose maps are nearly as sharp as the best: what pictures must show whole; all without maps."""
+    thickness_m = {row.name: row.figures.thickness_m or np.inf for row in table.rows}
+    limit_m = _NEARLY * min(thickness_m[course.name] for course in courses)
+    return [course for course in courses if thickness_m[course.name] <= limit_m]
+
+
+def _map_section(
+    directory: Path, courses: Sequence[Course], way: tuple[Floats, Floats], around_m: float
+) -> Iterator[Section]:
+    """Maps, all within the same corners: those of the ways and some of the surroundings."""
+    drawings = []
+    clouds = {course.name: method_folder(directory, course.name) / MAP_FILE for course in courses}
+    clouds = {name: read_ply(path) for name, path in clouds.items() if path.exists()}
+    if not clouds:
+        return
+    low, high = way[0] - around_m, way[1] + around_m
+    for course in courses:
+        if course.name in clouds:
+            picture = map_picture(
+                f"map {course.name}", clouds[course.name], low, high, figures.proportions(low, high)
+            )
+            drawings.append(Drawing(course.name, "", picture, chip(course)))
+    yield Section(
+        "Maps",
+        "The same points of the same scans, put where each method has the lidar.",
+        (),
+        tuple(drawings),
+        is_small=True,
+    )
+
+
+def _disagreement(table: Table) -> Section:
+    names = [row.name for row in table.rows]
+    rows = [
+        Row(name, tuple(Cell("–" if value is None else f"{1e3 * value:.1f}") for value in values))
+        for name, values in zip(names, table.disagreement_m, strict=True)
+    ]
+    return Section(
+        "Disagreement",
+        "Median distance between the motions that two methods find for a scan, in millimetres. "
+        "Not ground truth: two that err alike agree.",
+        grid=Grid((Head("mm"), *(Head(name) for name in names)), tuple(rows)),
+    )
+
+
+def _folds(directory: Path, table: Table) -> Iterator[Fold]:
+    yield from provenance_folds(table.provenance, table.baselines)
+    yield Fold("Notes", "\n".join(table.notes))
+    for row in table.rows:
+        definitions = "".join(f"\n\n{definition}" for definition in row.definitions)
+        yield Fold(row.name, f"{row.description or row.reason}{definitions}")
+    yield Fold("Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"))
+
+
+def provenance_folds(made: Provenance, others: dict[str, str]) -> Iterator[Fold]:
+    """The command, and the versions that it ran with."""
+    yield Fold("Command", shlex.join(made.command))
+    versions = {"python": made.python} | made.versions | others
+    yield Fold("Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items()))
+    yield Fold(
+        "Log files", "\n".join(f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
+    )
+
+
+def _head(column: Column) -> str:
+    return f"{column.head} [{column.unit}]" if column.unit else column.head

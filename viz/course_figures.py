@@ -1,0 +1,192 @@
+"""Drawings of courses: where they went, how far off they were, how long it took, what they knew of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from markupsafe import Markup
+from scipy.stats import chi2
+
+from viz.courses import Course, Floats
+from viz.sheet import INK, LINE, WIDTH_INCHES, Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MAX_POINTS = 1500  # of a line
+_WINDOWS = 250  # that a value a scan is averaged over
+_MARGIN = 0.25
+_FEW_DECADES = 60.0
+
+
+def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
+    """Seen from above, within corners."""
+    with Sheet(name, proportions(low, high)) as sheet:
+        axes = sheet.axes
+        _each(axes, courses, lambda course: (course.positions[:, 0], course.positions[:, 1]))
+        if truth is not None:
+            axes.plot(*_thinned(truth)[:, :2].T, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        _label(axes, "x [m]", "y [m]")
+        return sheet.svg()
+
+
+def height(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
+    """Height over the distance travelled, within corners."""
+    with Sheet(name) as sheet:
+        _each(sheet.axes, courses, lambda course: (course.distance_m, course.positions[:, 2]))
+        if truth is not None:
+            steps_m = np.linalg.norm(np.diff(truth, axis=0), axis=1)
+            way_m = np.append(0.0, np.cumsum(steps_m))
+            rows = np.linspace(0, len(truth) - 1, min(len(truth), _MAX_POINTS)).astype(int)
+            sheet.axes.plot(way_m[rows], truth[rows, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        sheet.axes.set_ylim(low[2], high[2])
+        longest_m = np.median([course.distance_m[-1] for course in courses if len(course.distance_m)])
+        sheet.axes.set_xlim(0.0, 1.05 * max(float(longest_m), 1.0))
+        _label(sheet.axes, "distance travelled [m]", "z [m]")
+        return sheet.svg()
+
+
+def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
+    """Position error along the way, after alignment."""
+    with Sheet(name) as sheet:
+        for course in _known(courses, "error_m"):
+            known = np.isfinite(course.error_m)
+            x, y = _windowed(course.distance_m[known], course.error_m[known])
+            sheet.axes.plot(x, np.maximum(y, 1e-4), **course.style)
+        _logarithmic(sheet.axes, "y")
+        _label(sheet.axes, "distance travelled [m]", "position error [m]")
+        return sheet.svg()
+
+
+def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: float, label: str) -> Markup:
+    """Share of the scans below a value, which runs from the 1st to the 99.9th percentile."""
+    with Sheet(name) as sheet:
+        for course in _known(courses, key):
+            values = getattr(course, key)
+            values = np.sort(unit_scale * values[np.isfinite(values)])
+            shares = np.linspace(0.0, 100.0, len(values))
+            rows = np.unique(np.linspace(0, len(values) - 1, min(len(values), 400)).astype(int))
+            sheet.axes.plot(np.maximum(values[rows], 1e-6), shares[rows], **course.style)
+        _logarithmic(sheet.axes, "x")
+        sheet.axes.set_ylim(0.0, 100.0)
+        _label(sheet.axes, label, "scans below [%]")
+        return sheet.svg()
+
+
+def time_per_scan(name: str, courses: Sequence[Course]) -> Markup:
+    """Milliseconds along the log."""
+    with Sheet(name) as sheet:
+        for course in _known(courses, "seconds"):
+            x, y = _windowed(np.arange(len(course.seconds), dtype=np.float64), 1e3 * course.seconds)
+            sheet.axes.plot(x, y, **{**course.style, "linewidth": 0.9})
+        _logarithmic(sheet.axes, "y")
+        _label(sheet.axes, "scan", "time of a scan [ms]")
+        return sheet.svg()
+
+
+def consistency(name: str, courses: Sequence[Course], degrees_of_freedom: int) -> Markup:
+    """Distribution of the NEES beside the one that exact covariances would give (dotted)."""
+    with Sheet(name) as sheet:
+        for course in _known(courses, "nees"):
+            values = np.sort(course.nees[np.isfinite(course.nees)])
+            sheet.axes.plot(np.maximum(values, 1e-4), np.linspace(0.0, 100.0, len(values)), **course.style)
+        shares = np.linspace(0.001, 0.999, 200)
+        ideal = chi2.ppf(shares, degrees_of_freedom) / degrees_of_freedom
+        sheet.axes.plot(ideal, 100.0 * shares, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        _logarithmic(sheet.axes, "x")
+        sheet.axes.set_ylim(0.0, 100.0)
+        _label(sheet.axes, "squared error over covariance (1 is exact on average)", "motions below [%]")
+        return sheet.svg()
+
+
+def degeneracy(name: str, courses: Sequence[Course], limit: float) -> Markup:
+    """Information along the worst direction, scan by scan; below the limit (dotted) a scan is degenerate."""
+    with Sheet(name) as sheet:
+        for course in _known(courses, "eigenvalue"):
+            x = np.arange(len(course.eigenvalue), dtype=np.float64)
+            sheet.axes.plot(*_windowed(x, np.maximum(course.eigenvalue, 1e-9), np.min), **course.style)
+        sheet.axes.axhline(limit, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        _logarithmic(sheet.axes, "y")
+        _label(sheet.axes, "scan", "information per inlier")
+        return sheet.svg()
+
+
+def degeneracy_plan(name: str, course: Course) -> Markup:
+    """The same on the way itself, the worst scans on top."""
+    low, high = frame([course], None)
+    order = np.argsort(-course.eigenvalue)
+    with Sheet(name, proportions(low, high)) as sheet:
+        x, y = course.positions[order, :2].T
+        values = np.log10(np.maximum(course.eigenvalue[order], 1e-6))
+        dots = sheet.axes.scatter(x, y, c=values, s=4.0, cmap="plasma", linewidths=0, rasterized=True)
+        bar = sheet.figure.colorbar(dots, ax=sheet.axes, shrink=0.8, pad=0.02)
+        bar.set_label("information, log10")
+        bar.outline.set_visible(False)
+        sheet.axes.set_aspect("equal")
+        sheet.axes.set_xlim(low[0], high[0])
+        sheet.axes.set_ylim(low[1], high[1])
+        _label(sheet.axes, "x [m]", "y [m]")
+        return sheet.svg()
+
+
+def frame(courses: Sequence[Course], truth: Floats | None) -> tuple[Floats, Floats]:
+    """Corners (3,) of what is shown: the truth's where there is one, else those of the courses, and a margin."""
+    ways = [truth] if truth is not None else [course.positions for course in courses]
+    low = np.min([way.min(axis=0) for way in ways], axis=0)
+    high = np.max([way.max(axis=0) for way in ways], axis=0)
+    size = high - low
+    margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
+    return low - margin, high + margin
+
+
+def proportions(low: Floats, high: Floats) -> float:
+    """Inches of height for a plan of these corners."""
+    return float(np.clip(WIDTH_INCHES * (high[1] - low[1]) / (high[0] - low[0]), 1.8, 5.0))
+
+
+def _known(courses: Sequence[Course], key: str) -> list[Course]:
+    """Those of which anything is known, the first of them drawn last and so on top."""
+    return [course for course in reversed(courses) if np.isfinite(getattr(course, key)).any()]
+
+
+def _each(axes: Axes, courses: Sequence[Course], line: Callable[[Course], tuple[Floats, Floats]]) -> None:
+    for course in reversed(courses):
+        if len(course.positions):
+            axes.plot(*(_thinned(values) for values in line(course)), **course.style)
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(visible=True, which="major")
+    axes.tick_params(which="minor", color=LINE)
+
+
+def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """Plain numbers at 1, or at 1, 2 and 5 where there are few decades; so that labels have room."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _thinned(values: Floats) -> Floats:
+    return values[:: max(1, -(-len(values) // _MAX_POINTS))]
+
+
+def _windowed(x: Floats, y: Floats, combine: Callable[..., Floats] = np.median) -> tuple[Floats, Floats]:
+    """Neighbouring values put together so that a line of them can be read."""
+    size = max(1, -(-len(x) // _WINDOWS))
+    count = len(x) // size * size
+    if not count:
+        return x, y
+    return x[:count].reshape(-1, size).mean(axis=1), combine(y[:count].reshape(-1, size), axis=1)

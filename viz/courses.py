@@ -1,0 +1,54 @@
+"""What is drawn of a method or of a run: its way, and what is known of each scan on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# Told apart on white and on black, also by most who see colours differently.
+_COLOURS = (
+    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#6f7fbf",
+    "#b0413e", "#5f8f57",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A way and its scans, N of them; numbers that are not known are NaN, all or some.
+
+    Attributes
+    ----------
+    name : for legends outside the drawings
+    colour, is_dashed : how its line is drawn
+    positions : (N, 3) metres, in one frame with the other courses
+    distance_m : (N,) travelled
+    error_m : (N,) distance from where it was
+    seconds : (N,) what each scan took
+    nees : (N,) squared error over covariance, 1 on average if exact
+    eigenvalue : (N,) information per inlier along the worst direction
+    """
+
+    name: str
+    colour: str
+    is_dashed: bool
+    positions: Floats
+    distance_m: Floats
+    error_m: Floats
+    seconds: Floats
+    nees: Floats
+    eigenvalue: Floats
+
+    @property
+    def style(self) -> dict[str, Any]:
+        """For matplotlib."""
+        return {"color": self.colour, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
+
+
+def colour_of(place: int) -> str:
+    """Of the method at this place of the table."""
+    return _COLOURS[place % len(_COLOURS)]

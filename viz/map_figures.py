@@ -1,0 +1,57 @@
+"""Maps as small pictures, and loop closures on them."""
+
+from __future__ import annotations
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.data import Points
+from viz.courses import Course, Floats
+from viz.sheet import INK, Sheet
+
+_ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
+_POINTS = "#808893"
+_MAX_POINTS = 120_000
+
+
+def map_picture(name: str, points: Points, low: Floats, high: Floats, inches: float) -> Markup:
+    """Points (M, 3) seen from above, within corners; the colour is the height, where there is any."""
+    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
+    shown = shown[inside]
+    with Sheet(name, inches) as sheet:
+        size = float(np.clip(12_000.0 / max(len(shown), 1), 0.08, 1.5))
+        if not len(shown) or not np.ptp(shown[:, 2]):
+            sheet.axes.scatter(shown[:, 0], shown[:, 1], s=size, c=_POINTS, linewidths=0, rasterized=True)
+        else:
+            shown = shown[np.argsort(shown[:, 2])]
+            bottom, top = np.percentile(shown[:, 2], (2.0, 98.0))
+            sheet.axes.scatter(
+                shown[:, 0], shown[:, 1], s=size, c=shown[:, 2], cmap="viridis", vmin=bottom, vmax=top,
+                linewidths=0, rasterized=True,
+            )  # fmt: skip
+        _frame(sheet, low, high)
+        return sheet.svg()
+
+
+def loops_picture(
+    name: str, course: Course, edges: Floats, is_accepted: np.ndarray, low: Floats, high: Floats, inches: float
+) -> Markup:
+    """The way (grey) with its closures, accepted and rejected; ``edges`` (E, 2, 3) from place to place."""
+    with Sheet(name, inches) as sheet:
+        sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
+        for chosen, colour in ((~is_accepted, _REJECTED), (is_accepted, _ACCEPTED)):
+            gaps = np.full((int(chosen.sum()), 1, 2), np.nan)
+            lines = np.concatenate([edges[chosen][:, :, :2], gaps], axis=1).reshape(-1, 2)
+            sheet.axes.plot(lines[:, 0], lines[:, 1], color=colour, linewidth=0.9)
+        sheet.axes.plot(*course.positions[0, :2], marker="o", markersize=4, color=INK)
+        _frame(sheet, low, high)
+        return sheet.svg()
+
+
+def _frame(sheet: Sheet, low: Floats, high: Floats) -> None:
+    sheet.axes.set_aspect("equal")
+    sheet.axes.set_xlim(low[0], high[0])
+    sheet.axes.set_ylim(low[1], high[1])
+    sheet.axes.set_xlabel("x [m]")
+    sheet.axes.set_ylabel("y [m]")

@@ -1,0 +1,112 @@
+"""A report: one page that needs nothing but itself, in light and dark, on paper and on a phone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """A name in a legend with the line that it is drawn with."""
+
+    name: str
+    colour: str
+    is_dashed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A table's cell; a ``wide`` one stretches to the end of its row."""
+
+    text: str
+    is_best: bool = False
+    is_wide: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A table's row: what it is about, with its line in the drawings if it has one, and its cells."""
+
+    name: str
+    cells: tuple[Cell, ...]
+    chip: Chip | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """A column's head: what, in which unit, what that means, and whether words stand below it."""
+
+    text: str
+    unit: str = ""
+    hint: str = ""
+    is_text: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A table."""
+
+    heads: tuple[Head, ...]
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A picture with what it shows; ``svg`` comes from a ``Sheet``, all else is escaped."""
+
+    title: str
+    caption: str
+    svg: Markup
+    chip: Chip | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a page; ``is_small`` puts more drawings side by side."""
+
+    title: str
+    text: str = ""
+    chips: tuple[Chip, ...] = ()
+    drawings: tuple[Drawing, ...] = ()
+    grid: Grid | None = None
+    is_small: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """Text that is shown on demand, as it stands."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A report; ``facts`` are label and value, ``warnings`` stand out."""
+
+    title: str
+    subtitle: str
+    facts: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    grid: Grid
+    legend: tuple[str, ...]
+    sections: tuple[Section, ...]
+    folds: tuple[Fold, ...] = field(default=())
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Write a page; every text in it is escaped, and it may load and run nothing."""
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    path.write_text(environment.get_template("report.html").render(page=page), encoding="utf-8")

@@ -1,0 +1,73 @@
+"""A small drawing that becomes an SVG inside a page and takes the page's colours, light or dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import TYPE_CHECKING, Any, cast
+
+from markupsafe import Markup
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_INCHES = 4.6
+INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
+_VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
+_DPI = 170  # of what is drawn as pixels
+_SETTINGS: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "font.size": 8.0,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": LINE,
+    "ytick.color": LINE,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": LINE,
+    "grid.linewidth": 0.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.2,
+}
+
+
+class Sheet:
+    """One drawing with one pair of axes; a context, inside which ``axes`` is drawn on.
+
+    height_inches : of the whole sheet, which is ``WIDTH_INCHES`` wide
+    name : tells its parts from those of other drawings on the same page
+    """
+
+    def __init__(self, name: str, height_inches: float = 2.7) -> None:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+
+        self._context = mpl.rc_context(cast("Any", _SETTINGS | {"svg.hashsalt": name}))
+        self._context.__enter__()
+        self.figure: Figure = Figure(figsize=(WIDTH_INCHES, height_inches), layout="constrained")
+        self.axes: Axes = self.figure.add_subplot()
+
+    def __enter__(self) -> Sheet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.__exit__(None, None, None)
+
+    def svg(self) -> Markup:
+        """The drawing, to be put into a page as it is; no text of a log is ever drawn."""
+        buffer = io.StringIO()
+        self.figure.patch.set_alpha(0.0)
+        self.axes.patch.set_alpha(0.0)
+        nobody = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        self.figure.savefig(buffer, format="svg", dpi=_DPI, metadata=nobody)
+        text = buffer.getvalue()
+        text = text[text.index("<svg") :]
+        text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+        text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+        for colour, variable in _VARIABLES.items():
+            text = text.replace(colour, variable)
+        return Markup(text)
