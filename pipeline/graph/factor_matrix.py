@@ -11,12 +11,12 @@ from pipeline.kernels.graph_fronts import Fronts
 
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
-    """U of the last factorisation, A = Uᵀ U, its scalars in the order of elimination; zeros left out."""
+    """U of the last factorisation, A = Uᵀ U, its scalars in the order of elimination; zeros kept where it may fill in."""
     return front_rows(cholesky._fronts, cholesky._factor)
 
 
 def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
-    """The upper triangular matrix whose rows the fronts keep, in the order of elimination; zeros left out."""
+    """The upper triangular matrix whose rows the fronts keep, in the order of elimination."""
     widths = np.diff(fronts.row_start)
     count = int(fronts.pivots.sum())
     front = np.repeat(np.arange(len(widths)), fronts.pivots)
@@ -26,6 +26,4 @@ def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
     along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
     columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
     first = fronts.factor_start[front] + within * widths[front] + within
-    result = csr_matrix((factor[np.repeat(first, lengths) + along], columns, row_start), shape=(count, count))
-    result.eliminate_zeros()
-    return result
+    return csr_matrix((factor[np.repeat(first, lengths) + along], columns, row_start), shape=(count, count))

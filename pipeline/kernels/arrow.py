@@ -78,14 +78,20 @@ def eliminate(band: _Array, border: _Array, share: float) -> int:
 
 @njit(cache=True)
 def complement(corner: _Array, border: _Array) -> None:
-    """Subtract YᵀY from the upper triangle of the corner, a few rows of Y at a time so that its rows stay near."""
-    for first in range(0, border.shape[0], _PANEL):
-        end = min(first + _PANEL, border.shape[0])
+    """Subtract YᵀY from the upper triangle of the corner, four rows of Y at a time, a panel that stays near."""
+    whole = border.shape[0] - border.shape[0] % 4
+    for first in range(0, whole, _PANEL):
         for a in range(corner.shape[0]):
             row = corner[a, a:]
-            for j in range(first, end):
-                if border[j, a] != 0.0:
-                    _subtract(row, border[j, a], border[j, a:])
+            for j in range(first, min(first + _PANEL, whole), 4):
+                w, x, y, z = border[j, a], border[j + 1, a], border[j + 2, a], border[j + 3, a]
+                if w != 0.0 or x != 0.0 or y != 0.0 or z != 0.0:
+                    W, X, Y, Z = border[j, a:], border[j + 1, a:], border[j + 2, a:], border[j + 3, a:]
+                    for c in range(row.size):
+                        row[c] -= (w * W[c] + x * X[c]) + (y * Y[c] + z * Z[c])
+    for j in range(whole, border.shape[0]):
+        for a in range(corner.shape[0]):
+            _subtract(corner[a, a:], border[j, a], border[j, a:])
 
 
 @njit(cache=True)
@@ -118,6 +124,55 @@ def solve_corner(corner: _Array, x: _Array) -> None:
         for b in range(a + 1, n):
             total -= corner[a, b] * x[b]
         x[a] = total / corner[a, a]
+
+
+@njit(cache=True)
+def invert(band: _Array, border: _Array, corner: _Array, Z_band: _Array, Z_border: _Array, Z_corner: _Array) -> None:
+    """Fill the inverse of AᵀA = UᵀU where the arrow has entries (Takahashi, Fagan & Chen 1973).
+
+        Z_ij = [i = j] / U_ii² − Σ_k U_ik Z_kj / U_ii,   k > i over row i of U, from the last row up
+
+    band, border, corner : U, as ``eliminate`` and ``eliminate_corner`` leave it
+    Z_band, Z_border, Z_corner : filled, of the same shapes; all of the corner
+    """
+    w, n, rest = band.shape[0] - 1, band.shape[1], corner.shape[0]
+    for i in range(rest - 1, -1, -1):
+        for j in range(rest - 1, i - 1, -1):
+            total = 1.0 / corner[i, i] if i == j else 0.0
+            for k in range(i + 1, rest):
+                total -= corner[i, k] * Z_corner[k, j]
+            Z_corner[i, j] = Z_corner[j, i] = total / corner[i, i]
+    for i in range(n - 1, -1, -1):
+        last, pivot, row = min(n - 1, i + w), band[w, i], Z_border[i]
+        row[:] = 0.0
+        for k in range(i + 1, last + 1):
+            _subtract(row, band[w + i - k, k], Z_border[k])
+        for m in range(rest):
+            _subtract(row, border[i, m], Z_corner[m])
+        _divide(row, pivot)
+        for j in range(last, i - 1, -1):
+            total = 1.0 / pivot if i == j else 0.0
+            for k in range(i + 1, last + 1):
+                total -= band[w + i - k, k] * Z_band[w + min(j, k) - max(j, k), max(j, k)]
+            for m in range(rest):
+                total -= border[i, m] * Z_border[j, m]
+            Z_band[w + i - j, j] = total / pivot
+
+
+@njit(cache=True)
+def blocks(Z_band: _Array, Z_border: _Array, Z_corner: _Array, wanted: _Index, result: _Array) -> None:
+    """Fill blocks of the inverse: wanted (N, c) columns of A, result (N, c, c); NaN for poses beyond the band."""
+    w, n = Z_band.shape[0] - 1, Z_band.shape[1]
+    for k in range(wanted.shape[0]):
+        for a in range(wanted.shape[1]):
+            for b in range(wanted.shape[1]):
+                i, j = min(wanted[k, a], wanted[k, b]), max(wanted[k, a], wanted[k, b])
+                if i >= n:
+                    result[k, a, b] = Z_corner[i - n, j - n]
+                elif j >= n:
+                    result[k, a, b] = Z_border[i, j - n]
+                else:
+                    result[k, a, b] = Z_band[w + i - j, j] if j - i <= w else np.nan
 
 
 @njit(cache=True)

@@ -65,3 +65,14 @@ def products(row_start: _Index, columns: _Index, values: _Array, b: _Array, slot
                 if slots[at] >= 0:
                     H[slots[at]] += values[p] * values[q]
                 at += 1
+
+
+@njit(cache=True)
+def gradient(row_start: _Index, columns: _Index, values: _Array, b: _Array, g: _Array, diagonal: _Array) -> None:
+    """Fill g = Aᵀb and the diagonal of AᵀA, both (n,)."""
+    g[:] = 0.0
+    diagonal[:] = 0.0
+    for r in range(row_start.size - 1):
+        for p in range(row_start[r], row_start[r + 1]):
+            g[columns[p]] += values[p] * b[r]
+            diagonal[columns[p]] += values[p] * values[p]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +21,16 @@ class Linearisation:
 
     Attributes
     ----------
-    prior, odometry, observations : residuals (pose,), (K − 1, pose), (N, 2); pure numbers
-    values : of A, as the problem's pattern has them
+    prior, odometry, observations : residuals (p,), (K − 1, p), (N, 2); pure numbers
+    prior_rows, odometry_rows, observation_rows : of A, (p, p), (K − 1, p, 2 p), (N, 2, p + 2), pose before landmark
     """
 
     prior: NDArray[np.float64]
     odometry: Matrix
     observations: Matrix
-    values: NDArray[np.float64]
-
-    @property
-    def residuals(self) -> NDArray[np.float64]:
-        """All of them, as the rows of A follow each other."""
-        return np.concatenate([self.prior, self.odometry.ravel(), self.observations.ravel()])
+    prior_rows: Matrix
+    odometry_rows: Matrix
+    observation_rows: Matrix
 
     @property
     def observation_chi2(self) -> NDArray[np.float64]:
@@ -65,7 +63,10 @@ class Measurements:
 
 
 class BearingRangeProblem:
-    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once."""
+    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
+
+    ``motion_columns`` (K − 1, 2 p) and ``observation_columns`` (N, p + 2) are the unknowns of each of them.
+    """
 
     def __init__(self, measurements: Measurements) -> None:
         given = measurements
@@ -78,12 +79,17 @@ class BearingRangeProblem:
         seen_from, seen = given.observed.T
         pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen)], axis=1)
         moves = np.concatenate([poses[:-1], poses[1:]], axis=1)
-        self._groups = [
-            np.repeat(poses[:1], size, axis=0), np.repeat(moves, size, axis=0), np.repeat(pairs, 2, axis=0)
-        ]  # fmt: skip
-        self.pattern = pattern_of(self._groups, layout)
+        groups = [np.repeat(poses[:1], size, axis=0), np.repeat(moves, size, axis=0), np.repeat(pairs, 2, axis=0)]
         damping = np.arange(layout.columns)[:, None]
-        self._damped = pattern_of([*self._groups, damping], layout)
+        self.motion_columns, self.observation_columns = moves, pairs
+        self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
+
+    def with_noise(self, measured_covariance: Matrix) -> BearingRangeProblem:
+        """The same problem, with the same pattern, and another covariance (N, 2, 2) of what was measured."""
+        result = copy(self)
+        result.measurements = replace(self.measurements, measured_covariance=measured_covariance)
+        result._observation = whitening(measured_covariance)
+        return result
 
     def linearise(self, state: State) -> Linearisation:
         """Residuals and Jacobians at a state."""
@@ -102,21 +108,20 @@ class BearingRangeProblem:
         )
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
-        values = np.concatenate([self._first.ravel(), J_motion.ravel(), J_seen.ravel()])
-        return Linearisation(self._first @ off, motion, seen, values)
+        return Linearisation(self._first @ off, motion, seen, self._first, J_motion, J_seen)
 
-    def system(self, at: Linearisation, weights: NDArray[np.float64], damping: float) -> LinearSystem:
-        """The step's system A x = −r, observations weighed by √w (N,), damped by rows √(λ diag AᵀA) unless λ = 0."""
-        p = at.odometry.shape[1]
+    def system(self, at: Linearisation, weights: NDArray[np.float64]) -> LinearSystem:
+        """The step's system A x = −r, observations weighed by √w (N,)."""
         root = np.sqrt(weights)[:, None]
-        values, start = at.values.copy(), at.values.size - 2 * (p + 2) * len(weights)
-        values[start:] = (values[start:].reshape(len(weights), -1) * root).ravel()
+        seen = at.observation_rows * root[..., None]
+        values = np.concatenate([at.prior_rows.ravel(), at.odometry_rows.ravel(), seen.ravel()])
         b = -np.concatenate([at.prior, at.odometry.ravel(), (at.observations * root).ravel()])
-        if damping == 0.0:
-            return LinearSystem(self.pattern, values, b)
-        curvature = np.bincount(self.pattern.columns, values**2, self.pattern.shape[1])
-        values = np.concatenate([values, np.sqrt(damping * curvature)])
-        return LinearSystem(self._damped, values, np.concatenate([b, np.zeros(len(curvature))]))
+        return LinearSystem(self.pattern, values, b)
+
+    def damped(self, system: LinearSystem, damping: NDArray[np.float64]) -> LinearSystem:
+        """The system with a row √d of its own for every unknown, so that AᵀA grows by diag(d); d (n,)."""
+        values, b = np.concatenate([system.values, np.sqrt(damping)]), np.append(system.b, np.zeros(len(damping)))
+        return LinearSystem(self._damped, values, b)
 
 
 def world_referenced(data: LandmarkData) -> Measurements:

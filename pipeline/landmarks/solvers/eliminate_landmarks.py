@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bmat, bsr_matrix, coo_matrix, csc_matrix, csr_matrix
+from scipy.sparse import bmat, bsr_matrix, coo_matrix, csc_matrix
 
 from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
 from pipeline.graph.factor_matrix import upper_factor
@@ -100,7 +100,5 @@ def _block_diagonal(blocks: NDArray[np.float64]) -> bsr_matrix:
 def _factor(roots: NDArray[np.float64], Y: csc_matrix, reduced: SparseCholesky, split: int) -> Factor:
     """U = [R, Y; 0, U_S], landmarks first, then the poses as they were eliminated."""
     order = reduced.analysis.order
-    matrix = csr_matrix(bmat([[_block_diagonal(roots), Y[:, order]], [None, upper_factor(reduced)]]))
-    matrix.eliminate_zeros()
-    landmarks = split + np.arange(Y.shape[0])
-    return Factor("U of AᵀA", csc_matrix(matrix), np.concatenate([landmarks, order]))
+    matrix = csc_matrix(bmat([[_block_diagonal(roots), Y[:, order]], [None, upper_factor(reduced)]]))
+    return Factor("U of AᵀA", matrix, np.concatenate([split + np.arange(Y.shape[0]), order]))

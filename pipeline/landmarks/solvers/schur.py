@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse import csc_matrix
 
 from pipeline.kernels import arrow
 from pipeline.landmarks.solvers.eliminate_landmarks import LandmarkElimination
@@ -41,50 +41,70 @@ class SchurSolver:
 
 
 @dataclass(frozen=True, slots=True)
-class _Arrow:
-    """U of the arrow: the band of P, the border Y = U_P⁻ᵀ Bᵀ, the corner U_S."""
+class Arrow:
+    """U of AᵀA = UᵀU, or AᵀA before it is factored: band and border (split, n − split) of the poses, corner."""
 
     band: NDArray[np.float64]
     border: NDArray[np.float64]
     corner: NDArray[np.float64]
 
 
+def factor_arrow(system: LinearSystem) -> Arrow:
+    """U of a system whose poses are joined in a chain; raises UndeterminedError where there is none."""
+    pattern = system.pattern
+    parts, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
+    _eliminate(parts, system)
+    return parts
+
+
 def _eliminate_poses(system: LinearSystem, width: int) -> Solution:
     """P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY dense: it joins every two landmarks anyway."""
     watch = Stopwatch()
+    U, g = _form(system, width)
+    build_s = watch.lap()
+    _eliminate(U, system)
+    factor_s = watch.lap()
+    poses, landmarks = np.split(g, [U.band.shape[1]])
+    arrow.solve_forward(U.band, poses)
+    landmarks -= poses @ U.border
+    arrow.solve_corner(U.corner, landmarks)
+    poses -= U.border @ landmarks
+    arrow.solve_backward(U.band, poses)
+    solve_s = watch.lap()
+    return Solution(g, build_s, factor_s, solve_s, lambda: _factor(U))
+
+
+def _form(system: LinearSystem, width: int) -> tuple[Arrow, NDArray[np.float64]]:
+    """AᵀA as an arrow, and Aᵀb."""
     pattern = system.pattern
     n, split = pattern.shape[1], pattern.layout.split
-    band, Y = np.zeros((width + 1, split)), np.zeros((split, n - split))
-    corner, g = np.zeros((n - split, n - split)), np.zeros(n)
-    arrow.products(pattern.row_start, pattern.columns, system.values, system.b, split, band, Y, corner, g)
-    diagonal = corner.diagonal()
-    build_s = watch.lap()
-    if arrow.eliminate(band, Y, LOST_DIGITS) >= 0:
-        raise undetermined(system)
-    arrow.complement(corner, Y)
-    if arrow.eliminate_corner(corner, LOST_DIGITS * diagonal) >= 0:
-        raise undetermined(system)
-    factor_s = watch.lap()
-    poses = g[:split]
-    arrow.solve_forward(band, poses)
-    landmarks = g[split:] - poses @ Y
-    arrow.solve_corner(corner, landmarks)
-    poses -= Y @ landmarks
-    arrow.solve_backward(band, poses)
-    solve_s = watch.lap()
-    x = np.concatenate([poses, landmarks])
-    return Solution(x, build_s, factor_s, solve_s, lambda: _factor(_Arrow(band, Y, np.triu(corner))))
+    H = Arrow(np.zeros((width + 1, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split)))
+    g = np.zeros(n)
+    arrow.products(
+        pattern.row_start, pattern.columns, system.values, system.b, split, H.band, H.border, H.corner, g
+    )
+    return H, g
 
 
-def _factor(U: _Arrow) -> Factor:
-    """The three parts put together."""
+def _eliminate(H: Arrow, system: LinearSystem) -> None:
+    """Turn AᵀA into its factor, in place."""
+    floor = LOST_DIGITS * H.corner.diagonal()
+    if arrow.eliminate(H.band, H.border, LOST_DIGITS) >= 0:
+        raise undetermined(system)
+    arrow.complement(H.corner, H.border)
+    if arrow.eliminate_corner(H.corner, floor) >= 0:
+        raise undetermined(system)
+
+
+def _factor(U: Arrow) -> Factor:
+    """The three parts put together, with every place that may fill in."""
     width, split = U.band.shape[0] - 1, U.band.shape[1]
-    n = split + len(U.corner)
-    below, right = np.nonzero(U.band)
+    n, rest = split + len(U.corner), len(U.corner)
+    below, right = np.indices(U.band.shape)
     inside = below + right >= width  # the corner of a band's storage is not part of it
     below, right = below[inside], right[inside]
-    border, corner = coo_matrix(U.border), coo_matrix(U.corner)
-    rows = np.concatenate([below + right - width, border.row, corner.row + split])
-    columns = np.concatenate([right, border.col + split, corner.col + split])
-    values = np.concatenate([U.band[below, right], border.data, corner.data])
+    across, down = np.indices(U.border.shape), np.triu_indices(rest)
+    rows = np.concatenate([below + right - width, across[0].ravel(), split + down[0]])
+    columns = np.concatenate([right, split + across[1].ravel(), split + down[1]])
+    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[down]])
     return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))

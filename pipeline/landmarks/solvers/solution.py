@@ -26,7 +26,7 @@ class Factor:
     Attributes
     ----------
     name : what it is, as "U of AᵀA" or "R of A"
-    matrix : (n, n) its rows and columns as the method ordered them
+    matrix : (n, n) its rows and columns as the method ordered them; may hold zeros where it could have filled in
     order : (n,) column of A at each place of that order
     """
 
@@ -105,6 +105,8 @@ def undetermined(system: LinearSystem) -> UndeterminedError:
     ε (H + ε I)⁻¹ tends to the projection onto the null space of H = AᵀA, here scaled to a unit diagonal; applied
     a few times to a random vector it leaves a nonzero entry just where some null vector has one.
     """
+    if not (np.isfinite(system.values).all() and np.isfinite(system.b).all()):
+        raise InputError("A x = b holds numbers that are not finite; start from a better guess")
     A = system.A
     H = csc_matrix(A.T @ A)
     scale = np.sqrt(H.diagonal())
