@@ -6,12 +6,14 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from pipeline.commands.config import config
 from pipeline.commands.evaluate import evaluate
 from pipeline.commands.info import info
+from pipeline.commands.landmarks import landmarks
 from pipeline.commands.run import run
 from pipeline.commands.sequence import sequence
 from pipeline.commands.simulate import simulate
@@ -19,6 +21,9 @@ from pipeline.commands.view import view
 from pipeline.config import RecordingConfig
 from pipeline.errors import InputError, ScanchainError
 from pipeline.runs.recorder import Recorder, SinkName, Viewing
+
+if TYPE_CHECKING:
+    from pipeline.landmarks.study import Study
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -36,13 +41,13 @@ def scanchain() -> None:
     """
 
 
-for _command in (run, view, info, simulate, evaluate, config, sequence):
+for _command in (run, view, info, simulate, evaluate, landmarks, config, sequence):
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show, _draw)
+    viewing = Viewing(_record, _show, _draw, _report)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -92,6 +97,12 @@ def _draw(directory: Path, picture: Path) -> None:
     from viz.run_picture import draw_run
 
     draw_run(directory, picture)
+
+
+def _report(directory: Path, studies: Sequence[Study]) -> None:
+    from viz.landmark_report import write_report
+
+    write_report(directory, studies)
 
 
 if __name__ == "__main__":

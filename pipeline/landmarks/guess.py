@@ -12,10 +12,10 @@ from pipeline.graph.robust import RobustLoss
 from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
 from pipeline.landmarks.dead_reckoning import chain
 from pipeline.landmarks.minimise import minimise
-from pipeline.landmarks.problem import State
+from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.solvers import LinearSolver
 
-_FIRST, _GROWTH = 16, 1.25  # poses to begin with, and how much further each part reaches
+_FIRST, _GROWTH = 16, 1.5  # poses to begin with, and how much further each part reaches
 _STEPS = 3
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
@@ -29,11 +29,29 @@ def from_odometry(measurements: Measurements) -> State:
     return State(poses, _first_seen(measurements, poses)[0])
 
 
+def of_relative_positions(data: LandmarkData) -> State:
+    """The same for a linear problem."""
+    poses = np.cumsum(np.vstack([np.zeros(2), data.odometry]), axis=0)
+    _, first = np.unique(data.observed[:, 1], return_index=True)
+    landmarks = np.full(data.true_landmarks.shape, np.nan)
+    landmarks[data.observed[first, 1]] = poses[data.observed[first, 0]] + data.measured[first]
+    return State(poses, landmarks)
+
+
+def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
+    """The poses but for the first moved by a shift along both axes and turned about the origin."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    poses = state.poses.copy()
+    poses[1:, :2] = poses[1:, :2] @ np.array([[c, s], [-s, c]]) + shift_m
+    poses[1:, 2:] += turn_rad
+    return State(poses, state.landmarks)
+
+
 def growing(measurements: Measurements, solver: LinearSolver) -> State:
     """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
 
     Dead reckoning over the whole log may be metres off, where a robust loss finds but a local minimum; over a
-    fifth of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
+    third of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
     """
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)

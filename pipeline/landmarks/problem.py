@@ -47,6 +47,11 @@ class State:
     poses: Matrix
     landmarks: Matrix
 
+    @property
+    def unknowns(self) -> NDArray[np.float64]:
+        """All in one, poses first, (n,)."""
+        return np.concatenate([self.poses.ravel(), self.landmarks.ravel()])
+
     def moved(self, step: NDArray[np.float64]) -> State:
         """This state plus a step (n,), poses first."""
         split = self.poses.size

@@ -24,8 +24,9 @@ _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _FIRST_SIGMAS = np.array([0.03, 0.12])  # rad, m; where the estimate of the sensor's noise begins
 _LEAST_SIGMAS = np.array([3e-4, 3e-4])  # rad, m; what rounding to three digits alone amounts to
 _FREEDOM = 4.0  # of Student's t
-_TURNS, _STEPS, _MOST = 12, 4, 50  # estimates of the noise; steps in between, and after the last
-_SETTLED = 0.02  # relative change of the noise that ends them
+STUDENT = RobustLoss("cauchy", np.sqrt(_FREEDOM + 2.0), 1.0)
+_TURNS, _STEPS, _MOST = 12, 2, 50  # estimates of the noise; steps in between, and after the last
+_SETTLED, _POWER = 0.02, 1.4  # relative change of the noise that ends them; it nears its limit slowly: go further
 _TOLERANCE, _LITTLE = 1e-6, 1e-10  # relative change of χ²; damping for a state that is settled
 
 
@@ -44,6 +45,7 @@ class RangeSolution:
     motion_chi2, observation_chi2 : χ² per degree of freedom of either kind, observations weighed; 1 is a noise
         model that fits
     iterations, converged, reason, time_s : of the whole, reading left out
+    problem, guess : the problem with that noise, and where its minimisation began
     """
 
     nodes_s: NDArray[np.float64]
@@ -61,6 +63,8 @@ class RangeSolution:
     converged: bool
     reason: str
     time_s: float
+    problem: BearingRangeProblem
+    guess: State
 
 
 def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") -> RangeSolution:
@@ -84,7 +88,8 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") 
         landmarks=reckoning.landmarks,
     )
     solver = create_solver(method)
-    fit = _fit(BearingRangeProblem(measurements), growing(measurements, solver), solver)
+    guess = growing(measurements, solver)
+    fit = _fit(BearingRangeProblem(measurements), guess, solver)
     layout, minimum = fit.problem.pattern.layout, fit.minimum
     return RangeSolution(
         nodes_s=reckoning.nodes_s,
@@ -102,6 +107,8 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") 
         converged=minimum.converged,
         reason=minimum.reason,
         time_s=perf_counter() - begin,
+        problem=fit.problem,
+        guess=guess,
     )
 
 
@@ -131,12 +138,11 @@ class _Fit:
 
 def _fit(problem: BearingRangeProblem, state: State, solver: LinearSolver) -> _Fit:
     """Estimate state and sensor noise in turn until neither changes any more."""
-    loss = RobustLoss("cauchy", np.sqrt(_FREEDOM + 2.0), 1.0)
     sigmas, iterations, count = _FIRST_SIGMAS, 0, len(problem.measurements.measured)
     for turn in range(_TURNS):
         last = turn == _TURNS - 1
         minimum = minimise(
-            problem, state, solver, loss=loss, tolerance=_TOLERANCE, first_damping=_LITTLE,
+            problem, state, solver, loss=STUDENT, tolerance=_TOLERANCE, first_damping=_LITTLE,
             max_iterations=_MOST if last else _STEPS,
         )  # fmt: skip
         state, iterations = minimum.state, iterations + minimum.iterations
@@ -145,7 +151,7 @@ def _fit(problem: BearingRangeProblem, state: State, solver: LinearSolver) -> _F
         ratio = np.sqrt(fit.observation_chi2())
         if last or (minimum.converged and np.abs(ratio - 1.0).max() < _SETTLED):
             break
-        sigmas = np.maximum(sigmas * ratio, _LEAST_SIGMAS)
+        sigmas = np.maximum(sigmas * ratio**_POWER, _LEAST_SIGMAS)
         problem = problem.with_noise(_diagonal(sigmas, count))
     return fit
 

@@ -6,13 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
+
+if TYPE_CHECKING:
+    from pipeline.landmarks.study import Study
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 
@@ -83,9 +86,11 @@ class OpenRecorder(Protocol):
 class Viewing:
     """What the commands ask of a viewer.
 
-    ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG.
+    ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
+    ``report`` studies of landmark problems, as pictures and a page, into a directory.
     """
 
     record: OpenRecorder
     show: Callable[[Path, bool], None]
     draw: Callable[[Path, Path], None]
+    report: Callable[[Path, Sequence[Study]], None]
