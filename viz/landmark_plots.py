@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _BEFORE, _AFTER, _TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
 _FRAME = "#cccccc"
-_FAINT = 0.18
+_ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # of a picture of a factor, at most
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _TITLE = {"loc": "left", "fontsize": 11}
@@ -35,7 +35,7 @@ def draw_estimate(path: Path, study: Study) -> None:
 
     low, high = _frame(study)
     width, height = high - low
-    figure = Figure(figsize=(11.0, float(np.clip(5.2 * height / width, 3.0, 9.0)) + 0.9), layout="constrained")
+    figure = Figure(figsize=(11.0, float(np.clip(5.2 * height / width, 3.0, 9.0)) + 1.0), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, estimate, colour, title in (
         (panels[0], study.before, _BEFORE, "before"),
@@ -51,28 +51,23 @@ def draw_estimate(path: Path, study: Study) -> None:
     _draw_ellipses(panels[1], study)
     panels[0].set_ylabel("y [m]", fontsize=9)
     _legend(figure)
-    figure.savefig(path, dpi=150, facecolor="white")
+    figure.savefig(path, dpi=150, facecolor="white", bbox_inches="tight")
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
     """Draw where the factor of every method is not zero, to a PNG; several problems stand side by side."""
     from matplotlib.figure import Figure
 
-    if len(studies) > 1:
-        cells = [[(study, method) for study in studies] for method in range(len(studies[0].methods))]
-    else:
-        count = len(studies[0].methods)
-        columns = min(4, count)
-        every = [(studies[0], method) for method in range(count)]
-        cells = [every[k : k + columns] for k in range(0, count, columns)]
-    columns = len(cells[0])
-    figure = Figure(figsize=(max(2.9 * columns, 4.0), 3.25 * len(cells)), layout="constrained")
-    for axes, cell in zip(figure.subplots(len(cells), columns, squeeze=False).flat, sum(cells, []), strict=False):
-        study, number = cell
+    cells = [(study, number) for number in range(len(studies[0].methods)) for study in studies]
+    columns = len(studies) * max(1, min(_ACROSS, len(cells)) // len(studies))
+    rows = -(-len(cells) // columns)
+    figure = Figure(figsize=(2.9 * columns, (3.25 if len(studies) > 1 else 3.05) * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (study, number) in zip(panels, cells, strict=False):
         _draw_factor(axes, study.methods[number], study.name if len(studies) > 1 else "")
-    for axes in figure.axes[sum(map(len, cells)) :]:
+    for axes in panels[len(cells) :]:
         axes.set_axis_off()
-    figure.savefig(path, dpi=130, facecolor="white")
+    figure.savefig(path, dpi=130, facecolor="white", bbox_inches="tight")
 
 
 def _frame(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -125,30 +120,31 @@ def _draw_ellipses(axes: Axes, study: Study) -> None:
     values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
     axis_m = 2.0 * _ELLIPSE * np.sqrt(np.maximum(values, 0.0))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    axes.add_collection(
-        EllipseCollection(
-            axis_m[:, 1], axis_m[:, 0], angle, units="xy", offsets=_in_truth(study.after)[1],
-            offset_transform=axes.transData, facecolors=_AFTER, alpha=_FAINT, zorder=2,
-        )  # fmt: skip
-    )
+    ellipses = EllipseCollection(
+        axis_m[:, 1], axis_m[:, 0], angle, units="xy", offsets=_in_truth(study.after)[1],
+        offset_transform=axes.transData, facecolors="none", edgecolors=_AFTER, linewidths=0.6, alpha=0.5, zorder=2,
+    )  # fmt: skip
+    axes.add_collection(ellipses)
 
 
 def _legend(figure: Figure) -> None:
     """One legend for both panels, each kind once."""
-    from matplotlib.patches import Patch
+    from matplotlib.lines import Line2D
 
     found = {}
     for axes in figure.axes:
         found |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    found["95 % of a landmark"] = Patch(facecolor=_AFTER, alpha=_FAINT)
-    figure.legend(list(found.values()), list(found), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    found["95 % ellipse of a landmark"] = Line2D([], [], color=_AFTER, linewidth=0.6, alpha=0.5)
+    figure.legend(
+        list(found.values()), list(found), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+    )
 
 
 def _draw_factor(axes: Axes, method: MethodResult, problem: str) -> None:
     """Nonzero entries dark; a pixel that stands for many of them is as dark as they are dense."""
     matrix = method.factor.matrix.tocoo()
     there = matrix.data != 0.0
-    size = matrix.shape[0]
+    size = len(method.factor.order)
     pixels = min(size, _PIXELS)
     count, _, _ = np.histogram2d(
         matrix.row[there], matrix.col[there], bins=pixels, range=[[-0.5, size - 0.5], [-0.5, size - 0.5]]

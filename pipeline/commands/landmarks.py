@@ -20,10 +20,22 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("data", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to write; must not exist.")
-@click.option("--method", "methods", default="all", show_default=True, metavar="NAME,...", help="Linear solvers to compare.")
-@click.option("--repeat", type=click.IntRange(1, 1000), default=3, show_default=True, help="Timed rounds; medians are told.")
-@click.option("--robot", type=click.IntRange(1), default=1, show_default=True, help="Whose log of an MRCLAM folder.")
+@click.option(
+    "--out",
+    required=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Directory to write; must not exist.",
+)
+@click.option(
+    "--method", "methods", default="all", show_default=True, metavar="NAME,...", help="Linear solvers to compare."
+)
+@click.option(
+    "--repeat", type=click.IntRange(1, 1000), default=3, show_default=True, help="Timed rounds; medians are told."
+)
+@click.option(
+    "--robot", type=click.IntRange(1), default=1, show_default=True, help="Whose log of an MRCLAM folder."
+)
 @click.option(
     "--odometry-noise",
     "noise",
@@ -80,7 +92,7 @@ def landmarks(
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with telling_of_compilation(terminal):
             studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]
-        tree = {"problems": [tree_of(study) for study in studies]}
+        tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
         _write(directory.path, data, studies, tree)
         viewing.report(directory.path, studies)
         directory.complete()

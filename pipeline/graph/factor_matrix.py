@@ -11,7 +11,7 @@ from pipeline.kernels.graph_fronts import Fronts
 
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
-    """U of the last factorisation, A = Uᵀ U, its scalars in the order of elimination; zeros kept where it may fill in."""
+    """U of the last factorisation, A = Uᵀ U, in the order of elimination; zeros kept where it may fill in."""
     return front_rows(cholesky._fronts, cholesky._factor)
 
 
@@ -26,4 +26,5 @@ def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
     along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
     columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
     first = fronts.factor_start[front] + within * widths[front] + within
-    return csr_matrix((factor[np.repeat(first, lengths) + along], columns, row_start), shape=(count, count))
+    values = factor[np.repeat(first, lengths) + along]
+    return csr_matrix((values, columns, row_start), shape=(count, count))

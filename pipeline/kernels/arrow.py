@@ -52,7 +52,7 @@ def products(
 
 @njit(cache=True)
 def eliminate(band: _Array, border: _Array, share: float) -> int:
-    """Factor P = UᵀU in its band and turn the border Bᵀ into Y = U⁻ᵀ Bᵀ, row after row (Golub & Van Loan 2013, 4.3.5).
+    """Factor P = UᵀU in its band and turn the border Bᵀ into Y = U⁻ᵀ Bᵀ (Golub & Van Loan 2013, 4.3.5).
 
     share : a pivot at or below this share of its diagonal entry has failed
     Returns -1, or the first pivot that failed.
@@ -127,7 +127,9 @@ def solve_corner(corner: _Array, x: _Array) -> None:
 
 
 @njit(cache=True)
-def invert(band: _Array, border: _Array, corner: _Array, Z_band: _Array, Z_border: _Array, Z_corner: _Array) -> None:
+def invert(
+    band: _Array, border: _Array, corner: _Array, Z_band: _Array, Z_border: _Array, Z_corner: _Array
+) -> None:
     """Fill the inverse of AᵀA = UᵀU where the arrow has entries (Takahashi, Fagan & Chen 1973).
 
         Z_ij = [i = j] / U_ii² − Σ_k U_ik Z_kj / U_ii,   k > i over row i of U, from the last row up

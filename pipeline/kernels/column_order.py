@@ -11,7 +11,7 @@ _Index = NDArray[np.int64]
 
 @njit(cache=True)
 def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Index, rows: _Index) -> _Index:
-    """Column to eliminate at each place, by approximate column minimum degree (Davis, Gilbert, Larimore & Ng 2004).
+    """Column to eliminate at each place, by approximate minimum degree (COLAMD, Davis et al. 2004).
 
     Eliminating a column joins all rows that hold it to one, its pivot row, which is how QR fills in at the worst.
     The next column is one whose rows, by the sum of what each has beyond the last pivot row, hold the fewest
@@ -31,12 +31,9 @@ def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Ind
     done, mark = np.zeros(n, np.bool_), np.full(n, -1, np.int64)
     degree, order = np.zeros(n, np.int64), np.empty(n, np.int64)
     for c in range(n):
-        for q in range(column_start[c], column_start[c + 1]):
-            degree[c] += length[rows[q]] - 1
-    queue = [(min(degree[c], n), c) for c in range(n)]
+        degree[c] = min((length[rows[column_start[c] : column_start[c + 1]]] - 1).sum(), n)
+    queue = [(degree[c], c) for c in range(n)]
     heapify(queue)
-    for c in range(n):
-        degree[c] = min(degree[c], n)
     for k in range(n):
         stated, c = heappop(queue)
         while done[c] or stated != degree[c]:
@@ -46,14 +43,8 @@ def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Ind
             store = np.concatenate((store, np.empty(store.size + n, np.int64)))
         pivot = m + k
         begin[pivot] = end
-        for q in range(column_start[c], column_start[c] + held[c]):
-            r = rows[q]
-            for s in range(begin[r], begin[r] + length[r]):
-                w = store[s]
-                if not done[w] and mark[w] != k:
-                    mark[w] = k
-                    store[end] = w
-                    end += 1
+        for r in rows[column_start[c] : column_start[c] + held[c]]:
+            end = _join(r, k, begin, length, done, mark, store, end)
             length[r] = 0
         members = store[begin[pivot] : end]
         length[pivot] = members.size
@@ -63,6 +54,19 @@ def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Ind
             degree[w] = min(degree[w] + members.size - 1, n - k - 2)
             heappush(queue, (degree[w], w))
     return order
+
+
+@njit(cache=True)
+def _join(
+    r: int, k: int, begin: _Index, length: _Index, done: NDArray[np.bool_], mark: _Index, store: _Index, end: int
+) -> int:
+    """Append the live columns of row r that the pivot row has not got yet; return its new end."""
+    for w in store[begin[r] : begin[r] + length[r]]:
+        if not done[w] and mark[w] != k:
+            mark[w] = k
+            store[end] = w
+            end += 1
+    return end
 
 
 @njit(cache=True)
@@ -93,7 +97,7 @@ def _adopt(
         if length[r] > 0 and beyond[r] > 0:
             rows[kept] = r
             kept += 1
-            total += beyond[r]
+            total += int(beyond[r])
     rows[kept] = pivot
     held[w] = kept + 1 - column_start[w]
     return total

@@ -1,4 +1,4 @@
-"""Velocities of a wheeled robot integrated to motions between given times, with what their noise does; compiled."""
+"""Velocities of a wheeled robot integrated to motions, with what their noise does to them; compiled."""
 
 import numpy as np
 from numba import njit

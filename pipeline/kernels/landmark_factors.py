@@ -1,4 +1,4 @@
-"""Factors of landmark SLAM in the plane: whitened residuals and Jacobians, written into the values of A; compiled."""
+"""Factors of landmark SLAM in the plane: whitened residuals and Jacobians; compiled."""
 
 import numpy as np
 from numba import njit

@@ -49,7 +49,9 @@ def product_structure(
 
 
 @njit(cache=True)
-def products(row_start: _Index, columns: _Index, values: _Array, b: _Array, slots: _Index, H: _Array, g: _Array) -> None:
+def products(
+    row_start: _Index, columns: _Index, values: _Array, b: _Array, slots: _Index, H: _Array, g: _Array
+) -> None:
     """Fill H = AᵀA, in the order that ``slots`` says, and g = Aᵀb.
 
     row_start (m + 1,), columns, values : A by rows; b (m,); H (n + pairs,), g (n,) filled

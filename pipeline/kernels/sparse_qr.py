@@ -18,7 +18,9 @@ _Index = NDArray[np.int64]
 
 
 @njit(cache=True)
-def assign_rows(fronts: Fronts, row_start: _Index, columns: _Index, place: _Index) -> tuple[_Index, _Index, _Index, int]:
+def assign_rows(
+    fronts: Fronts, row_start: _Index, columns: _Index, place: _Index
+) -> tuple[_Index, _Index, _Index, int]:
     """Find the front that takes each row of A: the one whose pivots hold the row's first column.
 
     row_start (m + 1,), columns : columns in each row; place (n,) : position of each column in the order
@@ -84,66 +86,103 @@ def factorise(
     A pivot that no row determines is zero on the diagonal of R.
     """
     count = fronts.pivots.size
-    waiting, top, depth = np.empty(count + 1, np.int64), 0, 0
-    largest = 1
+    waiting, top, depth, largest = np.empty(count + 1, np.int64), 0, 0, 1
     for f in range(count):
         largest = max(largest, height[f] * (fronts.row_start[f + 1] - fronts.row_start[f] + 1))
     work, local = np.empty(largest), np.empty(place.size, np.int64)
     sums = np.empty(fronts.widest + 1)
     for f in range(count):
-        column0 = fronts.row_start[f]
-        width, pivots = fronts.row_start[f + 1] - column0, fronts.pivots[f]
+        columns_f = fronts.rows[fronts.row_start[f] : fronts.row_start[f + 1]]
+        width, pivots = columns_f.size, fronts.pivots[f]
         for a in range(width):
-            local[fronts.rows[column0 + a]] = a
+            local[columns_f[a]] = a
         front = work[: height[f] * (width + 1)].reshape(height[f], width + 1)
         front[:] = 0.0
+        mine = own[begin[f] : begin[f + 1]]
+        top -= fronts.children[f]
+        children = waiting[top : top + fronts.children[f]]
         leads = np.full(height[f], width, np.int64)
-        for k in range(begin[f], begin[f + 1]):
-            for q in range(row_start[own[k]], row_start[own[k] + 1]):
-                leads[k - begin[f]] = min(leads[k - begin[f]], local[place[columns[q]]])
-        at, child_top, child_depth = begin[f + 1] - begin[f], top, depth
-        for _ in range(fronts.children[f]):
-            child_top -= 1
-            child = waiting[child_top]
-            first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-            for a in range(_handed_on(height[child], end - first, fronts.pivots[child])):
-                leads[at] = fronts.place[first + a]
-                at += 1
+        _find_leads(fronts, children, height, mine, row_start, columns, place, local, leads)
         stairs, target = _sort_by_lead(leads, width)
-        for k in range(begin[f], begin[f + 1]):
-            row = front[target[k - begin[f]]]
-            for q in range(row_start[own[k]], row_start[own[k] + 1]):
-                row[local[place[columns[q]]]] = values[q]
-            row[width] = b[own[k]]
-        at = begin[f + 1] - begin[f]
-        for _ in range(fronts.children[f]):
-            top -= 1
-            child = waiting[top]
-            first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-            left = _handed_on(height[child], end - first, fronts.pivots[child])
-            depth -= left * (end - first + 1)
-            for a in range(left):
-                row = front[target[at + a]]
-                kept = stack[depth + a * (end - first + 1) : depth + (a + 1) * (end - first + 1)]
-                for c in range(a, end - first):
-                    row[fronts.place[first + c]] = kept[c]
-                row[width] = kept[end - first]
-            at += left
+        _place_own(front, target, mine, row_start, columns, values, b, place, local)
+        depth = _place_children(front, target, mine.size, fronts, children, height, stack, depth)
         _triangularise(front, width, stairs, sums)
-        start = fronts.factor_start[f]
-        for a in range(pivots):
-            if a < height[f]:
-                factor[start + a * width + a : start + (a + 1) * width] = front[a, a:width]
-                z[fronts.rows[column0 + a]] = front[a, width]
-            else:
-                factor[start + a * width + a : start + (a + 1) * width] = 0.0
-                z[fronts.rows[column0 + a]] = 0.0
-        left, rest = _handed_on(height[f], width - pivots, pivots), width - pivots
-        for a in range(left):
-            stack[depth + a * (rest + 1) : depth + (a + 1) * (rest + 1)] = front[pivots + a, pivots:]
-        depth += left * (rest + 1)
+        _keep(front, columns_f, pivots, factor[fronts.factor_start[f] :], z)
+        rest = width - pivots
+        for a in range(_handed_on(height[f], rest, pivots)):
+            stack[depth : depth + rest + 1] = front[pivots + a, pivots:]
+            depth += rest + 1
         waiting[top] = f
         top += 1
+
+
+@njit(cache=True)
+def _find_leads(
+    fronts: Fronts, children: _Index, height: _Index, mine: _Index, row_start: _Index, columns: _Index,
+    place: _Index, local: _Index, leads: _Index,
+) -> None:  # fmt: skip
+    """Fill the first column of every row that a front gathers: its own rows, then those of its children."""
+    at = 0
+    for r in mine:
+        for q in range(row_start[r], row_start[r + 1]):
+            leads[at] = min(leads[at], local[place[columns[q]]])
+        at += 1
+    for k in range(children.size):
+        child = children[k]
+        first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
+        for a in range(_handed_on(height[child], end - first, fronts.pivots[child])):
+            leads[at] = fronts.place[first + a]
+            at += 1
+
+
+@njit(cache=True)
+def _place_own(
+    front: _Array, target: _Index, mine: _Index, row_start: _Index, columns: _Index, values: _Array, b: _Array,
+    place: _Index, local: _Index,
+) -> None:  # fmt: skip
+    """Write a front's own rows of A, and of b in the last column."""
+    for k in range(mine.size):
+        row = front[target[k]]
+        for q in range(row_start[mine[k]], row_start[mine[k] + 1]):
+            row[local[place[columns[q]]]] = values[q]
+        row[-1] = b[mine[k]]
+
+
+@njit(cache=True)
+def _place_children(
+    front: _Array, target: _Index, at: int, fronts: Fronts, children: _Index, height: _Index, stack: _Array,
+    depth: int,
+) -> int:  # fmt: skip
+    """Write the rows that the children hand on, from place ``at`` on; return the stack's depth without them."""
+    for k in range(children.size):
+        child = children[k]
+        first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
+        depth -= _handed_on(height[child], end - first, fronts.pivots[child]) * (end - first + 1)
+    start = depth
+    for k in range(children.size):
+        child = children[k]
+        first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
+        for a in range(_handed_on(height[child], end - first, fronts.pivots[child])):
+            row, kept = front[target[at]], stack[start : start + end - first + 1]
+            for c in range(a, end - first):
+                row[fronts.place[first + c]] = kept[c]
+            row[-1] = kept[-1]
+            start += kept.size
+            at += 1
+    return depth
+
+
+@njit(cache=True)
+def _keep(front: _Array, columns: _Index, pivots: int, factor: _Array, z: _Array) -> None:
+    """Keep the rows of R that belong to the pivots; zeros where the front has too few rows."""
+    width = columns.size
+    for a in range(pivots):
+        if a < front.shape[0]:
+            factor[a * width + a : (a + 1) * width] = front[a, a:width]
+            z[columns[a]] = front[a, width]
+        else:
+            factor[a * width + a : (a + 1) * width] = 0.0
+            z[columns[a]] = 0.0
 
 
 @njit(cache=True)

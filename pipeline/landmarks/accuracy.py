@@ -52,7 +52,9 @@ def of_positions(state: State, data: LandmarkData) -> Accuracy:
 
 def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> Truth:
     """Motion capture interpolated to these times, surveyed positions of these landmarks."""
-    place = {int(subject): position for subject, position in zip(log.true_subjects, log.true_landmarks, strict=True)}
+    place = {
+        int(subject): position for subject, position in zip(log.true_subjects, log.true_landmarks, strict=True)
+    }
     surveyed = np.array([place.get(int(subject), np.full(2, np.nan)) for subject in landmarks])
     if len(log.true_s) < 2:
         return Truth(np.zeros(len(nodes_s), np.bool_), np.empty((0, 3)), surveyed)

@@ -21,7 +21,7 @@ class Rows:
 
 def whitening(covariance: Matrix) -> Matrix:
     """W with WᵀW = Σ⁻¹, upper triangular; covariance (..., k, k)."""
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2).astype(np.float64, copy=False)
 
 
 def pattern_of(groups: list[NDArray[np.int64]], layout: Layout) -> Pattern:

@@ -14,6 +14,8 @@ from pipeline.landmarks.assembly import landmark_columns, pattern_of, pose_colum
 from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.system import Layout, LinearSystem
 
+_ANCHOR = 0.01  # noise of the first pose, in shares of a step's
+
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
@@ -22,7 +24,7 @@ class Linearisation:
     Attributes
     ----------
     prior, odometry, observations : residuals (p,), (K − 1, p), (N, 2); pure numbers
-    prior_rows, odometry_rows, observation_rows : of A, (p, p), (K − 1, p, 2 p), (N, 2, p + 2), pose before landmark
+    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p), (N, 2, p + 2)
     """
 
     prior: NDArray[np.float64]
@@ -129,7 +131,7 @@ def world_referenced(data: LandmarkData) -> Measurements:
     count, steps = len(data.observed), len(data.odometry)
     return Measurements(
         first_pose=np.zeros(2),
-        first_covariance=data.odometry_covariance,
+        first_covariance=_ANCHOR**2 * data.odometry_covariance,
         motion=data.odometry,
         motion_covariance=np.broadcast_to(data.odometry_covariance, (steps, 2, 2)),
         observed=data.observed,

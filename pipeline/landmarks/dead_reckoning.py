@@ -1,4 +1,4 @@
-"""Dead reckoning between the observations of a log: motions with their uncertainty, and the poses they chain to."""
+"""Dead reckoning between the observations of a log: motions with their uncertainty, and their chain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""First guesses: poses by odometry, landmarks where they were first seen, from the beginning of the log onwards."""
+"""First guesses: poses by odometry, landmarks where they were first seen; for a long log, part by part."""
 
 from __future__ import annotations
 

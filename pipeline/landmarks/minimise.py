@@ -60,8 +60,8 @@ def minimise(
     step is below the tolerance.
 
     Levenberg-Marquardt scales its damping by diag(AᵀA) and sets it by the gain ratio (Nielsen 1999). The first
-    damping is for a guess that may be poor; near the minimum 1e-10 serves better, since the weakest modes of a long
-    chain have 1e-9 of diag(AᵀA).
+    damping is for a guess that may be poor; near the minimum 1e-10 serves better, since a long chain's weakest
+    modes have 1e-9 of diag(AᵀA).
     """
     damping, growth = (first_damping if optimiser == "levenberg-marquardt" else 0.0), _GROWTH
     state, at = guess, problem.linearise(guess)

@@ -1,4 +1,4 @@
-"""Reads UTIAS MRCLAM folders: wheel velocities, ranges and bearings to barcodes, motion capture (Leung et al. 2011)."""
+"""Reads UTIAS MRCLAM folders: velocities, ranges and bearings to barcodes, motion capture (Leung et al. 2011)."""
 
 from __future__ import annotations
 
@@ -48,10 +48,14 @@ class RangeLog:
 def read_mrclam(folder: Path, robot: int) -> RangeLog:
     """Read what robot ``robot`` logged; raises InputError for whatever is missing or wrong."""
     if not (folder / "Barcodes.dat").is_file():
-        raise InputError(f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder")
+        raise InputError(
+            f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder"
+        )
     name = f"Robot{robot}_Odometry.dat"
     if not (folder / name).is_file():
-        there = sorted(int(found[0]) for file in folder.iterdir() if (found := re.findall(r"^Robot(\d+)_Odo", file.name)))
+        there = sorted(
+            int(found[0]) for file in folder.iterdir() if (found := re.findall(r"^Robot(\d+)_Odo", file.name))
+        )
         listed = ", ".join(map(str, there)) or "none"
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_table(folder / name, 3))
@@ -60,7 +64,9 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
     timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
     used = (subject > _ROBOTS) & timely
     if not used.any():
-        raise InputError(f"{folder}: robot {robot} saw no landmark while its odometry was logged; choose another robot")
+        raise InputError(
+            f"{folder}: robot {robot} saw no landmark while its odometry was logged; choose another robot"
+        )
     truth = folder / f"Robot{robot}_Groundtruth.dat"
     true = _by_time(_table(truth, 4)) if truth.is_file() else np.empty((0, 4))
     survey = folder / "Landmark_Groundtruth.dat"

@@ -64,7 +64,14 @@ def _read(path: Path) -> dict[str, Matrix]:
         raise InputError(f"{path}: does not exist; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from None
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError) as error:
+    except (
+        ValueError,
+        EOFError,
+        KeyError,
+        zipfile.BadZipFile,
+        zipfile.LargeZipFile,
+        NotImplementedError,
+    ) as error:
         reason = "it holds pickled objects" if "pickle" in str(error) else str(error)
         raise InputError(f"{path}: is no npz of plain arrays ({reason}); write it with numpy.savez") from None
 
@@ -88,7 +95,9 @@ def _table(path: Path, name: str, array: NDArray) -> Matrix:
 def _indices(path: Path, table: Matrix, poses: int, landmarks: int) -> NDArray[np.int64]:
     """Pose and landmark of every observation, (N, 2)."""
     for column, name, count in ((0, "pose", poses), (1, "landmark", landmarks)):
-        wrong = (table[:, column] != np.floor(table[:, column])) | (table[:, column] < 0) | (table[:, column] >= count)
+        wrong = (
+            (table[:, column] != np.floor(table[:, column])) | (table[:, column] < 0) | (table[:, column] >= count)
+        )
         for row in np.flatnonzero(wrong)[:1]:
             raise InputError(
                 f"{path}: observations[{row}] is of {name} {table[row, column]:g};"

@@ -53,7 +53,7 @@ class State:
         return np.concatenate([self.poses.ravel(), self.landmarks.ravel()])
 
     def moved(self, step: NDArray[np.float64]) -> State:
-        """This state plus a step (n,), poses first."""
+        """The state a step (n,) away, poses first."""
         split = self.poses.size
         poses = self.poses + step[:split].reshape(self.poses.shape)
         return State(poses, self.landmarks + step[split:].reshape(self.landmarks.shape))

@@ -70,10 +70,10 @@ class RangeSolution:
 def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") -> RangeSolution:
     """Estimate poses, landmarks and the sensor's noise together.
 
-    The odometry's noise is stated. That of bearings and ranges follows Student's t with 4 degrees of freedom, whose
-    scales are estimated along with the state: the weight (ν + 2) / (ν + χ²) of an observation is, but for a factor
-    that the scale takes up, Cauchy's with s² = ν + 2; the variance is Σ w r² over the redundancy Σ (1 − w h) of the
-    observations, h their leverage, as restricted maximum likelihood has it (Lange et al. 1989; Harville 1977).
+    The odometry's noise is stated. That of bearings and ranges follows Student's t with ν = 4 degrees of freedom,
+    whose scales are estimated along with the state. The weight (ν + 2) / (ν + χ²) of an observation is, but for a
+    factor that the scale takes up, Cauchy's with s² = ν + 2. The variance is Σ w r² over the redundancy Σ (1 − w h),
+    h the leverage of an observation: restricted maximum likelihood (Lange et al. 1989; Harville 1977).
     """
     begin = perf_counter()
     reckoning = reckon(log, noise)
@@ -138,22 +138,21 @@ class _Fit:
 
 def _fit(problem: BearingRangeProblem, state: State, solver: LinearSolver) -> _Fit:
     """Estimate state and sensor noise in turn until neither changes any more."""
-    sigmas, iterations, count = _FIRST_SIGMAS, 0, len(problem.measurements.measured)
-    for turn in range(_TURNS):
-        last = turn == _TURNS - 1
+    sigmas, iterations, turn = _FIRST_SIGMAS, 0, 1
+    while True:
         minimum = minimise(
             problem, state, solver, loss=STUDENT, tolerance=_TOLERANCE, first_damping=_LITTLE,
-            max_iterations=_MOST if last else _STEPS,
+            max_iterations=_STEPS if turn < _TURNS else _MOST,
         )  # fmt: skip
         state, iterations = minimum.state, iterations + minimum.iterations
         covariance = Covariance(problem.system(minimum.at, minimum.weights))
         fit = _Fit(problem, minimum, sigmas, covariance, iterations)
         ratio = np.sqrt(fit.observation_chi2())
-        if last or (minimum.converged and np.abs(ratio - 1.0).max() < _SETTLED):
-            break
+        if turn == _TURNS or (minimum.converged and np.abs(ratio - 1.0).max() < _SETTLED):
+            return fit
         sigmas = np.maximum(sigmas * ratio**_POWER, _LEAST_SIGMAS)
-        problem = problem.with_noise(_diagonal(sigmas, count))
-    return fit
+        problem = problem.with_noise(_diagonal(sigmas, len(minimum.weights)))
+        turn += 1
 
 
 def _diagonal(sigmas: NDArray[np.float64], count: int) -> Matrix:

@@ -78,7 +78,11 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
 def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
     """χ² over its degrees of freedom, and what that means."""
     freedom = max(rows - unknowns, 1)
-    verdict = "the noise model fits" if 0.5 <= chi2 / freedom <= 2.0 else "the noise model does not fit, or a poor minimum"
+    verdict = (
+        "the noise model fits"
+        if 0.5 <= chi2 / freedom <= 2.0
+        else "the noise model does not fit, or a poor minimum"
+    )
     return Fact("χ²", f"{chi2:.4f} over {freedom} degrees of freedom: {chi2 / freedom:.3f}; {verdict}")
 
 

@@ -19,6 +19,7 @@ from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_slam import STUDENT, RangeSolution, solve_range_log
 from pipeline.landmarks.study import Estimate, Fact, Options, Study
 
+_DOUBTED = 0.25  # weight
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
 
 
@@ -68,26 +69,26 @@ def _estimate(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> Estim
 
 def _facts(log: RangeLog, noise: OdometryNoise, solution: RangeSolution) -> tuple[Fact, ...]:
     ended = "converged" if solution.converged else "DID NOT CONVERGE"
-    doubted = int(np.count_nonzero(solution.weights < 0.25))
+    doubted = int(np.count_nonzero(solution.weights < _DOUBTED))
+    seen = f"{len(log.seen_s)} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s)} poses"
+    left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
+    stated = (
+        f"{noise.forward_m:g} m forward, {noise.sideways_m:g} m sideways, {noise.turn_rad:g} rad after a second"
+    )
+    found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
+    after = f"{ended} after {solution.iterations} linear solves: {solution.reason}"
     return (
-        Fact("observations", f"{len(log.seen_s)} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s)} poses"),
-        Fact("left out", f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"),
-        Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {ended} after {solution.iterations} linear solves: {solution.reason}"),
-        Fact(
-            "odometry noise",
-            f"stated: {noise.forward_m:g} m forward, {noise.sideways_m:g} m sideways, {noise.turn_rad:g} rad"
-            f" after one second; {_verdict(solution.motion_chi2)}",
-        ),
-        Fact(
-            "sensor noise",
-            f"estimated: bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m"
-            f" (Student's t); {_verdict(solution.observation_chi2)}; {doubted} observations count less than a quarter",
-        ),
-    )  # fmt: skip
+        Fact("observations", seen),
+        Fact("left out", left),
+        Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {after}"),
+        Fact("odometry noise", f"stated: {stated}; {_verdict(solution.motion_chi2)}"),
+        Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
+        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g}"),
+    )
 
 
 def _verdict(chi2: float) -> str:
     """χ² per degree of freedom in words."""
     low, high = _FITS
-    fit = "fits" if low <= chi2 <= high else f"too {'small' if chi2 > high else 'large'} by a factor {chi2**0.5:.2f}"
-    return f"χ² per degree of freedom {chi2:.2f}: {fit}"
+    verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
+    return f"χ² per degree of freedom {chi2:.2f}: {verdict}"

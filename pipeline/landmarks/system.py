@@ -63,7 +63,9 @@ class Pattern:
 
     def by_column(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Where each column's rows begin (n + 1,), and the rows."""
-        counts = csr_matrix((np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape).tocsc()
+        counts = csr_matrix(
+            (np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape
+        ).tocsc()
         return counts.indptr.astype(np.int64), counts.indices.astype(np.int64)
 
 

@@ -15,7 +15,17 @@ from pipeline.landmarks.compare import MethodResult
 from pipeline.landmarks.study import Study
 from pipeline.trajectory import write_tum
 
-HEADINGS = ("method", "build ms", "factor ms", "solve ms", "total ms", "again ms", "solves", "nnz factor", "differs by")
+HEADINGS = (
+    "method",
+    "build ms",
+    "factor ms",
+    "solve ms",
+    "total ms",
+    "again ms",
+    "solves",
+    "nnz factor",
+    "differs by",
+)
 
 
 def file_stem(name: str) -> str:
@@ -43,7 +53,10 @@ def text_of(study: Study) -> str:
     rows = [HEADINGS, *(row_of(method) for method in study.methods)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEADINGS))]
     for row in rows:
-        cells = (f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}" for k, (cell, width) in enumerate(zip(row, widths, strict=True)))
+        cells = (
+            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
         lines.append("  " + "  ".join(cells))
     return "\n".join(lines)
 
@@ -95,7 +108,14 @@ def write_estimate(directory: Path, study: Study) -> None:
     """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
     stem, state = file_stem(study.name), study.after.state
     names = ["x_m", "y_m", "heading_rad"][: state.poses.shape[1]]
-    _write_csv(directory / f"{stem}_poses.csv", "pose", np.arange(len(state.poses)), names, state.poses, study.pose_covariance)
+    _write_csv(
+        directory / f"{stem}_poses.csv",
+        "pose",
+        np.arange(len(state.poses)),
+        names,
+        state.poses,
+        study.pose_covariance,
+    )
     _write_csv(
         directory / f"{stem}_landmarks.csv", "landmark", study.landmarks, ["x_m", "y_m"], state.landmarks,
         study.landmark_covariance,
@@ -104,7 +124,9 @@ def write_estimate(directory: Path, study: Study) -> None:
         write_tum(directory / f"{stem}.tum", study.trajectory)
 
 
-def _write_csv(path: Path, kind: str, numbers: np.ndarray, names: list[str], values: Matrix, covariance: Matrix) -> None:
+def _write_csv(
+    path: Path, kind: str, numbers: np.ndarray, names: list[str], values: Matrix, covariance: Matrix
+) -> None:
     """One line each: number, values, upper triangle of the covariance."""
     rows, columns = np.triu_indices(len(names))
     header = [kind, *names, *(f"cov_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
 
 from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
 from pipeline.graph.factor_matrix import upper_factor
@@ -30,9 +31,7 @@ class NormalEquations:
         """Values of H and g."""
         H, g = np.empty(self.pattern.value_count), np.empty(self.pattern.scalars)
         pattern = system.pattern
-        normal_equations.products(
-            pattern.row_start, pattern.columns, system.values, system.b, self._slots, H, g
-        )
+        normal_equations.products(pattern.row_start, pattern.columns, system.values, system.b, self._slots, H, g)
         return H, g
 
 
@@ -66,4 +65,4 @@ class CholeskySolver:
 
 
 def _factor(cholesky: SparseCholesky) -> Factor:
-    return Factor("U of AᵀA", upper_factor(cholesky).tocsc(), cholesky.analysis.order)
+    return Factor("U of AᵀA", csc_matrix(upper_factor(cholesky)), cholesky.analysis.order)

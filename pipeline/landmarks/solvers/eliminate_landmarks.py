@@ -40,10 +40,10 @@ class LandmarkElimination:
         blocks = _diagonal_blocks(of_landmarks)
         build_s = watch.lap()
         roots = self._roots(blocks, system)  # R of C = RᵀR
-        inverse = csc_matrix(_block_diagonal(np.linalg.inv(roots)))
+        inverse = csc_matrix(_block_diagonal(np.asarray(np.linalg.inv(roots), np.float64)))
         Y = csc_matrix(inverse.T @ B)
         S = csc_matrix(P - Y.T @ Y)
-        reduced = self._factored(S, P.diagonal(), system)
+        reduced = self._factored(S, _diagonal(P), system)
         factor_s = watch.lap()
         forward = inverse.T @ g_landmarks
         poses = reduced.solve(g_poses - Y.T @ forward)
@@ -71,13 +71,13 @@ class LandmarkElimination:
         known = self._known
         if known is None or not (np.array_equal(rows, known.rows) and np.array_equal(columns, known.columns)):
             pairs = np.stack([rows, columns], axis=1).astype(np.int64)
-            pattern = BlockPattern(np.ones(S.shape[0], np.int64), pairs)
+            pattern = BlockPattern(np.ones(len(diagonal), np.int64), pairs)
             known = _Reduced(rows, columns, SparseCholesky(pattern, analyse(pattern)))
             self._known = known
-        if not np.all(S.diagonal() > LOST_DIGITS * diagonal):
+        if not np.all(_diagonal(S) > LOST_DIGITS * diagonal):
             raise undetermined(system)
         try:
-            known.cholesky.factorise(np.concatenate([S.diagonal(), lower.data[beyond]]))
+            known.cholesky.factorise(np.concatenate([_diagonal(S), lower.data[beyond]]))
         except SingularMatrixError as error:
             raise undetermined(system) from error
         return known.cholesky
@@ -86,10 +86,12 @@ class LandmarkElimination:
 def _diagonal_blocks(of_landmarks: csc_matrix) -> NDArray[np.float64]:
     """C = AᵀA of the landmarks' columns, (L, 2, 2); no row joins two landmarks."""
     x, y = of_landmarks[:, 0::2], of_landmarks[:, 1::2]
-    xx, yy, xy = (
-        np.asarray(a.multiply(b).sum(axis=0)).ravel() for a, b in ((x, x), (y, y), (x, y))
-    )
+    xx, yy, xy = (np.asarray(a.multiply(b).sum(axis=0)).ravel() for a, b in ((x, x), (y, y), (x, y)))
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+
+
+def _diagonal(matrix: csc_matrix) -> NDArray[np.float64]:
+    return np.asarray(matrix.diagonal(), np.float64)
 
 
 def _block_diagonal(blocks: NDArray[np.float64]) -> bsr_matrix:
@@ -101,4 +103,4 @@ def _factor(roots: NDArray[np.float64], Y: csc_matrix, reduced: SparseCholesky, 
     """U = [R, Y; 0, U_S], landmarks first, then the poses as they were eliminated."""
     order = reduced.analysis.order
     matrix = csc_matrix(bmat([[_block_diagonal(roots), Y[:, order]], [None, upper_factor(reduced)]]))
-    return Factor("U of AᵀA", matrix, np.concatenate([split + np.arange(Y.shape[0]), order]))
+    return Factor("U of AᵀA", matrix, np.concatenate([split + np.arange(2 * len(roots)), order]))

@@ -32,7 +32,7 @@ class _Analysis:
 
 
 class QrSolver:
-    """Householder QR of the project's own; ordering and symbolic analysis are kept while the pattern is the same."""
+    """Householder QR of the project's own; its analysis is kept while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering

@@ -100,11 +100,11 @@ def _factor(U: Arrow) -> Factor:
     """The three parts put together, with every place that may fill in."""
     width, split = U.band.shape[0] - 1, U.band.shape[1]
     n, rest = split + len(U.corner), len(U.corner)
-    below, right = np.indices(U.band.shape)
-    inside = below + right >= width  # the corner of a band's storage is not part of it
-    below, right = below[inside], right[inside]
-    across, down = np.indices(U.border.shape), np.triu_indices(rest)
-    rows = np.concatenate([below + right - width, across[0].ravel(), split + down[0]])
-    columns = np.concatenate([right, split + across[1].ravel(), split + down[1]])
-    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[down]])
+    places = np.indices(U.band.shape).reshape(2, -1)
+    below, right = places[:, places.sum(axis=0) >= width]  # the corner of a band's storage is not part of it
+    pose, landmark = np.indices(U.border.shape)
+    upper, lower = np.triu_indices(rest)
+    rows = np.concatenate([below + right - width, pose.ravel(), split + upper])
+    columns = np.concatenate([right, split + landmark.ravel(), split + lower])
+    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[upper, lower]])
     return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))

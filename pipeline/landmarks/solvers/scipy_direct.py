@@ -39,7 +39,7 @@ class PinvSolver:
             raise undetermined(system) from error
         factor_s = watch.lap()
         # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
-        _check_pivots(1.0 / inverse.diagonal(), H.diagonal(), system)
+        _check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), H, system)
         watch.lap()
         x = inverse @ g
         solve_s = watch.lap()
@@ -64,7 +64,7 @@ class DefaultSolver:
         except (RuntimeError, MatrixRankWarning) as error:
             raise undetermined(system) from error
         factor_s = watch.lap()
-        return Solution(x, build_s, factor_s, 0.0, lambda: _upper(_factorise(H, "COLAMD", system)))
+        return Solution(np.asarray(x), build_s, factor_s, 0.0, lambda: _upper(_factorise(H, "COLAMD", system)))
 
 
 class LuSolver:
@@ -95,13 +95,13 @@ def _factorise(H: csc_matrix, ordering: str, system: LinearSystem) -> SuperLU:
         lu = splu(H, permc_spec=ordering)
     except RuntimeError as error:  # an exact zero
         raise undetermined(system) from error
-    _check_pivots(np.abs(lu.U.diagonal())[lu.perm_c], H.diagonal(), system)
+    _check_pivots(np.abs(lu.U.diagonal())[lu.perm_c], H, system)
     return lu
 
 
-def _check_pivots(pivots: NDArray[np.float64], diagonal: NDArray[np.float64], system: LinearSystem) -> None:
+def _check_pivots(pivots: NDArray[np.float64], H: csc_matrix, system: LinearSystem) -> None:
     """Refuse pivots (n,) by column that are no more than rounding; the factor of a singular matrix has such."""
-    if not np.all(pivots > LOST_DIGITS * diagonal):
+    if not np.all(pivots > LOST_DIGITS * np.asarray(H.diagonal())):
         raise undetermined(system)
 
 

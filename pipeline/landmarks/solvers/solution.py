@@ -108,13 +108,14 @@ def undetermined(system: LinearSystem) -> UndeterminedError:
     if not (np.isfinite(system.values).all() and np.isfinite(system.b).all()):
         raise InputError("A x = b holds numbers that are not finite; start from a better guess")
     A = system.A
+    n = system.pattern.shape[1]
     H = csc_matrix(A.T @ A)
-    scale = np.sqrt(H.diagonal())
+    scale = np.sqrt(np.asarray(H.diagonal()))
     scale[scale == 0.0] = 1.0
     H = csc_matrix(diags_array(1.0 / scale) @ H @ diags_array(1.0 / scale))
     epsilon = 1e-11
-    factor = splu(csc_matrix(H + epsilon * identity(H.shape[0], format="csc")), permc_spec="MMD_AT_PLUS_A")
-    null = np.random.default_rng(0).uniform(1.0, 2.0, H.shape[0])
+    factor = splu(csc_matrix(H + epsilon * identity(n, format="csc")), permc_spec="MMD_AT_PLUS_A")
+    null = np.random.default_rng(0).uniform(1.0, 2.0, n)
     for _ in range(4):
         null = epsilon * factor.solve(null)
     null = np.abs(null) / scale

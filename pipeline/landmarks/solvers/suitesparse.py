@@ -20,7 +20,7 @@ class SuiteSparseQrSolver:
 
     def __init__(self, ordering: Literal["natural", "colamd"]) -> None:
         try:
-            import sparseqr
+            import sparseqr  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise MissingExtraError("sparseqr", "suitesparse") from error
         self._rz = sparseqr.rz
@@ -29,12 +29,11 @@ class SuiteSparseQrSolver:
     def solve(self, system: LinearSystem) -> Solution:
         """Solve in the least-squares sense; the factor is R."""
         watch = Stopwatch()
-        A = coo_matrix(system.A)
-        lengths = np.bincount(system.pattern.columns, system.values**2, A.shape[1])
+        A, n = coo_matrix(system.A), system.pattern.shape[1]
+        lengths = np.bincount(system.pattern.columns, system.values**2, n)
         build_s = watch.lap()
         z, R, permutation, rank = self._rz(A, system.b[:, None], ordering=_ORDERINGS[self._ordering])
         factor_s = watch.lap()
-        n = A.shape[1]
         order = np.asarray(permutation, np.int64) if self._ordering == "colamd" else np.arange(n)
         R = csc_matrix(R)
         if rank < n or not np.all(R.diagonal() ** 2 > LOST_DIGITS * lengths[order]):
