@@ -92,6 +92,7 @@ def landmarks(
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with telling_of_compilation(terminal):
             studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]
+        _check_names(studies)
         tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
         _write(directory.path, data, studies, tree)
         viewing.report(directory.path, studies)
@@ -114,6 +115,16 @@ def _noise(text: str | None) -> OdometryNoise:
     if len(values) != 3 or not all(0.0 < value < 1e3 for value in values):
         raise InputError(f"--odometry-noise is {text!r}; give three positive numbers, as 0.01,0.003,0.03")
     return OdometryNoise(*values)
+
+
+def _check_names(studies: Sequence[Study]) -> None:
+    """Refuse problems whose files would overwrite each other."""
+    from pipeline.landmarks.write import file_stem
+
+    stems = [file_stem(study.name) for study in studies]
+    for study, stem in zip(studies, stems, strict=True):
+        if stems.count(stem) > 1:
+            raise InputError(f"two problems are called {study.name}; rename one, or give each a call of its own")
 
 
 def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree: dict[str, object]) -> None:

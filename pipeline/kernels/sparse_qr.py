@@ -128,9 +128,9 @@ def _find_leads(
             leads[at] = min(leads[at], local[place[columns[q]]])
         at += 1
     for k in range(children.size):
-        child = children[k]
-        first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-        for a in range(_handed_on(height[child], end - first, fronts.pivots[child])):
+        child = int(children[k])
+        first = fronts.row_start[child] + fronts.pivots[child]
+        for a in range(_rows_of(fronts, height, child)):
             leads[at] = fronts.place[first + a]
             at += 1
 
@@ -155,14 +155,14 @@ def _place_children(
 ) -> int:  # fmt: skip
     """Write the rows that the children hand on, from place ``at`` on; return the stack's depth without them."""
     for k in range(children.size):
-        child = children[k]
+        child = int(children[k])
         first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-        depth -= _handed_on(height[child], end - first, fronts.pivots[child]) * (end - first + 1)
+        depth -= _rows_of(fronts, height, child) * (end - first + 1)
     start = depth
     for k in range(children.size):
-        child = children[k]
+        child = int(children[k])
         first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-        for a in range(_handed_on(height[child], end - first, fronts.pivots[child])):
+        for a in range(_rows_of(fronts, height, child)):
             row, kept = front[target[at]], stack[start : start + end - first + 1]
             for c in range(a, end - first):
                 row[fronts.place[first + c]] = kept[c]
@@ -203,6 +203,13 @@ def back_substitute(fronts: Fronts, factor: _Array, z: _Array) -> None:
 def _handed_on(height: int, rest: int, pivots: int) -> int:
     """Rows that a front of this height hands on."""
     return max(min(height, rest + pivots) - pivots, 0)
+
+
+@njit(cache=True)
+def _rows_of(fronts: Fronts, height: _Index, child: int) -> int:
+    """Rows that a front hands on to its parent."""
+    width = fronts.row_start[child + 1] - fronts.row_start[child]
+    return int(_handed_on(height[child], width - fronts.pivots[child], fronts.pivots[child]))
 
 
 @njit(cache=True)

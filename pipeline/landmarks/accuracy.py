@@ -69,12 +69,17 @@ def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.
 
 def against_truth(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
     """ATE of the poses after rigid alignment, landmarks by the same alignment; and T_truth_estimate (3, 3)."""
-    stamps_ns = np.round(nodes_s[truth.known] * 1e9).astype(np.int64)
+    stamps_ns = nanoseconds(nodes_s[truth.known])
     estimate = Trajectory(stamps_ns, pose_matrices(state.poses[truth.known]))
     error = absolute_error(pair(estimate, Trajectory(stamps_ns, pose_matrices(truth.poses))), Alignment.RIGID)
     T_truth_estimate = lie.flatten(error.T_reference_estimate)
     moved = lie.transform(T_truth_estimate, state.landmarks)
     return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), error.definition), T_truth_estimate
+
+
+def nanoseconds(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Whole nanoseconds of times that were written with milliseconds."""
+    return np.round(times_s * 1e3).astype(np.int64) * 1_000_000
 
 
 def pose_matrices(poses: Matrix) -> Matrix:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.data import Trajectory
-from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, pose_matrices, truth_at
+from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
 from pipeline.landmarks.compare import compare_linear
 from pipeline.landmarks.dead_reckoning import OdometryNoise
 from pipeline.landmarks.guess import from_odometry
@@ -53,9 +53,7 @@ def study_log(folder: Path, options: Options) -> Study:
         entries=len(system.values),
         build_s=build_s,
         methods=compare_linear(system, options.methods, options.repeats),
-        trajectory=Trajectory(
-            np.round(solution.nodes_s * 1e9).astype(np.int64), pose_matrices(solution.state.poses)
-        ),
+        trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.state.poses)),
     )
 
 

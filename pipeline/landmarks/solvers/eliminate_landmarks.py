@@ -77,7 +77,9 @@ class LandmarkElimination:
         if not np.all(_diagonal(S) > LOST_DIGITS * diagonal):
             raise undetermined(system)
         try:
-            known.cholesky.factorise(np.concatenate([_diagonal(S), lower.data[beyond]]))
+            known.cholesky.factorise(
+                np.concatenate([_diagonal(S), lower.data[beyond]]).astype(np.float64, copy=False)
+            )
         except SingularMatrixError as error:
             raise undetermined(system) from error
         return known.cholesky

@@ -54,7 +54,7 @@ class QrSolver:
         lengths = np.zeros(n)
         np.add.at(lengths, pattern.columns, system.values**2)
         diagonal = matrix.diagonal()[analysis.place]
-        if not np.all(diagonal**2 > LOST_DIGITS * lengths):
+        if not np.all(np.abs(diagonal) > LOST_DIGITS * np.sqrt(lengths)):
             raise undetermined(system)
         watch.lap()
         sparse_qr.back_substitute(fronts, R, z)

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from pipeline.errors import InputError
 from pipeline.landmarks.system import Layout, LinearSystem
 
-LOST_DIGITS = 1e-13  # a pivot of AᵀA below this share of its diagonal entry is rounding noise
+LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
 _NAMED = 6
 
 

@@ -36,7 +36,7 @@ class SuiteSparseQrSolver:
         factor_s = watch.lap()
         order = np.asarray(permutation, np.int64) if self._ordering == "colamd" else np.arange(n)
         R = csc_matrix(R)
-        if rank < n or not np.all(R.diagonal() ** 2 > LOST_DIGITS * lengths[order]):
+        if rank < n or not np.all(np.abs(R.diagonal()) > LOST_DIGITS * np.sqrt(lengths[order])):
             raise undetermined(system)
         watch.lap()
         x = np.empty(n)
