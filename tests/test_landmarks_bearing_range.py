@@ -125,7 +125,7 @@ def measurements(seed=0, unit=1.0, outliers=0):
     rng = np.random.default_rng(seed)
     motion = np.tile([0.3, 0.0, 0.16], (39, 1)) + rng.normal(size=(39, 3)) * [0.01, 0.005, 0.01]
     poses = guesses.chain(np.zeros(3), np.tile([0.3, 0.0, 0.16], (39, 1)))
-    landmarks = rng.uniform(-3.0, 3.0, (6, 2)) + [0.0, 2.0]
+    landmarks = rng.uniform(-3.0, 3.0, (6, 2)) + np.array([0.0, 2.0])
     observed = np.stack(np.meshgrid(np.arange(40), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     away = landmarks[observed[:, 1]] - poses[observed[:, 0], :2]
     bearing = np.arctan2(away[:, 1], away[:, 0]) - poses[observed[:, 0], 2] + rng.normal(size=len(away)) * 0.02

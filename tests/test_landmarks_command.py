@@ -53,7 +53,7 @@ def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path)
         rows = list(csv.DictReader(file))
     assert len(rows) == 5 and 0.0 < float(rows[0]["cov_x_m_x_m"]) < 0.01
     pixels = image.imread(out / "a_b_c.png")
-    assert np.mean(np.all(np.abs(pixels[..., :3] - [0.122, 0.373, 0.816]) < 0.1, axis=-1)) > 0.001
+    assert np.mean(np.all(np.abs(pixels[..., :3] - [0.25, 0.47, 0.84]) < 0.1, axis=-1)) > 0.001
     assert json.loads((out / "run.json").read_text())["complete"]
 
 

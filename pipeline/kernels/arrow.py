@@ -86,9 +86,10 @@ def complement(corner: _Array, border: _Array) -> None:
             for j in range(first, min(first + _PANEL, whole), 4):
                 w, x, y, z = border[j, a], border[j + 1, a], border[j + 2, a], border[j + 3, a]
                 if w != 0.0 or x != 0.0 or y != 0.0 or z != 0.0:
-                    W, X, Y, Z = border[j, a:], border[j + 1, a:], border[j + 2, a:], border[j + 3, a:]
                     for c in range(row.size):
-                        row[c] -= (w * W[c] + x * X[c]) + (y * Y[c] + z * Z[c])
+                        row[c] -= (w * border[j, a + c] + x * border[j + 1, a + c]) + (
+                            y * border[j + 2, a + c] + z * border[j + 3, a + c]
+                        )
     for j in range(whole, border.shape[0]):
         for a in range(corner.shape[0]):
             _subtract(corner[a, a:], border[j, a], border[j, a:])

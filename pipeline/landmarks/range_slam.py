@@ -71,9 +71,10 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") 
     """Estimate poses, landmarks and the sensor's noise together.
 
     The odometry's noise is stated. That of bearings and ranges follows Student's t with ν = 4 degrees of freedom,
-    whose scales are estimated along with the state. The weight (ν + 2) / (ν + χ²) of an observation is, but for a
-    factor that the scale takes up, Cauchy's with s² = ν + 2. The variance is Σ w r² over the redundancy Σ (1 − w h),
-    h the leverage of an observation: restricted maximum likelihood (Lange et al. 1989; Harville 1977).
+    whose scales are estimated with the state. The weight (ν + 2) / (ν + χ²) of an observation is, but for a
+    factor that the scale takes up, Cauchy's with s² = ν + 2. The variance is Σ w r² over the redundancy
+    Σ (1 − w h), h the leverage of an observation: restricted maximum likelihood (Lange et al. 1989;
+    Harville 1977).
     """
     begin = perf_counter()
     reckoning = reckon(log, noise)
@@ -128,31 +129,48 @@ class _Fit:
         leverage = _leverage(rows, self.covariance.of(self.problem.motion_columns))
         return float(np.square(residuals).sum() / (residuals.size - leverage.sum()))
 
+    def redundancy(self) -> NDArray[np.float64]:
+        """Degrees of freedom of bearings and of ranges, weighed, (2,)."""
+        weights = self.minimum.weights[:, None]
+        rows = self.minimum.at.observation_rows
+        leverage = _leverage(rows, self.covariance.of(self.problem.observation_columns))
+        return (1.0 - weights * leverage).sum(axis=0)
+
     def observation_chi2(self) -> NDArray[np.float64]:
         """χ² per degree of freedom of bearings and of ranges, weighed, (2,)."""
-        rows, residuals = self.minimum.at.observation_rows, self.minimum.at.observations
-        weights = self.minimum.weights[:, None]
-        leverage = _leverage(rows, self.covariance.of(self.problem.observation_columns))
-        return (weights * residuals**2).sum(axis=0) / (1.0 - weights * leverage).sum(axis=0)
+        return _squares(self.minimum) / self.redundancy()
 
 
 def _fit(problem: BearingRangeProblem, state: State, solver: LinearSolver) -> _Fit:
     """Estimate state and sensor noise in turn until neither changes any more."""
-    sigmas, iterations, turn = _FIRST_SIGMAS, 0, 1
+    sigmas, iterations, turn, redundancy = _FIRST_SIGMAS, 0, 1, np.ones(2)
     while True:
         minimum = minimise(
             problem, state, solver, loss=STUDENT, tolerance=_TOLERANCE, first_damping=_LITTLE,
             max_iterations=_STEPS if turn < _TURNS else _MOST,
         )  # fmt: skip
         state, iterations = minimum.state, iterations + minimum.iterations
-        covariance = Covariance(problem.system(minimum.at, minimum.weights))
-        fit = _Fit(problem, minimum, sigmas, covariance, iterations)
-        ratio = np.sqrt(fit.observation_chi2())
-        if turn == _TURNS or (minimum.converged and np.abs(ratio - 1.0).max() < _SETTLED):
-            return fit
+        near = minimum.converged and _settled(_squares(minimum) / redundancy)
+        if near or turn == _TURNS or turn.bit_count() == 1:  # the redundancy changes slowly: at 1, 2, 4, 8 will do
+            covariance = Covariance(problem.system(minimum.at, minimum.weights))
+            fit = _Fit(problem, minimum, sigmas, covariance, iterations)
+            redundancy = fit.redundancy()
+            if turn == _TURNS or (minimum.converged and _settled(_squares(minimum) / redundancy)):
+                return fit
+        ratio = np.sqrt(_squares(minimum) / redundancy)
         sigmas = np.maximum(sigmas * ratio**_POWER, _LEAST_SIGMAS)
         problem = problem.with_noise(_diagonal(sigmas, len(minimum.weights)))
         turn += 1
+
+
+def _squares(minimum: Minimum) -> NDArray[np.float64]:
+    """Σ w r² of bearings and of ranges, whitened, (2,)."""
+    return (minimum.weights[:, None] * minimum.at.observations**2).sum(axis=0)
+
+
+def _settled(chi2: NDArray[np.float64]) -> bool:
+    """Whether χ² per degree of freedom is as near to 1 as it need be."""
+    return bool(np.abs(np.sqrt(chi2) - 1.0).max() < _SETTLED)
 
 
 def _diagonal(sigmas: NDArray[np.float64], count: int) -> Matrix:

@@ -35,8 +35,8 @@ def with_suitesparse():
 def report(name, results):
     published = dict(zip(OF_THE_REPORT, REPORT_S[name], strict=True))
     print(f"\n{name}")
-    print(f"  {'method':12} {'report s':>9} {'total ms':>9} {'build':>8} {'factor':>8} {'solve':>7} {'again ms':>9}"
-          f" {'nnz factor':>11} {'differs by':>10}")  # fmt: skip
+    print(f"  {'method':12} {'report s':>9} {'total ms':>9} {'build':>8} {'factor':>8} {'solve':>7}"
+          f" {'again ms':>9} {'nnz factor':>11} {'differs by':>10}")  # fmt: skip
     for result in results:
         told = f"{published[result.method]:9.4f}" if result.method in published else f"{'-':>9}"
         build, factor, solve, again = (
