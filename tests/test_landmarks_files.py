@@ -157,6 +157,12 @@ def test_a_robot_that_is_not_there_and_a_folder_that_is_none_are_refused(folder,
         read_mrclam(tmp_path, 1)
 
 
+def test_a_log_too_short_to_tell_its_noise_is_refused(folder):
+    (folder / "Robot1_Measurement.dat").write_text("11.0 63 2.06 1.3\n")
+    with pytest.raises(InputError, match="too seldom"):
+        solve_range_log(read_mrclam(folder, 1), OdometryNoise())
+
+
 def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
     study = study_log(
         shared_data("landmarks/utias_mrclam6"), Options(("schur",), 1, 1, OdometryNoise(), "odometry")

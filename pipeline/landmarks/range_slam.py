@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
+from pipeline.errors import InputError
 from pipeline.graph.robust import RobustLoss
 from pipeline.landmarks.assembly import landmark_columns, pose_columns
 from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
@@ -23,6 +24,7 @@ from pipeline.landmarks.solvers import LinearSolver, create_solver
 _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _FIRST_SIGMAS = np.array([0.03, 0.12])  # rad, m; where the estimate of the sensor's noise begins
 _LEAST_SIGMAS = np.array([3e-4, 3e-4])  # rad, m; what rounding to three digits alone amounts to
+_LEAST_REDUNDANCY = 1e-3  # observations beyond what the state takes up
 _FREEDOM = 4.0  # of Student's t
 STUDENT = RobustLoss("cauchy", np.sqrt(_FREEDOM + 2.0), 1.0)
 _TURNS, _STEPS, _MOST = 12, 2, 50  # estimates of the noise; steps in between, and after the last
@@ -74,7 +76,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise, method: str = "schur") 
     whose scales are estimated with the state. The weight (ν + 2) / (ν + χ²) of an observation is, but for a
     factor that the scale takes up, Cauchy's with s² = ν + 2. The variance is Σ w r² over the redundancy
     Σ (1 − w h), h the leverage of an observation: restricted maximum likelihood (Lange et al. 1989;
-    Harville 1977).
+    Harville 1977). Raises InputError where the observations are too few for that.
     """
     begin = perf_counter()
     reckoning = reckon(log, noise)
@@ -155,6 +157,10 @@ def _fit(problem: BearingRangeProblem, state: State, solver: LinearSolver) -> _F
             covariance = Covariance(problem.system(minimum.at, minimum.weights))
             fit = _Fit(problem, minimum, sigmas, covariance, iterations)
             redundancy = fit.redundancy()
+            if not np.all(redundancy > _LEAST_REDUNDANCY):
+                raise InputError(
+                    "the landmarks were seen too seldom to tell the sensor's noise; give a longer log"
+                )
             if turn == _TURNS or (minimum.converged and _settled(_squares(minimum) / redundancy)):
                 return fit
         ratio = np.sqrt(_squares(minimum) / redundancy)
