@@ -1,9 +1,9 @@
 """An MRCLAM log against a batch in GTSAM, interleaved: python -m tests.benchmarks.landmark_log [FOLDER].
 
 GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and 0.12 m, and the
-odometry's noise as stated. Its time is that of building the graph and of its optimiser, with the covariance of every
-pose and landmark where it says so. "ours" is the whole estimate: dead reckoning, guess, the sensor's noise, all
-covariances; "ours as given" has GTSAM's noise, weights and guess, and no covariances.
+odometry's noise as stated. Its time is that of building the graph and of its optimiser, with the covariance of
+every pose and landmark where it says so. "ours" is the whole estimate: dead reckoning, guess, the sensor's noise,
+all covariances; "ours as given" has GTSAM's noise, weights and guess, and no covariances.
 """
 
 import argparse
