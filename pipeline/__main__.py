@@ -16,6 +16,7 @@ from pipeline.commands.convert import convert
 from pipeline.commands.doctor import doctor
 from pipeline.commands.evaluate import evaluate
 from pipeline.commands.info import info
+from pipeline.commands.landmarks import landmarks
 from pipeline.commands.optimize import optimize
 from pipeline.commands.run import run
 from pipeline.commands.sequence import sequence
@@ -27,6 +28,7 @@ from pipeline.runs.recorder import Recorder, SinkName, Viewing
 
 if TYPE_CHECKING:
     from pipeline.graph.optimisation import GraphChange
+    from pipeline.landmarks.study import Study
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -44,14 +46,16 @@ def scanchain() -> None:
     """
 
 
-_COMMANDS = (run, view, compare, info, doctor, convert, simulate, evaluate, optimize, config, sequence)
+_COMMANDS = (run, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config, sequence)
 for _command in _COMMANDS:
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(_record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph)
+    viewing = Viewing(
+        _record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph, _present_landmarks
+    )
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -127,6 +131,12 @@ def _present_comparison(directory: Path) -> None:
 
     write_compare_report(directory)
     record_comparison(directory)
+
+
+def _present_landmarks(directory: Path, studies: Sequence[Study]) -> None:
+    from viz.landmark_report import write_report
+
+    write_report(directory, studies)
 
 
 if __name__ == "__main__":

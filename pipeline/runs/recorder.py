@@ -16,6 +16,7 @@ from pipeline.data import Closure, GraphState, Matrix, Step
 
 if TYPE_CHECKING:
     from pipeline.graph.optimisation import GraphChange
+    from pipeline.landmarks.study import Study
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 
@@ -88,7 +89,8 @@ class Viewing:
 
     ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
     ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
-    ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording.
+    ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording;
+    ``present_landmarks`` studies of landmark problems, as pictures and a page, in a directory.
     """
 
     record: OpenRecorder
@@ -98,3 +100,4 @@ class Viewing:
     present_comparison: Callable[[Path], None]
     draw_graph: Callable[[GraphChange, Path], None]
     record_graph: Callable[[GraphChange, Path], None]
+    present_landmarks: Callable[[Path, Sequence[Study]], None]

@@ -1,0 +1,141 @@
+"""``scanchain landmarks``: landmark problems, their solvers side by side."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pipeline.errors import InputError
+
+if TYPE_CHECKING:
+    from pipeline.landmarks.dead_reckoning import OdometryNoise
+    from pipeline.landmarks.study import Guess, Study
+    from pipeline.runs.recorder import Viewing
+
+
+@click.command()
+@click.argument("data", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    required=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Directory to write; must not exist.",
+)
+@click.option(
+    "--method", "methods", default="all", show_default=True, metavar="NAME,...", help="Linear solvers to compare."
+)
+@click.option(
+    "--repeat", type=click.IntRange(1, 1000), default=3, show_default=True, help="Timed rounds; medians are told."
+)
+@click.option(
+    "--robot", type=click.IntRange(1), default=1, show_default=True, help="Whose log of an MRCLAM folder."
+)
+@click.option(
+    "--odometry-noise",
+    "noise",
+    metavar="FORWARD,SIDEWAYS,TURN",
+    help="Of an MRCLAM robot after one second: m, m, rad. [default: 0.01,0.003,0.03]",
+)
+@click.option(
+    "--guess",
+    type=click.Choice(["odometry", "disturbed", "origin"]),
+    default="odometry",
+    show_default=True,
+    help="Where a nonlinear file begins: disturbed by 1 m and 0.5 rad, or with all landmarks at the origin.",
+)
+@click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run.")
+@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
+@click.pass_context
+def landmarks(
+    ctx: click.Context,
+    data: tuple[Path, ...],
+    out: Path,
+    methods: str,
+    repeat: int,
+    robot: int,
+    noise: str | None,
+    guess: Guess,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Solve landmark problems, and compare linear solvers on them.
+
+    DATA is an npz problem of the course (linear, or of bearings and ranges), or a folder of the UTIAS MRCLAM data
+    sets, of which one robot's log is used. The estimate goes to DIR with pictures, and report.html holds them all.
+
+    Methods: default, pinv, lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them; with the package
+    sparseqr also spqr and spqr_colamd.
+
+    \b
+    Examples:
+      scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --out runs/linear
+      scanchain landmarks 2d_nonlinear.npz --guess origin --method cholesky,schur --out runs/nonlinear
+      scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
+    """
+    from pipeline.commands.terminal import Terminal
+    from pipeline.landmarks.solvers import parse_methods
+    from pipeline.landmarks.study import Options
+    from pipeline.landmarks.study_file import study_file
+    from pipeline.landmarks.study_log import study_log
+    from pipeline.landmarks.write import text_of, tree_of
+    from pipeline.runs.compiling import telling_of_compilation
+    from pipeline.runs.directory import RunDirectory
+
+    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess)
+    viewing: Viewing = ctx.obj
+    with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
+        with telling_of_compilation(terminal):
+            studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]
+        _check_names(studies)
+        tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
+        _write(directory.path, data, studies, tree)
+        viewing.present_landmarks(directory.path, studies)
+        directory.complete()
+    click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
+    if not as_json:
+        click.echo(f"\nwritten        {out}")
+
+
+def _noise(text: str | None) -> OdometryNoise:
+    """Three positive numbers with commas."""
+    from pipeline.landmarks.dead_reckoning import OdometryNoise
+
+    if text is None:
+        return OdometryNoise()
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(0.0 < value < 1e3 for value in values):
+        raise InputError(f"--odometry-noise is {text!r}; give three positive numbers, as 0.01,0.003,0.03")
+    return OdometryNoise(*values)
+
+
+def _check_names(studies: Sequence[Study]) -> None:
+    """Refuse problems whose files would overwrite each other."""
+    from pipeline.landmarks.write import file_stem
+
+    stems = [file_stem(study.name) for study in studies]
+    for study, stem in zip(studies, stems, strict=True):
+        if stems.count(stem) > 1:
+            raise InputError(f"two problems are called {study.name}; rename one, or give each a call of its own")
+
+
+def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree: dict[str, object]) -> None:
+    """The estimates, the figures, and how they came about."""
+    from msgspec.structs import replace
+
+    from pipeline.landmarks.write import write_estimate
+    from pipeline.runs.provenance import describe_start
+
+    for study in studies:
+        write_estimate(directory, study)
+    (directory / "metrics.json").write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
+    replace(describe_start(sys.argv, files, ""), complete=True).write(directory / "run.json")

@@ -1,0 +1,141 @@
+"""The landmark problem of bearings and ranges, with or without unknown headings."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.kernels import landmark_factors
+from pipeline.landmarks.assembly import landmark_columns, pattern_of, pose_columns, whitening
+from pipeline.landmarks.problem import LandmarkData, State
+from pipeline.landmarks.system import Layout, LinearSystem
+
+_ANCHOR = 0.01  # noise of the first pose, in shares of a step's
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Whitened residuals r at a state and the values of A = ∂r/∂x there.
+
+    Attributes
+    ----------
+    prior, odometry, observations : residuals (p,), (K − 1, p), (N, 2); pure numbers
+    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p), (N, 2, p + 2)
+    """
+
+    prior: NDArray[np.float64]
+    odometry: Matrix
+    observations: Matrix
+    prior_rows: Matrix
+    odometry_rows: Matrix
+    observation_rows: Matrix
+
+    @property
+    def observation_chi2(self) -> NDArray[np.float64]:
+        """χ² of every observation, (N,)."""
+        return np.square(self.observations).sum(axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """What a bearing-range problem is made of.
+
+    Attributes
+    ----------
+    first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
+    motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
+        of the former, without in the world's
+    observed : (N, 2) pose, landmark
+    measured, measured_covariance : (N, 2), (N, 2, 2) bearing in rad, range in m
+    landmarks : (L,) their names, as numbers
+    """
+
+    first_pose: NDArray[np.float64]
+    first_covariance: Matrix
+    motion: Matrix
+    motion_covariance: Matrix
+    observed: NDArray[np.int64]
+    measured: Matrix
+    measured_covariance: Matrix
+    landmarks: NDArray[np.int64]
+
+
+class BearingRangeProblem:
+    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
+
+    ``motion_columns`` (K − 1, 2 p) and ``observation_columns`` (N, p + 2) are the unknowns of each of them.
+    """
+
+    def __init__(self, measurements: Measurements) -> None:
+        given = measurements
+        self.measurements = given
+        size = given.motion.shape[1]
+        layout = Layout(len(given.motion) + 1, size, given.landmarks)
+        self._first, self._motion = whitening(given.first_covariance), whitening(given.motion_covariance)
+        self._observation = whitening(given.measured_covariance)
+        poses = pose_columns(layout, np.arange(layout.poses))
+        seen_from, seen = given.observed.T
+        pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen)], axis=1)
+        moves = np.concatenate([poses[:-1], poses[1:]], axis=1)
+        groups = [np.repeat(poses[:1], size, axis=0), np.repeat(moves, size, axis=0), np.repeat(pairs, 2, axis=0)]
+        damping = np.arange(layout.columns)[:, None]
+        self.motion_columns, self.observation_columns = moves, pairs
+        self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
+
+    def with_noise(self, measured_covariance: Matrix) -> BearingRangeProblem:
+        """The same problem, with the same pattern, and another covariance (N, 2, 2) of what was measured."""
+        result = copy(self)
+        result.measurements = replace(self.measurements, measured_covariance=measured_covariance)
+        result._observation = whitening(measured_covariance)
+        return result
+
+    def linearise(self, state: State) -> Linearisation:
+        """Residuals and Jacobians at a state."""
+        given, p = self.measurements, state.poses.shape[1]
+        motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
+        if p == 3:
+            landmark_factors.odometry(state.poses, given.motion, self._motion, motion, J_motion)
+        else:
+            W = self._motion
+            motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
+            J_motion = np.concatenate([-W, W], axis=-1)
+        seen = np.empty(given.measured.shape)
+        J_seen = np.empty((len(seen), 2, p + 2))
+        landmark_factors.bearing_range(
+            state.poses, state.landmarks, given.observed, given.measured, self._observation, seen, J_seen
+        )
+        off = state.poses[0] - given.first_pose
+        off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
+        return Linearisation(self._first @ off, motion, seen, self._first, J_motion, J_seen)
+
+    def system(self, at: Linearisation, weights: NDArray[np.float64]) -> LinearSystem:
+        """The step's system A x = −r, observations weighed by √w (N,)."""
+        root = np.sqrt(weights)[:, None]
+        seen = at.observation_rows * root[..., None]
+        values = np.concatenate([at.prior_rows.ravel(), at.odometry_rows.ravel(), seen.ravel()])
+        b = -np.concatenate([at.prior, at.odometry.ravel(), (at.observations * root).ravel()])
+        return LinearSystem(self.pattern, values, b)
+
+    def damped(self, system: LinearSystem, damping: NDArray[np.float64]) -> LinearSystem:
+        """The system with a row √d of its own for every unknown, so that AᵀA grows by diag(d); d (n,)."""
+        values, b = np.concatenate([system.values, np.sqrt(damping)]), np.append(system.b, np.zeros(len(damping)))
+        return LinearSystem(self._damped, values, b)
+
+
+def world_referenced(data: LandmarkData) -> Measurements:
+    """The problem of a course file: headings are known, so that bearings are those of the world's axes."""
+    count, steps = len(data.observed), len(data.odometry)
+    return Measurements(
+        first_pose=np.zeros(2),
+        first_covariance=_ANCHOR**2 * data.odometry_covariance,
+        motion=data.odometry,
+        motion_covariance=np.broadcast_to(data.odometry_covariance, (steps, 2, 2)),
+        observed=data.observed,
+        measured=data.measured,
+        measured_covariance=np.broadcast_to(data.observation_covariance, (count, 2, 2)),
+        landmarks=np.arange(len(data.true_landmarks)),
+    )

@@ -1,0 +1,97 @@
+"""First guesses: poses by odometry, landmarks where they were first seen; for a long log, part by part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.graph.robust import RobustLoss
+from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
+from pipeline.landmarks.dead_reckoning import chain
+from pipeline.landmarks.minimise import minimise
+from pipeline.landmarks.problem import LandmarkData, State
+from pipeline.landmarks.solvers import LinearSolver
+
+_FIRST, _GROWTH = 16, 1.5  # poses to begin with, and how much further each part reaches
+_STEPS = 3
+_CONVEX = RobustLoss("huber", 1.345, 1.0)
+
+
+def from_odometry(measurements: Measurements) -> State:
+    """Poses chained by the motions, every landmark where its first observation puts it."""
+    if measurements.motion.shape[1] == 3:
+        poses = chain(measurements.first_pose, measurements.motion)
+    else:
+        poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
+    return State(poses, _first_seen(measurements, poses)[0])
+
+
+def of_relative_positions(data: LandmarkData) -> State:
+    """The same for a linear problem."""
+    poses = np.cumsum(np.vstack([np.zeros(2), data.odometry]), axis=0)
+    _, first = np.unique(data.observed[:, 1], return_index=True)
+    landmarks = np.full(data.true_landmarks.shape, np.nan)
+    landmarks[data.observed[first, 1]] = poses[data.observed[first, 0]] + data.measured[first]
+    return State(poses, landmarks)
+
+
+def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
+    """The poses but for the first moved by a shift along both axes and turned about the origin."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    poses = state.poses.copy()
+    poses[1:, :2] = poses[1:, :2] @ np.array([[c, s], [-s, c]]) + shift_m
+    poses[1:, 2:] += turn_rad
+    return State(poses, state.landmarks)
+
+
+def growing(measurements: Measurements, solver: LinearSolver) -> State:
+    """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
+
+    Dead reckoning over the whole log may be metres off, where a robust loss finds but a local minimum; over a
+    third of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
+    """
+    count = len(measurements.motion) + 1
+    poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
+    reach = _FIRST
+    while True:
+        reach = min(int(reach), count)
+        poses = np.vstack([poses, chain(poses[-1], measurements.motion[len(poses) - 1 : reach - 1])[1:]])
+        part, known = _beginning(measurements, reach)
+        guess, _ = _first_seen(part, poses)
+        settled = np.isfinite(landmarks[known, 0])
+        guess[settled] = landmarks[known[settled]]
+        state = minimise(
+            BearingRangeProblem(part), State(poses, guess), solver, loss=_CONVEX, max_iterations=_STEPS
+        ).state
+        poses, landmarks[known] = state.poses, state.landmarks
+        if reach == count:
+            return State(poses, landmarks)
+        reach = reach * _GROWTH
+
+
+def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
+    """The problem of the first so many poses, and which landmarks they saw."""
+    kept = measurements.observed[:, 0] < poses
+    known, landmark = np.unique(measurements.observed[kept, 1], return_inverse=True)
+    part = replace(
+        measurements,
+        motion=measurements.motion[: poses - 1],
+        motion_covariance=measurements.motion_covariance[: poses - 1],
+        observed=np.stack([measurements.observed[kept, 0], landmark], axis=1),
+        measured=measurements.measured[kept],
+        measured_covariance=measurements.measured_covariance[kept],
+        landmarks=measurements.landmarks[known],
+    )
+    return part, known
+
+
+def _first_seen(measurements: Measurements, poses: Matrix) -> tuple[Matrix, NDArray[np.int64]]:
+    """Where the first observation of every landmark puts it, (L, 2), and which observation that is, (L,)."""
+    _, first = np.unique(measurements.observed[:, 1], return_index=True)
+    pose = poses[measurements.observed[first, 0]]
+    bearing, reach = measurements.measured[first].T
+    direction = bearing + (pose[:, 2] if poses.shape[1] == 3 else 0.0)
+    return pose[:, :2] + reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1), first

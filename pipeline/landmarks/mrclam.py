@@ -1,0 +1,121 @@
+"""Reads UTIAS MRCLAM folders: velocities, ranges and bearings to barcodes, motion capture (Leung et al. 2011)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix
+from pipeline.errors import InputError
+
+_ROBOTS = 5  # subjects 1 to 5 are robots, the others landmarks (Leung et al. 2011)
+
+
+@dataclass(frozen=True, slots=True)
+class RangeLog:
+    """What one robot logged, in order of time.
+
+    Attributes
+    ----------
+    name : of the folder and the robot
+    times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s
+    seen_s, subjects, measured : (N,), (N,) landmark subjects, (N, 2) bearing in rad and range in m
+    of_robots, unknown : observations left out: of other robots, and of barcodes that no subject has
+    outside : observations left out since no odometry was logged at their time
+    true_s, true_poses : (T,), (T, 3) motion capture x, y, heading; empty where the folder has none
+    true_subjects, true_landmarks : (L,), (L, 2) surveyed landmarks; empty where the folder has none
+    """
+
+    name: str
+    times_s: NDArray[np.float64]
+    velocities: Matrix
+    seen_s: NDArray[np.float64]
+    subjects: NDArray[np.int64]
+    measured: Matrix
+    of_robots: int
+    unknown: int
+    outside: int
+    true_s: NDArray[np.float64]
+    true_poses: Matrix
+    true_subjects: NDArray[np.int64]
+    true_landmarks: Matrix
+
+
+def read_mrclam(folder: Path, robot: int) -> RangeLog:
+    """Read what robot ``robot`` logged; raises InputError for whatever is missing or wrong."""
+    if not (folder / "Barcodes.dat").is_file():
+        raise InputError(
+            f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder"
+        )
+    name = f"Robot{robot}_Odometry.dat"
+    if not (folder / name).is_file():
+        there = sorted(
+            int(found[0]) for file in folder.iterdir() if (found := re.findall(r"^Robot(\d+)_Odo", file.name))
+        )
+        listed = ", ".join(map(str, there)) or "none"
+        raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
+    odometry = _by_time(_table(folder / name, 3))
+    seen = _by_time(_table(folder / f"Robot{robot}_Measurement.dat", 4))
+    subject = _subjects(_table(folder / "Barcodes.dat", 2), seen[:, 1])
+    timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
+    used = (subject > _ROBOTS) & timely
+    if not used.any():
+        raise InputError(
+            f"{folder}: robot {robot} saw no landmark while its odometry was logged; choose another robot"
+        )
+    truth = folder / f"Robot{robot}_Groundtruth.dat"
+    true = _by_time(_table(truth, 4)) if truth.is_file() else np.empty((0, 4))
+    survey = folder / "Landmark_Groundtruth.dat"
+    landmarks = _table(survey, 5) if survey.is_file() else np.empty((0, 5))
+    return RangeLog(
+        name=f"{folder.resolve().name} robot {robot}",
+        times_s=odometry[:, 0],
+        velocities=np.ascontiguousarray(odometry[:, 1:]),
+        seen_s=seen[used, 0],
+        subjects=subject[used],
+        measured=np.ascontiguousarray(seen[used][:, [3, 2]]),
+        of_robots=int(((subject >= 1) & (subject <= _ROBOTS)).sum()),
+        unknown=int((subject < 1).sum()),
+        outside=int(((subject > _ROBOTS) & ~timely).sum()),
+        true_s=true[:, 0],
+        true_poses=true[:, 1:],
+        true_subjects=landmarks[:, 0].astype(np.int64),
+        true_landmarks=landmarks[:, 1:3],
+    )
+
+
+def _table(path: Path, columns: int) -> Matrix:
+    """The numbers of a file, (rows, columns); lines that begin with # are comments."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            table = np.loadtxt(file, ndmin=2)
+    except FileNotFoundError:
+        raise InputError(f"{path}: does not exist; an MRCLAM folder needs it") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is no table of {columns} numbers a line ({error}); check the file") from None
+    if not table.size:
+        raise InputError(f"{path}: is empty; it must have {columns} numbers a line")
+    if table.shape[1] != columns:
+        raise InputError(f"{path}: has {table.shape[1]} numbers a line; it must have {columns}")
+    if not np.isfinite(table).all():
+        row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
+        raise InputError(f"{path}: row {row + 1} is not finite; correct or remove it")
+    return table
+
+
+def _by_time(table: Matrix) -> Matrix:
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _subjects(barcodes: Matrix, seen: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Subject of each barcode seen, 0 where no subject has it."""
+    subjects, codes = barcodes.astype(np.int64).T
+    order = np.argsort(codes, kind="stable")
+    at = np.minimum(np.searchsorted(codes[order], seen), len(codes) - 1)
+    return np.where(codes[order][at] == seen, subjects[order][at], 0)

@@ -1,0 +1,109 @@
+"""``qr`` and ``qr_colamd``: sparse orthogonal factorisation A = Q R, R x = Qᵀb, without ever forming AᵀA."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from pipeline.graph.factor_matrix import front_rows
+from pipeline.kernels import column_order, graph_fronts, graph_symbolic, normal_equations, sparse_qr
+from pipeline.kernels.graph_fronts import Fronts
+from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from pipeline.landmarks.system import LinearSystem, Pattern
+
+Ordering = Literal["natural", "colamd"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Analysis:
+    """What follows from the pattern: the asked order, the place of each column, fronts, and their rows of A."""
+
+    order: NDArray[np.int64]
+    place: NDArray[np.int64]
+    fronts: Fronts
+    begin: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    height: NDArray[np.int64]
+    stack_size: int
+
+
+class QrSolver:
+    """Householder QR of the project's own; its analysis is kept while the pattern is the same."""
+
+    def __init__(self, ordering: Ordering) -> None:
+        self._ordering: Ordering = ordering
+        self._known: tuple[Pattern, _Analysis] | None = None
+
+    def solve(self, system: LinearSystem) -> Solution:
+        """Solve in the least-squares sense; the factor is R."""
+        watch = Stopwatch()
+        analysis = self._analysis(system.pattern)
+        build_s = watch.lap()
+        fronts, pattern, n = analysis.fronts, system.pattern, system.pattern.shape[1]
+        R, z = np.zeros(int(fronts.factor_start[-1])), np.zeros(n)
+        sparse_qr.factorise(
+            fronts, analysis.begin, analysis.rows, analysis.height, pattern.row_start, pattern.columns,
+            system.values, system.b, analysis.place, R, z, np.empty(analysis.stack_size),
+        )  # fmt: skip
+        matrix = front_rows(fronts, R)
+        factor_s = watch.lap()
+        lengths = np.zeros(n)
+        np.add.at(lengths, pattern.columns, system.values**2)
+        diagonal = matrix.diagonal()[analysis.place]
+        if not np.all(np.abs(diagonal) > LOST_DIGITS * np.sqrt(lengths)):
+            raise undetermined(system)
+        watch.lap()
+        sparse_qr.back_substitute(fronts, R, z)
+        x = z[analysis.place]
+        solve_s = watch.lap()
+        to_asked = analysis.place[analysis.order]
+        return Solution(
+            x, build_s, factor_s, solve_s,
+            lambda: Factor("R of A", matrix[to_asked][:, to_asked].tocsc(), analysis.order),
+        )  # fmt: skip
+
+    def _analysis(self, pattern: Pattern) -> _Analysis:
+        if self._known is None or self._known[0] is not pattern:
+            self._known = pattern, _analyse(pattern, self._ordering)
+        return self._known[1]
+
+
+def _analyse(pattern: Pattern, ordering: Ordering) -> _Analysis:
+    """Order the columns and lay out the fronts.
+
+    Within the asked order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
+    it is (Liu 1990), so that R can be given in the order asked for.
+    """
+    n = pattern.shape[1]
+    column_start, rows = pattern.by_column()
+    order = np.arange(n)
+    if ordering == "colamd":
+        order = column_order.column_minimum_degree(pattern.row_start, pattern.columns, column_start, rows)
+    start, partners, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
+    start, neighbours = _neighbour_lists(start, partners)
+    after = graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))
+    eliminated = order[after]
+    parent = graph_symbolic.elimination_tree(start, neighbours, eliminated)
+    begin, below = graph_symbolic.column_structures(start, neighbours, eliminated, parent)
+    sizes = np.ones(n, np.int64)
+    fronts = graph_fronts.lay_out_fronts(
+        graph_symbolic.group_columns(parent, begin, below, sizes), begin, below, sizes
+    )
+    place = np.empty(n, np.int64)
+    place[eliminated] = np.arange(n)
+    found = sparse_qr.assign_rows(fronts, pattern.row_start, pattern.columns, place)
+    return _Analysis(order, place, fronts, *found)
+
+
+def _neighbour_lists(
+    start: NDArray[np.int64], partners: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Every column's partners on either side, from those beyond it: (start (n + 1,), neighbours)."""
+    n = len(start) - 1
+    beyond = csr_matrix((np.ones(len(partners), np.int8), partners, start), shape=(n, n))
+    both = csr_matrix(beyond + beyond.T)
+    return both.indptr.astype(np.int64), both.indices.astype(np.int64)

@@ -1,0 +1,110 @@
+"""``schur``: eliminate the poses, or the landmarks, and solve what is left for the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
+
+from pipeline.kernels import arrow
+from pipeline.landmarks.solvers.eliminate_landmarks import LandmarkElimination
+from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from pipeline.landmarks.system import LinearSystem, Pattern
+
+_WIDEST_BAND = 64  # scalars; beyond it poses are joined by more than odometry
+_LARGEST_BORDER = 25_000_000  # numbers of the dense border, 200 MB
+
+
+class SchurSolver:
+    """Two stages: S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], then the rest.
+
+    Poses joined by odometry alone make P banded, landmarks make C block diagonal. The larger of the two is
+    eliminated, unless the border of the poses would be too large to be kept dense.
+    """
+
+    def __init__(self) -> None:
+        self._known: tuple[Pattern, int] | None = None
+        self._landmarks_first = LandmarkElimination()
+
+    def solve(self, system: LinearSystem) -> Solution:
+        """Solve in the least-squares sense; the factor is U with AᵀA = UᵀU, the eliminated columns first."""
+        pattern = system.pattern
+        if self._known is None or self._known[0] is not pattern:
+            layout = pattern.layout
+            self._known = pattern, arrow.bandwidth(pattern.row_start, pattern.columns, layout.split)
+        split, rest = pattern.layout.split, pattern.shape[1] - pattern.layout.split
+        if self._known[1] > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
+            return self._landmarks_first.solve(system)
+        return _eliminate_poses(system, self._known[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Arrow:
+    """U of AᵀA = UᵀU, or AᵀA before it is factored: band and border (split, n − split) of the poses, corner."""
+
+    band: NDArray[np.float64]
+    border: NDArray[np.float64]
+    corner: NDArray[np.float64]
+
+
+def factor_arrow(system: LinearSystem) -> Arrow:
+    """U of a system whose poses are joined in a chain; raises UndeterminedError where there is none."""
+    pattern = system.pattern
+    parts, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
+    _eliminate(parts, system)
+    return parts
+
+
+def _eliminate_poses(system: LinearSystem, width: int) -> Solution:
+    """P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY dense: it joins every two landmarks anyway."""
+    watch = Stopwatch()
+    U, g = _form(system, width)
+    build_s = watch.lap()
+    _eliminate(U, system)
+    factor_s = watch.lap()
+    poses, landmarks = np.split(g, [U.band.shape[1]])
+    arrow.solve_forward(U.band, poses)
+    landmarks -= poses @ U.border
+    arrow.solve_corner(U.corner, landmarks)
+    poses -= U.border @ landmarks
+    arrow.solve_backward(U.band, poses)
+    solve_s = watch.lap()
+    return Solution(g, build_s, factor_s, solve_s, lambda: _factor(U))
+
+
+def _form(system: LinearSystem, width: int) -> tuple[Arrow, NDArray[np.float64]]:
+    """AᵀA as an arrow, and Aᵀb."""
+    pattern = system.pattern
+    n, split = pattern.shape[1], pattern.layout.split
+    H = Arrow(np.zeros((width + 1, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split)))
+    g = np.zeros(n)
+    arrow.products(
+        pattern.row_start, pattern.columns, system.values, system.b, split, H.band, H.border, H.corner, g
+    )
+    return H, g
+
+
+def _eliminate(H: Arrow, system: LinearSystem) -> None:
+    """Turn AᵀA into its factor, in place."""
+    floor = LOST_DIGITS * H.corner.diagonal()
+    if arrow.eliminate(H.band, H.border, LOST_DIGITS) >= 0:
+        raise undetermined(system)
+    arrow.complement(H.corner, H.border)
+    if arrow.eliminate_corner(H.corner, floor) >= 0:
+        raise undetermined(system)
+
+
+def _factor(U: Arrow) -> Factor:
+    """The three parts put together, with every place that may fill in."""
+    width, split = U.band.shape[0] - 1, U.band.shape[1]
+    n, rest = split + len(U.corner), len(U.corner)
+    places = np.indices(U.band.shape).reshape(2, -1)
+    below, right = places[:, places.sum(axis=0) >= width]  # the corner of a band's storage is not part of it
+    pose, landmark = np.indices(U.border.shape)
+    upper, lower = np.triu_indices(rest)
+    rows = np.concatenate([below + right - width, pose.ravel(), split + upper])
+    columns = np.concatenate([right, split + landmark.ravel(), split + lower])
+    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[upper, lower]])
+    return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))

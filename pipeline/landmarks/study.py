@@ -1,0 +1,80 @@
+"""What ``scanchain landmarks`` finds out about a problem: before and after, every method, accuracy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data import Matrix, Pose, Trajectory
+from pipeline.landmarks.accuracy import Accuracy
+from pipeline.landmarks.compare import MethodResult
+from pipeline.landmarks.dead_reckoning import OdometryNoise
+from pipeline.landmarks.problem import State
+
+Guess = Literal["odometry", "disturbed", "origin"]
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to study a problem; ``robot`` and ``noise`` are for MRCLAM folders, ``guess`` for nonlinear files."""
+
+    methods: tuple[str, ...]
+    repeats: int
+    robot: int
+    noise: OdometryNoise
+    guess: Guess
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """A line about a problem: what, and its value in words."""
+
+    label: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Poses and landmarks, how far off they are, and T_truth_estimate (3, 3) that carries them to the truth."""
+
+    state: State
+    accuracy: Accuracy
+    T_truth_estimate: Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What was found out about a problem.
+
+    Attributes
+    ----------
+    name, facts : of the problem, and lines about it
+    before, after : optimisation
+    converged : whether every iteration came to an end by itself
+    pose_covariance, landmark_covariance : (K, p, p), (L, 2, 2) after it; m, rad
+    true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
+    landmarks : (L,) names, as numbers
+    rows, columns, entries, build_s : of A, and the time to put it together
+    methods : how every method fared
+    trajectory : the poses after it with their stamps; None for a file, which has no stamps
+    """
+
+    name: str
+    facts: tuple[Fact, ...]
+    before: Estimate
+    after: Estimate
+    converged: bool
+    pose_covariance: Matrix
+    landmark_covariance: Matrix
+    true_poses: Matrix
+    true_landmarks: Matrix
+    landmarks: NDArray[np.int64]
+    rows: int
+    columns: int
+    entries: int
+    build_s: float
+    methods: tuple[MethodResult, ...]
+    trajectory: Trajectory | None

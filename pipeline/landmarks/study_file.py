@@ -1,0 +1,120 @@
+"""Studies the landmark problems of the course."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.landmarks import guess as guesses
+from pipeline.landmarks.accuracy import of_positions
+from pipeline.landmarks.assembly import landmark_columns, pose_columns
+from pipeline.landmarks.bearing_range import BearingRangeProblem, world_referenced
+from pipeline.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
+from pipeline.landmarks.covariance import Covariance
+from pipeline.landmarks.minimise import QUADRATIC, minimise
+from pipeline.landmarks.npz import read_landmark_data
+from pipeline.landmarks.problem import LandmarkData, State
+from pipeline.landmarks.relative_position import linear_system, state_of
+from pipeline.landmarks.solvers import create_solver
+from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study
+from pipeline.landmarks.system import LinearSystem
+
+_SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
+
+
+def study_file(path: Path, options: Options) -> Study:
+    """Read a problem, solve it by every method, compare with the truth in the file."""
+    data = read_landmark_data(path)
+    return _write_up(data, _linear(data, options) if data.kind == "linear" else _nonlinear(data, options))
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    before: State
+    after: State
+    converged: bool
+    system: LinearSystem
+    build_s: float
+    methods: tuple[MethodResult, ...]
+    facts: tuple[Fact, ...]
+
+
+def _linear(data: LandmarkData, options: Options) -> _Solved:
+    begin = perf_counter()
+    system = linear_system(data)
+    build_s = perf_counter() - begin
+    methods = compare_linear(system, options.methods, options.repeats)
+    chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
+    facts = (
+        Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
+        chi2_fact(chi2, len(system.b), system.pattern.shape[1]),
+    )
+    before, after = guesses.of_relative_positions(data), state_of(data, methods[0].x)
+    return _Solved(before, after, True, system, build_s, methods, facts)
+
+
+def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
+    problem = BearingRangeProblem(world_referenced(data))
+    guess = _guess(problem, options.guess)
+    methods = compare_nonlinear(problem, guess, QUADRATIC, options.methods, options.repeats)
+    minimum = minimise(problem, guess, create_solver(options.methods[0]))
+    begin = perf_counter()
+    system = problem.system(problem.linearise(minimum.state), minimum.weights)
+    build_s = perf_counter() - begin
+    ended = "converged" if minimum.converged else "DID NOT CONVERGE"
+    facts = (
+        Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
+        Fact("guess", options.guess),
+        Fact("iteration", f"{ended} after {minimum.iterations} linear solves: {minimum.reason}"),
+        chi2_fact(minimum.cost, len(system.b), system.pattern.shape[1]),
+    )
+    return _Solved(guess, minimum.state, minimum.converged, system, build_s, methods, facts)
+
+
+def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
+    """χ² over its degrees of freedom, and what that means."""
+    freedom = max(rows - unknowns, 1)
+    verdict = (
+        "the noise model fits"
+        if 0.5 <= chi2 / freedom <= 2.0
+        else "the noise model does not fit, or a poor minimum"
+    )
+    return Fact("χ²", f"{chi2:.4f} over {freedom} degrees of freedom: {chi2 / freedom:.3f}; {verdict}")
+
+
+def _guess(problem: BearingRangeProblem, guess: Guess) -> State:
+    state = guesses.from_odometry(problem.measurements)
+    if guess == "disturbed":
+        return guesses.disturbed(state, _SHIFT_M, _TURN_RAD)
+    if guess == "origin":
+        return replace(state, landmarks=np.zeros_like(state.landmarks))
+    return state
+
+
+def _write_up(data: LandmarkData, solved: _Solved) -> Study:
+    layout, covariance = solved.system.pattern.layout, Covariance(solved.system)
+    before, after = (
+        Estimate(state, of_positions(state, data), lie.identity(2)) for state in (solved.before, solved.after)
+    )
+    return Study(
+        name=data.name,
+        facts=solved.facts,
+        before=before,
+        after=after,
+        converged=solved.converged,
+        pose_covariance=covariance.of(pose_columns(layout, np.arange(layout.poses))),
+        landmark_covariance=covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks)))),
+        true_poses=data.true_poses,
+        true_landmarks=data.true_landmarks,
+        landmarks=layout.landmarks,
+        rows=len(solved.system.b),
+        columns=layout.columns,
+        entries=len(solved.system.values),
+        build_s=solved.build_s,
+        methods=solved.methods,
+        trajectory=None,
+    )

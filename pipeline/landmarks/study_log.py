@@ -1,0 +1,92 @@
+"""Studies what one robot of an MRCLAM folder logged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Trajectory
+from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
+from pipeline.landmarks.compare import compare_linear
+from pipeline.landmarks.dead_reckoning import OdometryNoise
+from pipeline.landmarks.guess import from_odometry
+from pipeline.landmarks.mrclam import RangeLog, read_mrclam
+from pipeline.landmarks.problem import State
+from pipeline.landmarks.range_slam import STUDENT, RangeSolution, solve_range_log
+from pipeline.landmarks.study import Estimate, Fact, Options, Study
+
+_DOUBTED = 0.25  # weight
+_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
+
+
+def study_log(folder: Path, options: Options) -> Study:
+    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture and with every method.
+
+    The linear solvers are compared on the first step from where the estimate began, with the noise that it found.
+    """
+    log = read_mrclam(folder, options.robot)
+    solve_range_log(log, options.noise)  # compiles, which is no part of the time
+    solution = solve_range_log(log, options.noise)
+    begin = perf_counter()
+    at = solution.problem.linearise(solution.guess)
+    system = solution.problem.system(at, STUDENT.weight(at.observation_chi2))
+    build_s = perf_counter() - begin
+    truth = truth_at(log, solution.nodes_s, solution.landmarks)
+    reckoned = from_odometry(solution.problem.measurements)
+    return Study(
+        name=log.name,
+        facts=_facts(log, options.noise, solution),
+        before=_estimate(reckoned, solution.nodes_s, truth),
+        after=_estimate(solution.state, solution.nodes_s, truth),
+        converged=solution.converged,
+        pose_covariance=solution.pose_covariance,
+        landmark_covariance=solution.landmark_covariance,
+        true_poses=truth.poses[:, :2],
+        true_landmarks=truth.landmarks,
+        landmarks=solution.landmarks,
+        rows=len(system.b),
+        columns=system.pattern.shape[1],
+        entries=len(system.values),
+        build_s=build_s,
+        methods=compare_linear(system, options.methods, options.repeats),
+        trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.state.poses)),
+    )
+
+
+def _estimate(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
+    if np.count_nonzero(truth.known) < 2:
+        nothing = Accuracy(np.nan, np.nan, "no motion capture at these times")
+        return Estimate(state, nothing, lie.identity(2))
+    accuracy, T_truth_estimate = against_truth(state, nodes_s, truth)
+    return Estimate(state, accuracy, T_truth_estimate)
+
+
+def _facts(log: RangeLog, noise: OdometryNoise, solution: RangeSolution) -> tuple[Fact, ...]:
+    ended = "converged" if solution.converged else "DID NOT CONVERGE"
+    doubted = int(np.count_nonzero(solution.weights < _DOUBTED))
+    seen = f"{len(log.seen_s)} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s)} poses"
+    left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
+    stated = (
+        f"{noise.forward_m:g} m forward, {noise.sideways_m:g} m sideways, {noise.turn_rad:g} rad after a second"
+    )
+    found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
+    after = f"{ended} after {solution.iterations} linear solves: {solution.reason}"
+    return (
+        Fact("observations", seen),
+        Fact("left out", left),
+        Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {after}"),
+        Fact("odometry noise", f"stated: {stated}; {_verdict(solution.motion_chi2)}"),
+        Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
+        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g}"),
+    )
+
+
+def _verdict(chi2: float) -> str:
+    """χ² per degree of freedom in words."""
+    low, high = _FITS
+    verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
+    return f"χ² per degree of freedom {chi2:.2f}: {verdict}"

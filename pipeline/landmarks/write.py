@@ -1,0 +1,153 @@
+"""Writes what a study found: tables as text, JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.data import Matrix
+from pipeline.landmarks.accuracy import Accuracy
+from pipeline.landmarks.compare import MethodResult
+from pipeline.landmarks.study import Study
+from pipeline.trajectory import write_tum
+
+HEADINGS = (
+    "method",
+    "build ms",
+    "factor ms",
+    "solve ms",
+    "total ms",
+    "again ms",
+    "solves",
+    "nnz factor",
+    "differs by",
+)
+
+
+def file_stem(name: str) -> str:
+    """A name as the beginning of a file's name."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "problem"
+
+
+def row_of(method: MethodResult) -> tuple[str, ...]:
+    """A method's line of the table, as ``HEADINGS`` has it."""
+    times = (method.build_s, method.factor_s, method.solve_s, method.total_s, method.again_s)
+    return (
+        method.method,
+        *(f"{1e3 * seconds:.2f}" for seconds in times),
+        str(method.iterations),
+        f"{method.factor.nnz:,}",
+        f"{method.difference:.1e}",
+    )
+
+
+def text_of(study: Study) -> str:
+    """The whole study for a terminal."""
+    lines = [study.name, *(f"  {fact.label:<15}{fact.value}" for fact in study.facts)]
+    lines += [f"  {label:<15}{value}" for label, value in accuracy_lines(study)]
+    lines.append(f"  {'A':<15}{size_of(study)}")
+    rows = [HEADINGS, *(row_of(method) for method in study.methods)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADINGS))]
+    for row in rows:
+        cells = (
+            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  " + "  ".join(cells))
+    return "\n".join(lines)
+
+
+def size_of(study: Study) -> str:
+    """A in words."""
+    return (
+        f"{study.rows:,} rows, {study.columns:,} columns, {study.entries:,} entries,"
+        f" put together in {1e3 * study.build_s:.1f} ms"
+    )
+
+
+def accuracy_lines(study: Study) -> list[tuple[str, str]]:
+    """Label and value of the accuracy before and after, and how it is defined."""
+    return [
+        ("before", _accuracy(study.before.accuracy)),
+        ("after", _accuracy(study.after.accuracy)),
+        ("accuracy", study.after.accuracy.definition),
+    ]
+
+
+def tree_of(study: Study) -> dict[str, object]:
+    """The figures for JSON."""
+    return {
+        "name": study.name,
+        "facts": {fact.label: fact.value for fact in study.facts},
+        "converged": study.converged,
+        "before": _figures(study.before.accuracy),
+        "after": _figures(study.after.accuracy),
+        "A": {"rows": study.rows, "columns": study.columns, "entries": study.entries, "build_s": study.build_s},
+        "methods": [
+            {
+                "method": method.method,
+                "build_s": method.build_s,
+                "factor_s": method.factor_s,
+                "solve_s": method.solve_s,
+                "again_s": method.again_s,
+                "iterations": method.iterations,
+                "factor": method.factor.name,
+                "factor_entries": method.factor.nnz,
+                "difference": method.difference,
+            }
+            for method in study.methods
+        ],
+    }
+
+
+def write_estimate(directory: Path, study: Study) -> None:
+    """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
+    stem, state = file_stem(study.name), study.after.state
+    names = ["x_m", "y_m", "heading_rad"][: state.poses.shape[1]]
+    _write_csv(
+        directory / f"{stem}_poses.csv",
+        "pose",
+        np.arange(len(state.poses)),
+        names,
+        state.poses,
+        study.pose_covariance,
+    )
+    _write_csv(
+        directory / f"{stem}_landmarks.csv", "landmark", study.landmarks, ["x_m", "y_m"], state.landmarks,
+        study.landmark_covariance,
+    )  # fmt: skip
+    if study.trajectory is not None:
+        write_tum(directory / f"{stem}.tum", study.trajectory)
+
+
+def _write_csv(
+    path: Path, kind: str, numbers: np.ndarray, names: list[str], values: Matrix, covariance: Matrix
+) -> None:
+    """One line each: number, values, upper triangle of the covariance."""
+    rows, columns = np.triu_indices(len(names))
+    header = [kind, *names, *(f"cov_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))]
+    table = np.concatenate([values, covariance[:, rows, columns]], axis=1)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for number, row in zip(numbers.tolist(), table.tolist(), strict=True):
+            writer.writerow([number, *(f"{value:.9g}" for value in row)])
+
+
+def _accuracy(accuracy: Accuracy) -> str:
+    if math.isnan(accuracy.poses_m):
+        return "unknown"
+    landmarks = "unknown" if math.isnan(accuracy.landmarks_m) else f"{accuracy.landmarks_m:.4f} m"
+    return f"poses {accuracy.poses_m:.4f} m, landmarks {landmarks} off"
+
+
+def _figures(accuracy: Accuracy) -> dict[str, float | str | None]:
+    return {
+        "poses_m": None if math.isnan(accuracy.poses_m) else accuracy.poses_m,
+        "landmarks_m": None if math.isnan(accuracy.landmarks_m) else accuracy.landmarks_m,
+        "definition": accuracy.definition,
+    }

@@ -1,0 +1,126 @@
+"""An MRCLAM log against a batch in GTSAM, interleaved: python -m tests.benchmarks.landmark_log [FOLDER].
+
+GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and 0.12 m, and the
+odometry's noise as stated. Its time is that of building the graph and of its optimiser, with the covariance of
+every pose and landmark where it says so. "ours" is the whole estimate: dead reckoning, guess, the sensor's noise,
+all covariances; "ours as given" has GTSAM's noise, weights and guess, and no covariances.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pipeline.graph.robust import RobustLoss
+from pipeline.landmarks.accuracy import against_truth, truth_at
+from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
+from pipeline.landmarks.dead_reckoning import OdometryNoise, reckon
+from pipeline.landmarks.guess import from_odometry
+from pipeline.landmarks.minimise import minimise
+from pipeline.landmarks.mrclam import read_mrclam
+from pipeline.landmarks.problem import State
+from pipeline.landmarks.range_slam import solve_range_log
+from pipeline.landmarks.solvers import create_solver
+
+ROOT = Path(__file__).resolve().parents[2]
+HUBER = 1.345
+SIGMAS = np.array([0.03, 0.12])
+LANDMARK = 10_000_000  # first key of a landmark
+
+
+def measurements_of(log):
+    reckoning = reckon(log, OdometryNoise())
+    return Measurements(
+        np.zeros(3), 1e-8 * np.eye(3), reckoning.motion, reckoning.covariance, reckoning.observed, log.measured,
+        np.broadcast_to(np.diag(SIGMAS**2), (len(log.measured), 2, 2)), reckoning.landmarks,
+    )  # fmt: skip
+
+
+def as_given(log):
+    given = measurements_of(log)
+    begin = time.perf_counter()
+    found = minimise(
+        BearingRangeProblem(given), from_odometry(given), create_solver("schur"),
+        loss=RobustLoss("huber", HUBER, 1.0), tolerance=1e-6, first_damping=1e-10,
+    )  # fmt: skip
+    return time.perf_counter() - begin, found.state
+
+
+def ours(log):
+    begin = time.perf_counter()
+    solution = solve_range_log(log, OdometryNoise())
+    return time.perf_counter() - begin, solution.state
+
+
+def with_gtsam(log, optimiser, parameters, *, covariances=False):
+    given = measurements_of(log)
+    guess = from_odometry(given)
+    begin = time.perf_counter()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    anchor = gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), anchor))
+    for k, (move, covariance) in enumerate(zip(given.motion, given.motion_covariance, strict=True)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*move), noise))
+    noise = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
+    )
+    for (pose, landmark), (bearing, reach) in zip(given.observed.tolist(), given.measured, strict=True):
+        key = LANDMARK + landmark
+        graph.add(gtsam.BearingRangeFactor2D(pose, key, gtsam.Rot2(bearing), reach, noise))
+    for k, pose in enumerate(guess.poses):
+        values.insert(k, gtsam.Pose2(*pose))
+    for k, position in enumerate(guess.landmarks):
+        values.insert(LANDMARK + k, position)
+    found = optimiser(graph, values, parameters).optimize()
+    if covariances:
+        marginals = gtsam.Marginals(graph, found)
+        for key in found.keys():  # noqa: SIM118
+            marginals.marginalCovariance(key)
+    seconds = time.perf_counter() - begin
+    poses = [found.atPose2(k) for k in range(len(guess.poses))]
+    landmarks = np.array([found.atPoint2(LANDMARK + k) for k in range(len(guess.landmarks))])
+    return seconds, State(np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]), landmarks)
+
+
+METHODS = {
+    "ours": ours,
+    "ours as given": as_given,
+    "gtsam LM": lambda log: with_gtsam(log, gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams()),
+    "gtsam LM, covariances": lambda log: with_gtsam(
+        log, gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), covariances=True
+    ),
+    "gtsam GN": lambda log: with_gtsam(log, gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams()),
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=ROOT.parent / "shared" / "data" / "landmarks" / "utias_mrclam6"
+    )
+    parser.add_argument("--robot", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=9)
+    options = parser.parse_args()
+    log = read_mrclam(options.folder, options.robot)
+    reckoning = reckon(log, OdometryNoise())
+    truth = truth_at(log, reckoning.nodes_s, reckoning.landmarks)
+    seconds = {name: [] for name in METHODS}
+    for method in METHODS.values():
+        method(log)  # compiles
+    for _ in range(options.repeats):
+        for name, method in METHODS.items():
+            spent, state = method(log)
+            seconds[name].append((spent, state))
+    print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
+    for name, runs in seconds.items():
+        accuracy, _ = against_truth(runs[-1][1], reckoning.nodes_s, truth)
+        spent = 1e3 * np.array([run[0] for run in runs])
+        print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
+              f" {accuracy.landmarks_m:12.4f}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""``scanchain landmarks`` as its users meet it."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+from scenes import shared_data
+
+from pipeline.__main__ import main
+from pipeline.trajectory import read_tum
+
+image = pytest.importorskip("matplotlib.image")
+
+
+@pytest.fixture
+def call(capfd):
+    def run(*words):
+        code = main([str(word) for word in words])
+        return code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def small(tmp_path):
+    """A linear problem of 30 poses and 5 landmarks, whose name would be markup if it were not escaped."""
+    rng = np.random.default_rng(0)
+    poses, landmarks = np.cumsum(rng.normal(size=(30, 2)), axis=0), 4.0 * rng.normal(size=(5, 2))
+    poses -= poses[0]
+    pairs = np.stack(np.meshgrid(np.arange(30), np.arange(5), indexing="ij"), -1).reshape(-1, 2)
+    seen = landmarks[pairs[:, 1]] - poses[pairs[:, 0]] + 0.1 * rng.normal(size=pairs.shape)
+    path = tmp_path / "a<b>&c.npz"
+    np.savez(
+        path, gt_traj=poses, gt_landmarks=landmarks, observations=np.concatenate([pairs, seen], axis=1),
+        odom=np.diff(poses, axis=0) + 0.1 * rng.normal(size=(29, 2)), sigma_odom=0.01 * np.eye(2),
+        sigma_landmark=0.01 * np.eye(2),
+    )  # fmt: skip
+    return path
+
+
+def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path):
+    out = tmp_path / "out"
+    code, output, _ = call("landmarks", small, "--out", out, "--repeat", "1")
+    assert code == 0
+    for method in ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd", "cholesky", "schur"):
+        assert re.search(rf"^  {method} .* \d\.\de[+-]\d\d$", output, re.MULTILINE), method
+    page = (out / "report.html").read_text()
+    assert "a&lt;b&gt;&amp;c" in page and "<b>" not in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    with (out / "a_b_c_landmarks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 5 and 0.0 < float(rows[0]["cov_x_m_x_m"]) < 0.01
+    pixels = image.imread(out / "a_b_c.png")
+    assert np.mean(np.all(np.abs(pixels[..., :3] - [0.25, 0.47, 0.84]) < 0.1, axis=-1)) > 0.001
+    assert json.loads((out / "run.json").read_text())["complete"]
+
+
+def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, small, tmp_path):
+    other = tmp_path / "other.npz"
+    other.write_bytes(small.read_bytes())
+    code, output, _ = call(
+        "landmarks", small, other, "--out", tmp_path / "out", "--repeat", "1", "--method", "qr,schur", "--json"
+    )
+    assert code == 0
+    problems = json.loads(output)["problems"]
+    assert [problem["name"] for problem in problems] == ["a<b>&c", "other"]
+    for problem in problems:
+        assert [method["method"] for method in problem["methods"]] == ["qr", "schur"]
+        assert problem["after"]["poses_m"] < problem["before"]["poses_m"]
+        assert problem["methods"][1]["difference"] < 1e-8
+    assert (tmp_path / "out" / "factors.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--method", "chol"], "there is no method 'chol'"),
+        (["--odometry-noise", "1,2"], "give three positive numbers"),
+        (["--odometry-noise", "0.1,0.1,-1"], "give three positive numbers"),
+        (["--robot", "0"], "--robot"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_leave_nothing(call, small, tmp_path, words, said):
+    code, output, errors = call("landmarks", small, "--out", tmp_path / "out", *words)
+    assert code == 2 and output == "" and said in errors and errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_problems_of_one_name_and_a_directory_that_exists_are_refused(call, small, tmp_path):
+    code, _, errors = call("landmarks", small, small, "--out", tmp_path / "out", "--method", "schur")
+    assert code == 2 and "two problems are called a<b>&c" in errors
+    (tmp_path / "out").mkdir()
+    code, _, errors = call("landmarks", small, "--out", tmp_path / "out")
+    assert code == 2 and "--force" in errors
+
+
+def test_an_mrclam_folder_gives_a_stamped_trajectory(call, tmp_path):
+    folder = shared_data("landmarks/utias_mrclam6")
+    code, output, _ = call("landmarks", folder, "--out", tmp_path / "out", "--method", "schur", "--repeat", "1")
+    assert code == 0 and "407 of other robots" in output
+    trajectory = read_tum(tmp_path / "out" / "utias_mrclam6_robot_1.tum")
+    assert len(trajectory) == 1012 and trajectory.stamps_ns[0] == 1248444189_599_000_000
