@@ -24,6 +24,7 @@ from pipeline.data import (
     Trajectory,
     Verdict,
 )
+from pipeline.graph.graduation import Judgement
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser
 from pipeline.odometry import Odometry, Tracked
@@ -101,7 +102,7 @@ class Slam:
         """Close what is left, optimise once more and spread the corrections over all scans."""
         if self.config.loops.enabled:
             self._take(self.closer.finish(self.keyframes, self.graph.poses))
-        state = self._optimise()
+        state = self._optimise("mended")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         corrected = self._spread(state.poses, odometry)
@@ -197,10 +198,10 @@ class Slam:
         enough = self.config.loops.optimise_every
         if not self.surprising:
             enough = max(enough, _GROWTH * len(self.keyframes))
-        return self._optimise() if self.waiting_closures and grown >= enough else None
+        return self._optimise("graduated") if self.waiting_closures and grown >= enough else None
 
-    def _optimise(self) -> GraphState:
-        state = self.graph.optimise(self.config.graph, initialise="given").state
+    def _optimise(self, judgement: Judgement) -> GraphState:
+        state = self.graph.optimise(self.config.graph, initialise="given", judgement=judgement).state
         self.waiting_closures, self.surprising, self.optimised_at = 0, False, len(self.keyframes)
         self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state

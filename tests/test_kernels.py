@@ -1,12 +1,14 @@
 import naive
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from pipeline import lie
 from pipeline.config import LocalMapConfig
 from pipeline.kernels import descent, downsample, eigen, hashing
 from pipeline.kernels.association import associate
 from pipeline.kernels.residuals import normal_equations
+from pipeline.kernels.shortest_ways import shortest_ways
 from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
 from pipeline.kernels.voxels import DIRECTION, SHAPE
@@ -325,3 +327,20 @@ def test_deskewing_moves_each_point_along_the_motion(dimension):
     expected = naive.deskew(points, shares, twist)
     downsample.deskew(points, shares, twist)
     np.testing.assert_allclose(points, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_shortest_ways_equal_those_of_scipy(seed):
+    rng = np.random.default_rng(seed)
+    edges = np.concatenate([np.stack([np.arange(39), np.arange(1, 40)], axis=1), rng.integers(0, 45, (20, 2))])
+    lengths = rng.uniform(0.1, 2.0, len(edges))
+    dense = np.full((45, 45), np.inf)
+    for (i, j), length in zip(edges, lengths, strict=True):
+        dense[i, j] = dense[j, i] = min(dense[i, j], length)
+    expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
+    assert shortest_ways(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
+
+
+def test_an_edge_of_infinite_length_leads_nowhere():
+    edges = np.array([[0, 1], [1, 2]])
+    assert shortest_ways(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]

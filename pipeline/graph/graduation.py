@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +15,29 @@ from pipeline.graph.robust import GRADUATED, RobustLoss
 from pipeline.graph.soundness import is_connected
 from pipeline.graph.verdicts import Verdicts, contradictions, fair_price
 
+Judgement = Literal["graduated", "mended"]
+
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _MOST_ROUNDS = 50  # of mending verdicts
 _FEWER, _FEWEST = 0.3, 1e-3  # after changes that do not help, of those that promise the most
 
 
 def minimise(
-    minimiser: Minimiser, poses: Matrix, loss: RobustLoss, max_iterations: int, tolerance: float
+    minimiser: Minimiser,
+    poses: Matrix,
+    loss: RobustLoss,
+    max_iterations: int,
+    tolerance: float,
+    judgement: Judgement,
 ) -> Minimum:
-    """Minimise from these poses; a kernel that is not convex is graduated first (Yang et al. 2020)."""
+    """Minimise from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
+
+    judgement : of truncated edges: as the graduation leaves them, or mended by what the other edges bear out
+    """
     now, used = minimiser.evaluate(poses, loss), 0
     if loss.kernel in GRADUATED and len(minimiser.loops):
         now, loss, used = _graduate(minimiser, now, loss)
-    if loss.kernel == "truncated" and len(minimiser.loops):
+    if judgement == "mended" and loss.kernel == "truncated" and len(minimiser.loops):
         minimum = _judge(minimiser, now, loss, max_iterations, tolerance)
     else:
         minimum = minimiser.descend(now, loss, max_iterations, tolerance)

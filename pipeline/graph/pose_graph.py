@@ -16,7 +16,7 @@ from pipeline.graph.certificate import Certificate, certify
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.covariance import own_covariances, relative_covariance
 from pipeline.graph.estimate import Minimum
-from pipeline.graph.graduation import minimise
+from pipeline.graph.graduation import Judgement, minimise
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation, first_guess
 from pipeline.graph.optimisation import Optimisation
@@ -142,8 +142,13 @@ class PoseGraph:
         self._changed()
         self._fixed.add(index)
 
-    def optimise(self, config: GraphConfig, *, initialise: Initialisation = "auto") -> Optimisation:
-        """Move the poses to the minimum of χ², starting from the chosen guess."""
+    def optimise(
+        self, config: GraphConfig, *, initialise: Initialisation = "auto", judgement: Judgement = "mended"
+    ) -> Optimisation:
+        """Move the poses to the minimum of χ², starting from the chosen guess.
+
+        judgement : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
+        """
         begin = time.perf_counter()
         problem = self._prepared()
         chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
@@ -154,7 +159,7 @@ class PoseGraph:
         loss = robust_loss(config.robust, config.robust_scale, self.freedom)
         minimiser = Minimiser(problem, self.is_loop, config.optimiser)
         try:
-            minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance)
+            minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance, judgement)
         except SingularMatrixError as error:
             raise undetermined(int(problem.free[error.variable])) from error
         self._take(minimum, shift)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.kernels.shortest_ways import shortest_ways
 
 _CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two places
 _LOOP_M = 1e-3  # length of such an edge
@@ -28,11 +27,9 @@ class Doubt:
     def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
         """Metres (K,) that each keyframe of the graph may be off as seen from one of them, at most the limit."""
         self._learn(graph)
-        lengths = self.lengths.rows
-        joined = ~graph.is_loop | (graph.weight > _CLOSED)
-        i, j = graph.edges[joined].T
-        ways = csr_matrix((lengths[joined], (i, j)), shape=(len(graph), len(graph)))
-        metres = dijkstra(ways, directed=False, indices=keyframe, limit=limit_m / self.drift)
+        is_open = ~graph.is_loop | (graph.weight > _CLOSED)
+        lengths = np.where(is_open, self.lengths.rows, np.inf)
+        metres = shortest_ways(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
         return np.minimum(self.drift * metres, limit_m)
 
     def _learn(self, graph: PoseGraph) -> None:
