@@ -29,7 +29,7 @@ from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser
 from pipeline.odometry import Odometry, Tracked
 
-_LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion since the last keyframe where scans were lost between
+_LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
 _GROWTH = 0.05  # of the graph, between two optimisations that change little
 _SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimised in soon
 
@@ -67,7 +67,7 @@ class Slam:
         self.travelled_m = 0.0
         self.waiting_closures = 0
         self.surprising = False
-        self.was_lost = False
+        self.lost_scans = 0
         self.optimised_at = 0
 
     def process(self, scan: Scan) -> Step:
@@ -124,7 +124,7 @@ class Slam:
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
             self.keyframes[0] = replace(self.keyframes[0], points=self.odometry.first_points)
-        self.was_lost |= tracked.state is State.LOST
+        self.lost_scans += tracked.state is State.LOST
         if self.keyframes and (tracked.state is State.LOST or not self._moved_enough(tracked.T_odom_lidar)):
             return -1
         keyframe = Keyframe(
@@ -141,13 +141,15 @@ class Slam:
             last = self.keyframes[-1]
             config = self.config.odometry
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
+            if self.lost_scans:
+                sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
             self.graph.add_edge(
                 last.index,
                 keyframe.index,
                 lie.inverse(last.T_odom_lidar) @ keyframe.T_odom_lidar,
-                edge_information(tracked.match, *(_LOST_SIGMAS if self.was_lost else sigmas)),
+                edge_information(tracked.match, *sigmas),
             )
-            self.was_lost = False
+            self.lost_scans = 0
         self.keyframes.append(keyframe)
         return keyframe.index
 
