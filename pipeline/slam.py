@@ -194,13 +194,15 @@ class Slam:
         """Optimise when closures wait: soon if one of them moves the map, else once the graph has grown enough.
 
         The growth asked for is a share of the graph, so that all optimisations together cost little more than a
-        few of the last one.
+        few of the last one. Verdicts are mended where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimised_at
         enough = self.config.loops.optimise_every
         if not self.surprising:
             enough = max(enough, _GROWTH * len(self.keyframes))
-        return self._optimise("graduated") if self.waiting_closures and grown >= enough else None
+        if not self.waiting_closures or grown < enough:
+            return None
+        return self._optimise("mended" if self.surprising else "graduated")
 
     def _optimise(self, judgement: Judgement) -> GraphState:
         state = self.graph.optimise(self.config.graph, initialise="given", judgement=judgement).state
