@@ -104,7 +104,7 @@ def test_a_pole_before_a_far_wall_stands_though_most_rays_pass_it():
         views.append(View(T, lie.transform(lie.inverse(T), np.vstack([wall, pole])), 0.5))
     heights = np.arange(-0.9, 1.2, 0.2)
     standing = np.column_stack([np.full(len(heights), 9.0), np.zeros(len(heights)), heights])
-    gone = moved(np.vstack([standing, [[9.0, 4.0, 1.0]]]), 0.2, views)
+    gone = moved(np.vstack([standing, [[9.0, 2.0, 0.5]]]), 0.2, views)
     assert gone.tolist() == [False] * len(heights) + [True]
 
 
