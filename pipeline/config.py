@@ -154,9 +154,16 @@ class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The maps that are written at the end."""
+    """The maps that are written at the end.
+
+    Without what ``remove_moving`` finds to have moved, the cloud has one point a voxel; it is written as PLY, and
+    as PCD and LAZ where asked for.
+    """
 
     voxel_size_m: Positive = 0.2
+    remove_moving: bool = True
+    write_pcd: bool = False
+    write_laz: bool = False
     grid_resolution_m: Positive = 0.2
     grid_max_range_m: Positive = 80.0
     slice_min_z_m: float = -0.5

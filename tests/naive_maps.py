@@ -4,6 +4,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from naive_loops import bin_of
 
 
 def crossed_cells(start, end, resolution):
@@ -64,3 +65,30 @@ def served_map(folder):
     cells[p < float(yaml["free_thresh"])] = 0
     origin = [float(value) for value in yaml["origin"].strip("[]").split(",")]
     return cells[::-1], origin, float(yaml["resolution"])
+
+
+def sight(point, ranges_m, limits):
+    """1 where a scan with these nearest ranges saw a surface at a point, −1 where it looked through, else 0."""
+    reach, window, margin, margin_share, level, level_share = limits
+    rows, columns = ranges_m.shape
+    (row, column), range_m = bin_of(point, ranges_m.shape)
+    if not window < range_m <= reach:
+        return 0
+    step = 2 * math.pi / columns
+    half = max(math.ceil(0.5 * window / (range_m * step)), 1)
+    around = {
+        (r, c % columns): ranges_m[r, c % columns]
+        for r in range(max(row - 1, 0), min(row + half + 1, rows))
+        for c in range(column - half, column + half + 1)
+    }
+    place = min(around, key=around.get)
+    nearest, slack = around[place], margin + margin_share * range_m
+    if nearest >= 1e9 or nearest < range_m - slack:
+        return 0
+    if nearest <= range_m + slack:
+        return 1
+    height = nearest * math.sin((place[0] + 0.5) * step - math.pi / 2)
+    if rows > 1 and abs(height - point[2]) <= level + level_share * nearest:
+        return 0
+    by_the_point = [r for (i, j), r in around.items() if abs(i - row) <= 1 and (j - column + 1) % columns <= 2]
+    return -1 if min(by_the_point) < 1e9 else 0

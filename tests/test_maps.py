@@ -1,13 +1,17 @@
 """Maps: kernels equal their slow twins, files mean to others what the grid means to us."""
 
+import laspy
 import naive_maps as naive
 import numpy as np
 import pytest
+from PIL import Image
+from ruamel.yaml import YAML
 from scenes import kitti_scans, shared_data
 
 from pipeline import lie
 from pipeline.config import MapsConfig
 from pipeline.errors import InputError
+from pipeline.logs.formats.pcd import read_pcd
 from pipeline.maps import (
     OccupancyGrid,
     PointMap,
@@ -16,10 +20,14 @@ from pipeline.maps import (
     fitting_resolution,
     read_map,
     read_ply,
+    write_laz,
     write_map,
+    write_pcd,
     write_ply,
 )
 from pipeline.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
+from pipeline.simulate import SENSORS
+from pipeline.simulate.solids import Scenery
 from pipeline.trajectory import read_tum
 
 RESOLUTION_M = 0.1
@@ -138,6 +146,65 @@ def test_a_map_server_reads_walls_where_they_are_and_unknown_as_unknown(tmp_path
     assert set(np.unique(cells)) == {-1, 0, 100}
 
 
+def nav2_map(folder):
+    """A map as nav2's map_server loads it (map_io.cpp), by libraries for YAML and images; trinary mode alone."""
+    told = YAML(typ="safe").load((folder / "map.yaml").read_text())
+    assert (told["mode"], told["negate"]) == ("trinary", 0)
+    with Image.open(folder / told["image"]) as image:
+        occupancy = (255.0 - np.array(image.convert("L"), float)) / 255.0
+    cells = np.full(occupancy.shape, -1)
+    cells[occupancy < told["free_thresh"]] = 0
+    cells[occupancy > told["occupied_thresh"]] = 100
+    return cells[::-1], np.array(told["origin"]), told["resolution"]
+
+
+def room_scans(west, south, east, north):
+    """A laser scanner that turns and moves about in an empty room between four walls; it measures exactly."""
+    scenery = Scenery()
+    for x, y, size in (
+        (west - 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
+        (east + 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
+        (0.5 * (west + east), south - 0.5, (east - west + 2.0, 1.0)),
+        (0.5 * (west + east), north + 0.5, (east - west + 2.0, 1.0)),
+    ):
+        scenery.box((x, y), size, (0.0, 2.0))
+    solids, rays = scenery.finish(), SENSORS["lms-270"].rays(0)
+    for share in np.linspace(0.2, 0.8, 25):
+        T = lie.pose_2d(west + share * (east - west), south + share**2 * (north - south), 20.0 * share)
+        raised = lie.lift(T)
+        raised[2, 3] = 1.0
+        ranges_m = solids.cast(raised[None], np.zeros(len(rays.directions), np.int32), rays.directions, 30.0)
+        yield T, (rays.directions * ranges_m[:, None])[:, :2]
+
+
+def test_nav2_reads_the_walls_of_a_known_room_to_one_cell(tmp_path):
+    west, south, east, north = -3.33, 1.27, 4.12, 5.58
+    write_map(tmp_path, draw_grid(room_scans(west, south, east, north), CONFIG))
+    cells, origin, resolution_m = nav2_map(tmp_path)
+    assert resolution_m == RESOLUTION_M and origin[2] == 0.0
+    assert np.abs(origin[:2] - [west, south]).max() <= RESOLUTION_M
+    rows, columns = np.indices(cells.shape)
+    x, y = origin[0] + (columns + 0.5) * resolution_m, origin[1] + (rows + 0.5) * resolution_m
+    inwards_m = np.minimum.reduce([x - west, east - x, y - south, north - y])
+    walls = cells == 100
+    assert np.abs(inwards_m[walls]).max() <= RESOLUTION_M
+    assert (cells[inwards_m > RESOLUTION_M] == 0).all() and not (cells[inwards_m < -RESOLUTION_M] == 0).any()
+    for across, axis, places in ((x, 1, (west, east)), (y, 0, (south, north))):
+        for place in places:
+            assert (walls & (np.abs(across - place) <= RESOLUTION_M)).any(axis=axis).mean() > 0.95
+
+
+def test_nav2_reads_cell_0_0_at_the_origin_and_rows_upwards(tmp_path):
+    grid = OccupancyGrid(CONFIG)
+    for _ in range(5):
+        grid.insert(lie.pose_2d(-4.95, 2.05, 0.0), np.array([[3.0, 0.0], [0.0, 2.0]]))
+    write_map(tmp_path, grid.trimmed())
+    cells, origin, _ = nav2_map(tmp_path)
+    np.testing.assert_allclose(origin, [-5.0, 2.0, 0.0], atol=1e-9)
+    assert cells.shape == (21, 31)
+    assert (cells[0, 0], cells[0, 30], cells[20, 0], cells[20, 30]) == (0, 100, 100, -1)
+
+
 def test_an_empty_grid_is_written_as_one_unknown_pixel(tmp_path):
     write_map(tmp_path, OccupancyGrid(CONFIG).trimmed())
     assert naive.served_map(tmp_path)[0].tolist() == [[-1]]
@@ -242,6 +309,33 @@ def test_small_gicp_reads_our_ply(tmp_path):
     points = np.random.default_rng(0).normal(size=(100, 3))
     write_ply(tmp_path / "a.ply", points)
     np.testing.assert_allclose(library.read_ply(str(tmp_path / "a.ply")).points()[:, :3], points, atol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_pcd_and_laz_hold_the_points(tmp_path, dimension):
+    points = np.random.default_rng(0).normal(scale=300.0, size=(100, dimension)) + 1000.0
+    expected = np.pad(points, ((0, 0), (0, 3 - dimension)))
+    write_pcd(tmp_path / "a.pcd", points)
+    rows = read_pcd(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(np.column_stack([rows[axis] for axis in "xyz"]), expected.astype(np.float32))
+    write_laz(tmp_path / "a.laz", points)
+    cloud = laspy.read(tmp_path / "a.laz")
+    assert cloud.header.are_points_compressed
+    np.testing.assert_allclose(cloud.xyz, expected, atol=0.0006)
+
+
+def test_pcd_and_laz_of_no_points_are_read_as_empty(tmp_path):
+    write_pcd(tmp_path / "a.pcd", np.empty((0, 3)))
+    write_laz(tmp_path / "a.laz", np.empty((0, 3)))
+    assert len(read_pcd(tmp_path / "a.pcd")) == len(laspy.read(tmp_path / "a.laz")) == 0
+
+
+def test_open3d_reads_our_pcd(tmp_path):
+    library = pytest.importorskip("open3d")
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    write_pcd(tmp_path / "a.pcd", points)
+    read = np.asarray(library.io.read_point_cloud(str(tmp_path / "a.pcd")).points)
+    np.testing.assert_allclose(read, points, atol=1e-6)
 
 
 def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():

@@ -47,6 +47,81 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     return agreeing, contradicting
 
 
+@njit(cache=True, nogil=True)
+def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_through):
+    """Count, for each point, whether one scan saw a surface there or looked through it.
+
+    All rays that pass within half the window of the point, to its sides and above it, are looked at; below it, a
+    single bin, or else the ground would vouch for what goes over it. The point was seen where the nearest of them
+    ended there, within the margin: so a thin pole before a far wall is not looked through, though most rays miss
+    it. It was looked through where the nearest went on behind it, unless that one ended at the same height, as
+    rays do on ground that they graze, and where one is within a bin of its direction. Otherwise it is hidden or
+    out of sight.
+
+    points : (N, 3) metres, world; spans : (S, 2) int64 first and last + 1 of the points to look at
+    T : (4, 4) T_lidar_world; ranges_m : (E, A) of ``nearest_ranges``; one row for scans in a plane
+    limits : (6,) reach m; window m; margin of a range m, and per metre; margin of a height m, and per metre
+    enough : points that so many scans saw are not looked at again
+    seen, looked_through : (N,) int32, changed in place
+    """
+    for s in range(spans.shape[0]):
+        for i in range(spans[s, 0], spans[s, 1]):
+            if seen[i] >= enough:
+                continue
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            sight = _sight(
+                T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+                T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+                T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+                ranges_m, limits,
+            )  # fmt: skip
+            if sight > 0:
+                seen[i] += 1
+            elif sight < 0:
+                looked_through[i] += 1
+
+
+@njit(cache=True, inline="always")
+def _sight(x, y, z, ranges_m, limits):
+    """1 where a point in the lidar's frame was seen, −1 where it was looked through, else 0."""
+    reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
+    if x * x + y * y + z * z > reach_m * reach_m:
+        return 0
+    row, column, range_m = _bin_of(x, y, z, ranges_m.shape)
+    if range_m <= window_m:
+        return 0
+    step_rad = 2.0 * np.pi / ranges_m.shape[1]
+    margin = margin_m + margin_share * range_m
+    half = max(int(np.ceil(0.5 * window_m / (range_m * step_rad))), 1)
+    nearest_m, row_of_nearest = _least(ranges_m, row, column, half, range_m - margin)
+    if nearest_m >= FAR or nearest_m < range_m - margin:
+        return 0
+    if nearest_m <= range_m + margin:
+        return 1
+    if ranges_m.shape[0] > 1:
+        height_m = nearest_m * np.sin((row_of_nearest + 0.5) * step_rad - 0.5 * np.pi)
+        if abs(height_m - z) <= level_m + level_share * nearest_m:
+            return 0
+    return -1 if _least(ranges_m, row, column, 1, FAR)[0] < FAR else 0
+
+
+@njit(cache=True, inline="always")
+def _least(ranges_m, row, column, half, enough_m):
+    """Least range, or any below ``enough_m``, and its row; of the bins ``half`` away at most, below 1.
+
+    Columns are closed in a ring.
+    """
+    rows, columns = ranges_m.shape
+    least_m, row_of_least = FAR, row
+    for r in range(max(row - 1, 0), min(row + half, rows - 1) + 1):
+        for c in range(column - half, column + half + 1):
+            if ranges_m[r, c % columns] < least_m:
+                least_m, row_of_least = ranges_m[r, c % columns], r
+                if least_m < enough_m:
+                    return least_m, row_of_least
+    return least_m, row_of_least
+
+
 @njit(cache=True, inline="always")
 def _bin_of(x: float, y: float, z: float, shape):
     """Row and column of a direction, and the range; (0, 0, 0) at the lidar itself."""

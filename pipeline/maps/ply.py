@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.data import Points
 from pipeline.errors import InputError
@@ -22,11 +23,16 @@ end_header
 
 def write_ply(path: Path | str, points: Points) -> None:
     """Write points (N, d) as binary little-endian PLY (Turk 1994) of float32; 2D ones lie in the plane z = 0."""
-    rows = np.zeros((len(points), 3), "<f4")
-    rows[:, : points.shape[1]] = points
     with Path(path).open("wb") as file:
         file.write(_HEADER.format(count=len(points)).encode("ascii"))
-        file.write(rows.tobytes())
+        file.write(as_rows(points).tobytes())
+
+
+def as_rows(points: Points) -> NDArray[np.float32]:
+    """Points (N, d) as (N, 3) little-endian float32, 2D ones at height 0."""
+    rows = np.zeros((len(points), 3), "<f4")
+    rows[:, : points.shape[1]] = points
+    return rows
 
 
 def read_ply(path: Path | str) -> Points:

@@ -13,6 +13,7 @@ from pipeline.data import State, Trajectory, Verdict
 from pipeline.errors import InputError
 from pipeline.evaluate import Alignment, absolute_error, kitti_error, lengths_for, pair
 from pipeline.evaluate.absolute import path_length
+from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
@@ -65,6 +66,8 @@ class Metrics(Struct, frozen=True):
     closures_tried: int
     closures_verified: int
     closures_accepted: int
+    map_points: int
+    moving_points_removed: int
     chi2: float
     median_ms: dict[str, float]
     p95_ms: dict[str, float]
@@ -81,6 +84,7 @@ class Metrics(Struct, frozen=True):
 def measure(
     steps: StepTable,
     result: SlamResult,
+    cloud: Cloud,
     judged: Sequence[JudgedClosure],
     *,
     run_s: float,
@@ -109,6 +113,8 @@ def measure(
         closures_tried=len(judged),
         closures_verified=sum(item.closure.verdict is Verdict.ACCEPTED for item in judged),
         closures_accepted=sum(item.verdict is Verdict.ACCEPTED for item in judged),
+        map_points=len(cloud.points),
+        moving_points_removed=cloud.removed,
         chi2=result.state.chi2,
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
@@ -138,6 +144,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
         f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
         f"accepted; chi2 {m.chi2:.4g}",
+        f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {1e3 * m.median_residual_m:.1f} mm, {m.median_iterations:.0f} iterations (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",

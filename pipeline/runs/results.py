@@ -3,26 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import MapsConfig
+from pipeline.config import Config, MapsConfig
 from pipeline.data import Points, Pose
 from pipeline.graph.g2o_write import write_g2o
-from pipeline.maps import OccupancyGrid, build_point_map, draw_grid, fitting_resolution, write_map, write_ply
+from pipeline.maps import (
+    OccupancyGrid,
+    View,
+    build_point_map,
+    draw_grid,
+    fitting_resolution,
+    moved,
+    write_laz,
+    write_map,
+    write_pcd,
+    write_ply,
+)
 from pipeline.runs.recorder import Recorder
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_kitti, write_tum
 
 
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """The point cloud of the world: points (N, d), metres, and how many were left out as having moved."""
+
+    points: Points
+    removed: int
+
+
 def write_results(
-    folder: Path, result: SlamResult, judged: Sequence[JudgedClosure], config: MapsConfig, recording: Recorder
-) -> None:
+    folder: Path, result: SlamResult, judged: Sequence[JudgedClosure], config: Config, recording: Recorder
+) -> Cloud:
     """Write trajectories, graph and maps into a run directory, and show them in the recording."""
     write_tum(folder / "trajectory.tum", result.trajectory)
     write_tum(folder / "odometry.tum", result.odometry)
@@ -32,19 +51,39 @@ def write_results(
     recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
     recording.log_closures([replace(item.closure, verdict=item.verdict) for item in judged], result.state)
     dimension = result.trajectory.dimension
-    cloud = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.voxel_size_m).points()
-    write_ply(folder / "map.ply", cloud)
-    recording.log_map(cloud)
-    grid = _grid(result, config)
+    cloud = _cloud(result, config)
+    write_ply(folder / "map.ply", cloud.points)
+    if config.maps.write_pcd:
+        write_pcd(folder / "map.pcd", cloud.points)
+    if config.maps.write_laz:
+        write_laz(folder / "map.laz", cloud.points)
+    recording.log_map(cloud.points)
+    grid = _grid(result, config.maps)
     write_map(folder, grid)
     if dimension == 2:
         x_m, y_m = grid.origin_m.tolist()
         recording.log_grid(occupancy(grid), resolution_m=grid.resolution_m, origin_m=(x_m, y_m))
+    return cloud
 
 
 def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
     """Cells as ROS counts them: 0 free to 100 occupied, −1 where nothing was seen."""
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
+
+
+def _cloud(result: SlamResult, config: Config) -> Cloud:
+    """The cloud of all keyframes, without what moved if that is wished."""
+    dimension = result.trajectory.dimension
+    built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
+    points = built.points()
+    if not config.maps.remove_moving:
+        return Cloud(points, 0)
+    views = (
+        View(pose, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
+        for pose, keyframe in zip(result.state.poses, result.keyframes, strict=True)
+    )
+    gone = moved(points, built.voxel_size_m, views)
+    return Cloud(points[~gone], int(gone.sum()))
 
 
 def _grid(result: SlamResult, config: MapsConfig) -> OccupancyGrid:

@@ -23,7 +23,7 @@ from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
-from pipeline.runs.results import write_results
+from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
@@ -103,7 +103,9 @@ def run(
             truth, note = _judge(job, log, recorded.result, reference, directory.path)
             warnings = (*log.damage, *recorded.warnings, *note)
             run_s = perf_counter() - started - recorded.held_s
-            metrics = measure(steps, recorded.result, recorded.judged, run_s=run_s, ground_truth=truth)
+            metrics = measure(
+                steps, recorded.result, recorded.cloud, recorded.judged, run_s=run_s, ground_truth=truth
+            )
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
             metrics.write(directory.path / "metrics.json")
@@ -135,6 +137,7 @@ class _Recorded:
     """The result of a log that went through, what the recording has to say, and how long the user looked at it."""
 
     result: SlamResult
+    cloud: Cloud
     judged: tuple[JudgedClosure, ...]
     warnings: tuple[str, ...]
     held_s: float
@@ -167,11 +170,11 @@ def _process(
         progress.say("optimising and writing")
         result = slam.finish()
         judged = final_verdicts(result.closures, result.state)
-        write_results(folder, result, judged, config.maps, recording)
+        cloud = write_results(folder, result, judged, config, recording)
         write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
         steps.write(folder / "steps.parquet", result.trajectory)
         held_s = _hold(recording, progress)
-    return _Recorded(result, judged, tuple(recording.warnings), held_s)
+    return _Recorded(result, cloud, judged, tuple(recording.warnings), held_s)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

@@ -1,0 +1,86 @@
+"""What moved while a log was recorded, told by free space: later or earlier, the lidar looked through it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Points, Pose
+from pipeline.kernels.free_space import nearest_ranges, weigh_points
+
+_COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
+_REACH_BINS = 1.5  # width of a bin in voxels, up to which a scan is a witness
+_WINDOW = 0.6  # of a scan's spacing, within which a surface has a point
+_RANGE_MARGIN_SHARE = 0.03  # beside one voxel
+_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # how level the ground is, and how exact an elevation
+_LEAST_THROUGH = 2  # scans that looked through what moved, at least
+_MAJORITY = 1.5  # times as many as saw a surface there
+_ENOUGH = 12  # scans that saw a surface, for which it stays
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A scan as evidence.
+
+    Attributes
+    ----------
+    T_world_lidar : (d+1, d+1)
+    points : (M, d) metres, lidar frame
+    spacing_m : edge of the voxels that the scan was thinned out with; a surface has a point in each
+    """
+
+    T_world_lidar: Pose
+    points: Points
+    spacing_m: float
+
+
+def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray[np.bool_]:
+    """Which points (N, d) of a map, one a voxel, clearly more scans looked through than saw a surface there.
+
+    A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
+    """
+    index = _Cells(_in_space(voxels), _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi))
+    seen, looked_through = np.zeros((2, len(voxels)), np.int32)
+    ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
+    for view in views:
+        nearest_ranges(_in_space(view.points), ranges_m)
+        T_world_lidar = lie.lift(view.T_world_lidar)
+        limits = np.array([
+            index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
+            _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
+        ])  # fmt: skip
+        spans = index.within_reach(T_world_lidar[:3, 3])
+        weigh_points(
+            index.points, spans, lie.inverse(T_world_lidar), ranges_m, limits, _ENOUGH, seen, looked_through
+        )
+    result = np.zeros(len(voxels), bool)
+    clearly = (looked_through >= _LEAST_THROUGH) & (looked_through > _MAJORITY * seen)
+    result[index.order] = clearly & (seen < _ENOUGH)
+    return result
+
+
+def _in_space(points: Points) -> Points:
+    """(N, 3); points of the plane get height 0."""
+    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+
+
+class _Cells:
+    """Points sorted by coarse cubes, so that a scan looks at those within reach alone."""
+
+    def __init__(self, points: Points, reach_m: float) -> None:
+        self.reach_m = reach_m
+        cubes, cube_of_point = np.unique(np.floor(points / reach_m), axis=0, return_inverse=True)
+        self.middles_m = (cubes + 0.5) * reach_m
+        self.order = np.argsort(cube_of_point, kind="stable")
+        self.points = np.ascontiguousarray(points[self.order])
+        ends = np.cumsum(np.bincount(cube_of_point, minlength=len(cubes)))
+        self.spans = np.column_stack([np.append(0, ends[:-1]), ends]) if len(cubes) else np.empty((0, 2), np.int64)
+
+    def within_reach(self, place_m: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(S, 2) spans of the points in cubes that are, in part, within reach of a place."""
+        outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.reach_m, 0.0)
+        return self.spans[np.einsum("ij,ij->i", outside_m, outside_m) <= self.reach_m**2]

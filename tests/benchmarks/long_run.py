@@ -1,0 +1,59 @@
+"""Time and memory of SLAM along a long log: ``python -m tests.benchmarks.long_run [--scans N]``.
+
+A laser scanner goes round the simulated office for hours. Every tenth of the way: the mean CPU time of
+``Slam.process`` a scan, loops and optimisations included, the memory of this process, and what of it the points of
+keyframes take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from time import thread_time
+
+from pipeline import Slam
+from pipeline.logs import open_log
+from pipeline.settings import load_settings
+from pipeline.simulate import SENSORS, simulate
+
+_PAGE_MIB = 4096 / 2**20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scans", type=int, default=20_000)
+    parser.add_argument("--log", type=Path, help="take the scans of this log instead of simulating one")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        path = arguments.log or Path(folder) / "office.mcap"
+        if arguments.log is None:
+            simulate("office", path, duration_s=arguments.scans * SENSORS["lms-270"].period_ns * 1e-9)
+        _follow(path, arguments.scans)
+
+
+def _follow(path: Path, scans: int) -> None:
+    log = open_log(path)
+    slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)
+    tenth, spent_s, taken_s = max(scans // 10, 1), [], 0.0
+    for scan in log.scans():
+        started = thread_time()
+        slam.process(scan)
+        taken_s += thread_time() - started
+        if (scan.index + 1) % tenth == 0:
+            spent_s.append(taken_s)
+            taken_s = 0.0
+            resident_mib = int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MIB
+            points_mib = sum(keyframe.points.nbytes for keyframe in slam.keyframes) / 2**20
+            print(
+                f"{scan.index + 1:6} scans {1e3 * spent_s[-1] / tenth:6.2f} ms a scan, {resident_mib:6.1f} MiB, "
+                f"{points_mib:5.1f} of it points of {len(slam.keyframes)} keyframes; "
+                f"{len(slam.closures)} closures tried",
+                flush=True,
+            )
+    if len(spent_s) >= 10:
+        print(f"last tenth / second tenth: {spent_s[9] / spent_s[1]:.2f}")
+
+
+if __name__ == "__main__":
+    main()
