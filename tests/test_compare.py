@@ -91,12 +91,18 @@ def good(office, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bad(office, tmp_path_factory):
-    """Bad methods among two good ones, by the command line: the exit code and the directory."""
+    """Bad methods among two good ones, by the command line: the exit code and the directory.
+
+    The clock of the time limit stands still until one hangs, so that a slow machine ends no other.
+    """
     folder = tmp_path_factory.mktemp("bad")
+    hanging = folder / "hanging"
     settings = "".join(f'[{name.lower()}]\nmethod = "bad_odometries:{name}"\n' for name in NATURES)
     names = [name.lower() for name in NATURES]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
+        patch.setenv("HANGS_FILE", str(hanging))
+        patch.setattr("pipeline.compare.watch.monotonic", lambda: 1000.0 * hanging.exists())
         code = main(
             [
                 "compare", str(office), "--out", str(folder / "out"),
