@@ -9,8 +9,7 @@ import numpy as np
 
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
 from pipeline.compare.figures import Column
-from pipeline.compare.outcome import Status
-from pipeline.compare.runner import CLOSURES_FILE
+from pipeline.compare.outcome import CLOSURES_FILE, Status
 from pipeline.compare.table import Table, read_table
 from pipeline.config import MatchingConfig
 from pipeline.maps import read_ply

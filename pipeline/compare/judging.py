@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.compare.figures import Figures
-from pipeline.compare.outcome import Outcome
-from pipeline.compare.runner import STEPS_FILE
+from pipeline.compare.outcome import STEPS_FILE, Outcome
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
