@@ -91,33 +91,29 @@ def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: boo
     told = _with(courses, "eigenvalue")
     if not told:
         return
-    drawings = []
+    degeneracy = Drawing(
+        "Degeneracy along the way",
+        "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
+        "by every residual. Below the dotted line a scan is called degenerate.",
+        figures.degeneracy("degeneracy", told, limit),
+    )
+    whose = f" of {told[0].name}" if len(told) > 1 else ""
+    where = Drawing(
+        "Where little was seen", f"The same on the way{whose}.", figures.degeneracy_plan("blind", told[0])
+    )
+    drawings = (*_consistency(courses, is_planar=is_planar), degeneracy, where)
+    yield Section("Certainty", "", tuple(chip(course) for course in told), drawings)
+
+
+def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Drawing]:
     judged = _with(courses, "nees")
     if judged:
-        drawings.append(
-            Drawing(
-                "Covariance consistency",
-                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
-                "they are too large, to the right too small.",
-                figures.consistency("nees", judged, 3 if is_planar else 6),
-            )
+        yield Drawing(
+            "Covariance consistency",
+            "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
+            "they are too large, to the right too small.",
+            figures.consistency("nees", judged, 3 if is_planar else 6),
         )
-    drawings.append(
-        Drawing(
-            "Degeneracy along the way",
-            "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
-            "by every residual. Below the dotted line a scan is called degenerate.",
-            figures.degeneracy("degeneracy", told, limit),
-        )
-    )
-    drawings.append(
-        Drawing(
-            "Where little was seen",
-            f"The same on the way of {told[0].name}.",
-            figures.degeneracy_plan("blind", told[0]),
-        )
-    )
-    yield Section("Certainty", "", tuple(chip(course) for course in told), tuple(drawings))
 
 
 def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
@@ -160,13 +156,18 @@ def _verdict_grid(closures: pa.Table) -> Grid:
             (
                 Cell(f"{len(places):,}"),
                 Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
-                Cell(f"{1e3 * np.median(residual_m[places]):.0f}"),
+                Cell(_millimetres(float(np.median(residual_m[places])))),
                 Cell(reason, is_wide=True),
             ),
         )
         for (verdict, reason), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
     return Grid(heads, rows)
+
+
+def _millimetres(value_m: float) -> str:
+    """– for what no point has."""
+    return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
 def _with(courses: Sequence[Course], key: str) -> list[Course]:
