@@ -36,7 +36,7 @@ def write_compare_report(directory: Path) -> None:
         facts=_facts(table),
         warnings=tuple(_warnings(table)),
         grid_title="Summary",
-        grid=_summary(table, courses),
+        grid=_figures(table, courses, [column for column in table.columns if column.is_main]),
         legend=tuple(f"{_head(column)}: {column.definition}" for column in table.columns),
         sections=tuple(_sections(directory, table, courses, truth)),
         folds=tuple(_folds(directory, table)),
@@ -71,8 +71,8 @@ def _warnings(table: Table) -> Iterator[str]:
             yield f"{row.name} {row.status}: {row.reason}"
 
 
-def _summary(table: Table, courses: Sequence[Course]) -> Grid:
-    columns = table.columns
+def _figures(table: Table, courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
+    """A row a method; one that failed says how in place of its figures."""
     chips = {course.name: chip(course) for course in courses}
     best = [column.best(table.figures) for column in columns]
     rows = []
@@ -88,6 +88,8 @@ def _summary(table: Table, courses: Sequence[Course]) -> Grid:
 
 
 def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
+    others = [column for column in table.columns if not column.is_main]
+    yield Section("More figures", grid=_figures(table, courses, others))
     is_planar = table.dimension == 2
     drawn = [course for course in courses if len(course.positions)]
     if drawn:

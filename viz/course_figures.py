@@ -125,7 +125,8 @@ def degeneracy_plan(name: str, course: Course) -> Markup:
     with Sheet(name, 0.85 * proportions(low, high)) as sheet:
         x, y = course.positions[order, :2].T
         values = np.log10(np.maximum(course.eigenvalue[order], 1e-6))
-        dots = sheet.axes.scatter(x, y, c=values, s=4.0, cmap="plasma", linewidths=0, rasterized=True)
+        size = float(np.clip(3000.0 / len(order), 4.0, 30.0))
+        dots = sheet.axes.scatter(x, y, c=values, s=size, cmap="cool_r", linewidths=0, rasterized=True)
         sheet.figure.subplots_adjust(right=0.92)
         bar = sheet.figure.colorbar(dots, ax=sheet.axes, shrink=0.8, pad=0.02)
         bar.set_label("information, log10")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 WIDTH_INCHES = 4.6
 INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
-_DPI = 170  # of what is drawn as pixels
+_DPI = 140  # of what is drawn as pixels
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
 _SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
