@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -29,7 +30,10 @@ class Raises(StandsStill):
 
 
 class Hangs(StandsStill):
+    """Says that it hangs by a file, so that a test need not wait."""
+
     def misbehave(self):
+        Path(os.environ["HANGS_FILE"]).touch()
         time.sleep(600.0)
 
 
@@ -41,6 +45,7 @@ class Eats(StandsStill):
     def misbehave(self):
         while True:
             self.hoard.append(np.ones(1 << 20))
+            time.sleep(0.005)
 
 
 class Dies(StandsStill):

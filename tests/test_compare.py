@@ -91,12 +91,18 @@ def good(office, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bad(office, tmp_path_factory):
-    """Bad methods among two good ones, by the command line: the exit code and the directory."""
+    """Bad methods among two good ones, by the command line: the exit code and the directory.
+
+    The clock of the time limit stands still until one hangs, so that a slow machine ends no other.
+    """
     folder = tmp_path_factory.mktemp("bad")
+    hanging = folder / "hanging"
     settings = "".join(f'[{name.lower()}]\nmethod = "bad_odometries:{name}"\n' for name in NATURES)
     names = [name.lower() for name in NATURES]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
+        patch.setenv("HANGS_FILE", str(hanging))
+        patch.setattr("pipeline.compare.watch.monotonic", lambda: 1000.0 * hanging.exists())
         code = main(
             [
                 "compare", str(office), "--out", str(folder / "out"),
@@ -199,14 +205,14 @@ def test_runs_of_the_same_method_are_compared_with_each_other(good):
     assert set(scans["repeat"].to_pylist()) == {0, 1} and len(scans) == 2 * 4 * 60
 
 
-@pytest.mark.parametrize("name", [name for name in default_names(2) if name not in OURS])
-def test_a_method_for_clouds_follows_planar_scans_in_the_plane(office, tmp_path, name):
-    table = run(office, tmp_path, name)
-    if table.rows[0].status is Status.MISSING:
+def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):
+    table = run(office, tmp_path, *[name for name in default_names(2) if name not in OURS])
+    began = [each for each in table.rows if each.status is not Status.MISSING]
+    if not began:
         pytest.skip(table.rows[0].reason)
-    assert table.rows[0].figures.ate_m < 0.1
+    assert all(each.status is Status.OK and each.figures.ate_m < 0.1 for each in began), text(table)
     scans = pq.read_table(tmp_path / "out" / "per_scan.parquet")
-    assert not any(scans["z"].to_numpy())
+    assert len(scans) == 60 * len(began) and not any(scans["z"].to_numpy())
 
 
 # settings

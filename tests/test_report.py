@@ -105,8 +105,7 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
     seen = look(one_run / "report.html", tmp_path, width=1200)
     for title in (
-        "Trajectories",
-        "Map",
+        "Trajectory and map",
         "Error",
         "Time per scan",
         "Degeneracy",
@@ -170,5 +169,5 @@ def test_every_text_of_a_page_is_escaped(tmp_path):
     chip, drawing = Chip(EVIL, "red"), Drawing(EVIL, EVIL, svg="<svg></svg>")
     grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),))
     section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
-    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), grid, (EVIL,), (section,)))
+    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), EVIL, grid, (EVIL,), (section,)))
     assert "<script" not in (tmp_path / "a.html").read_text()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -10,23 +9,20 @@ import numpy as np
 
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
 from pipeline.compare.figures import Column
-from pipeline.compare.outcome import Status
-from pipeline.compare.runner import CLOSURES_FILE
+from pipeline.compare.outcome import CLOSURES_FILE, Status
 from pipeline.compare.table import Table, read_table
 from pipeline.config import MatchingConfig
 from pipeline.maps import read_ply
-from pipeline.runs.provenance import Provenance
 from pipeline.trajectory import read_tum
 from viz import course_figures as figures
 from viz.compared_courses import read_courses
 from viz.course_sections import chip, error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats
-from viz.map_figures import map_picture
-from viz.report import Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from viz.map_figures import AROUND_M, map_picture
+from viz.provenance_folds import provenance_folds
+from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
-REPORT_FILE = "report.html"
 _NEARLY = 1.25  # times the thickness of the sharpest map
-AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around the way
 
 
 def write_compare_report(directory: Path) -> None:
@@ -39,7 +35,8 @@ def write_compare_report(directory: Path) -> None:
         subtitle=_subtitle(table),
         facts=_facts(table),
         warnings=tuple(_warnings(table)),
-        grid=_summary(table, courses),
+        grid_title="Summary",
+        grid=_figures(table, courses, [column for column in table.columns if column.is_main]),
         legend=tuple(f"{_head(column)}: {column.definition}" for column in table.columns),
         sections=tuple(_sections(directory, table, courses, truth)),
         folds=tuple(_folds(directory, table)),
@@ -74,8 +71,8 @@ def _warnings(table: Table) -> Iterator[str]:
             yield f"{row.name} {row.status}: {row.reason}"
 
 
-def _summary(table: Table, courses: Sequence[Course]) -> Grid:
-    columns = table.columns
+def _figures(table: Table, courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
+    """A row a method; one that failed says how in place of its figures."""
     chips = {course.name: chip(course) for course in courses}
     best = [column.best(table.figures) for column in columns]
     rows = []
@@ -91,6 +88,8 @@ def _summary(table: Table, courses: Sequence[Course]) -> Grid:
 
 
 def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
+    others = [column for column in table.columns if not column.is_main]
+    yield Section("More figures", grid=_figures(table, courses, others))
     is_planar = table.dimension == 2
     drawn = [course for course in courses if len(course.positions)]
     if drawn:
@@ -104,7 +103,9 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
         yield from _map_section(directory, drawn, figures.frame(framing, truth), AROUND_M[table.dimension])
     for course in courses:
-        yield from loop_section(course, method_folder(directory, course.name) / CLOSURES_FILE)
+        yield from loop_section(
+            course, method_folder(directory, course.name) / CLOSURES_FILE, f"Loop closures of {course.name}"
+        )
     if len(table.rows) > 1:
         yield _disagreement(table)
 
@@ -162,16 +163,6 @@ def _folds(directory: Path, table: Table) -> Iterator[Fold]:
         definitions = "".join(f"\n\n{definition}" for definition in row.definitions)
         yield Fold(row.name, f"{row.description or row.reason}{definitions}")
     yield Fold("Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"))
-
-
-def provenance_folds(made: Provenance, others: dict[str, str]) -> Iterator[Fold]:
-    """The command, and the versions that it ran with."""
-    yield Fold("Command", shlex.join(made.command))
-    versions = {"python": made.python} | made.versions | others
-    yield Fold("Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items()))
-    yield Fold(
-        "Log files", "\n".join(f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
-    )
 
 
 def _head(column: Column) -> str:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from markupsafe import Markup
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from viz.courses import Course, Floats
-from viz.sheet import INK, LINE, WIDTH_INCHES, Sheet
+from viz.sheet import INK, WIDTH_INCHES, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +19,7 @@ _MAX_POINTS = 1500  # of a line
 _WINDOWS = 250  # that a value a scan is averaged over
 _MARGIN = 0.25
 _FEW_DECADES = 60.0
+_SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 
 
 def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
@@ -64,14 +65,15 @@ def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
 
 
 def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: float, label: str) -> Markup:
-    """Share of the scans below a value, which runs from the 1st to the 99.9th percentile."""
+    """Share of the scans below a value, which is shown up to the 99.5th percentile of the worst course."""
     with Sheet(name) as sheet:
+        ends = []
         for course in _known(courses, key):
             values = getattr(course, key)
-            values = np.sort(unit_scale * values[np.isfinite(values)])
-            shares = np.linspace(0.0, 100.0, len(values))
-            rows = np.unique(np.linspace(0, len(values) - 1, min(len(values), 400)).astype(int))
-            sheet.axes.plot(np.maximum(values[rows], 1e-6), shares[rows], **course.style)
+            values = np.maximum(np.sort(unit_scale * values[np.isfinite(values)]), 1e-6)
+            _cumulative(sheet.axes, course, values)
+            ends.append(np.percentile(values, _SHOWN_SHARES))
+        sheet.axes.set_xlim(0.9 * np.min(ends), 1.1 * np.max(ends))
         _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
         _label(sheet.axes, label, "scans below [%]")
@@ -94,9 +96,9 @@ def consistency(name: str, courses: Sequence[Course], degrees_of_freedom: int) -
     with Sheet(name) as sheet:
         for course in _known(courses, "nees"):
             values = np.sort(course.nees[np.isfinite(course.nees)])
-            sheet.axes.plot(np.maximum(values, 1e-4), np.linspace(0.0, 100.0, len(values)), **course.style)
+            _cumulative(sheet.axes, course, np.maximum(values, 1e-4))
         shares = np.linspace(0.001, 0.999, 200)
-        ideal = chi2.ppf(shares, degrees_of_freedom) / degrees_of_freedom
+        ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
         sheet.axes.plot(ideal, 100.0 * shares, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
         _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
@@ -120,10 +122,12 @@ def degeneracy_plan(name: str, course: Course) -> Markup:
     """The same on the way itself, the worst scans on top."""
     low, high = frame([course], None)
     order = np.argsort(-course.eigenvalue)
-    with Sheet(name, proportions(low, high)) as sheet:
+    with Sheet(name, 0.85 * proportions(low, high)) as sheet:
         x, y = course.positions[order, :2].T
         values = np.log10(np.maximum(course.eigenvalue[order], 1e-6))
-        dots = sheet.axes.scatter(x, y, c=values, s=4.0, cmap="plasma", linewidths=0, rasterized=True)
+        size = float(np.clip(3000.0 / len(order), 4.0, 30.0))
+        dots = sheet.axes.scatter(x, y, c=values, s=size, cmap="cool_r", linewidths=0, rasterized=True)
+        sheet.figure.subplots_adjust(right=0.92)
         bar = sheet.figure.colorbar(dots, ax=sheet.axes, shrink=0.8, pad=0.02)
         bar.set_label("information, log10")
         bar.outline.set_visible(False)
@@ -160,23 +164,28 @@ def _each(axes: Axes, courses: Sequence[Course], line: Callable[[Course], tuple[
             axes.plot(*(_thinned(values) for values in line(course)), **course.style)
 
 
+def _cumulative(axes: Axes, course: Course, ordered: Floats) -> None:
+    """Per cent of the values below each."""
+    rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), _MAX_POINTS)).astype(int))
+    axes.plot(ordered[rows], np.linspace(0.0, 100.0, len(ordered))[rows], **course.style)
+
+
 def _label(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(visible=True, which="major")
-    axes.tick_params(which="minor", color=LINE)
+    axes.grid(visible=True)
 
 
 def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """Plain numbers at 1, or at 1, 2 and 5 where there are few decades; so that labels have room."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     (axes.set_xscale if which == "x" else axes.set_yscale)("log")
     axis = axes.xaxis if which == "x" else axes.yaxis
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 def _thinned(values: Floats) -> Floats:

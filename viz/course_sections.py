@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from viz import course_figures as figures
@@ -14,7 +17,7 @@ from viz.map_figures import loops_picture
 from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _DOTTED = "Dotted: the truth. "
-_SHOWN_CLOSURES = 12
+_FIRST_NUMBER = re.compile(r" -?\d[\d.e+-]*")
 
 
 def chip(course: Course) -> Chip:
@@ -88,40 +91,38 @@ def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: boo
     told = _with(courses, "eigenvalue")
     if not told:
         return
-    drawings = []
+    degeneracy = Drawing(
+        "Degeneracy along the way",
+        "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
+        "by every residual. Below the dotted line a scan is called degenerate.",
+        figures.degeneracy("degeneracy", told, limit),
+    )
+    whose = f" of {told[0].name}" if len(told) > 1 else ""
+    where = Drawing(
+        "Where little was seen", f"The same on the way{whose}.", figures.degeneracy_plan("blind", told[0])
+    )
+    drawings = (*_consistency(courses, is_planar=is_planar), degeneracy, where)
+    yield Section("Certainty", "", tuple(chip(course) for course in told), drawings)
+
+
+def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Drawing]:
     judged = _with(courses, "nees")
     if judged:
-        drawings.append(
-            Drawing(
-                "Covariance consistency",
-                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
-                "they are too large, to the right too small.",
-                figures.consistency("nees", judged, 3 if is_planar else 6),
-            )
+        yield Drawing(
+            "Covariance consistency",
+            "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
+            "they are too large, to the right too small.",
+            figures.consistency("nees", judged, 3 if is_planar else 6),
         )
-    drawings.append(
-        Drawing(
-            "Degeneracy along the way",
-            "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
-            "by every residual. Below the dotted line a scan is called degenerate.",
-            figures.degeneracy("degeneracy", told, limit),
-        )
-    )
-    drawings.append(
-        Drawing(
-            f"Where {told[0].name} saw little", "The same on the way.", figures.degeneracy_plan("blind", told[0])
-        )
-    )
-    yield Section("What ours knows of itself", "", tuple(chip(course) for course in told), tuple(drawings))
 
 
-def loop_section(course: Course, path: Path) -> Iterator[Section]:
-    """Every loop closure tried, with its verdict."""
+def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
+    """Every loop closure tried, and how many of them met which verdict."""
     if not path.exists():
         return
     table = pq.read_table(path)
     if not table.num_rows:
-        yield Section(f"Loop closures of {course.name}", "None was tried: the way never comes back to itself.")
+        yield Section(title, "None was tried: the way never comes back to itself.")
         return
     ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
     is_accepted = np.array([verdict == "accepted" for verdict in table["verdict"].to_pylist()])
@@ -129,34 +130,44 @@ def loop_section(course: Course, path: Path) -> Iterator[Section]:
     inches = figures.proportions(low, high)
     picture = loops_picture("loops", course, course.positions[ends], is_accepted, low, high, inches)
     yield Section(
-        f"Loop closures of {course.name}",
-        f"{len(ends):,} tried, {is_accepted.sum():,} accepted. Those that weigh least come first; all are in "
-        "loops.parquet.",
+        title,
+        f"{len(ends):,} tried, {is_accepted.sum():,} accepted; each is a row of loops.parquet.",
         (),
         (Drawing("On the way", "Green: accepted. Red: rejected.", picture),),
-        _closure_grid(table.sort_by("weight").slice(0, _SHOWN_CLOSURES).to_pylist()),
+        _verdict_grid(table),
     )
 
 
-def _closure_grid(closures: list[dict]) -> Grid:
+def _verdict_grid(closures: pa.Table) -> Grid:
+    """Closures by verdict and reason, the figures of each left out of it, most frequent first."""
+    groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+    for place, (verdict, reason) in enumerate(
+        zip(*(closures[key].to_pylist() for key in ("verdict", "reason")), strict=True)
+    ):
+        groups[verdict, _FIRST_NUMBER.sub("", reason, count=1)].append(place)
+    overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     heads = (
-        Head("scans"), Head("overlap", "%"), Head("residual", "mm"),
-        Head("weight", "", "left by the robust graph"), Head("verdict"), Head("reason", is_text=True),
+        Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
+        Head("reason", is_text=True),
     )  # fmt: skip
     rows = tuple(
         Row(
-            f"{closure['target_scan']} – {closure['source_scan']}",
+            verdict,
             (
-                Cell(f"{100.0 * closure['overlap']:.0f}"),
-                Cell(f"{1e3 * closure['residual_m']:.0f}"),
-                Cell(f"{closure['weight']:.2f}"),
-                Cell(closure["verdict"]),
-                Cell(closure["reason"], is_wide=True),
+                Cell(f"{len(places):,}"),
+                Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
+                Cell(_millimetres(float(np.median(residual_m[places])))),
+                Cell(reason, is_wide=True),
             ),
         )
-        for closure in closures
+        for (verdict, reason), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
     return Grid(heads, rows)
+
+
+def _millimetres(value_m: float) -> str:
+    """– for what no point has."""
+    return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
 def _with(courses: Sequence[Course], key: str) -> list[Course]:

@@ -12,6 +12,7 @@ from viz.sheet import INK, Sheet
 _ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
+AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around a way
 
 
 def map_picture(name: str, points: Points, low: Floats, high: Floats, inches: float) -> Markup:

@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -88,12 +89,13 @@ class Fold:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report; ``facts`` are label and value, ``warnings`` stand out."""
+    """A report; ``facts`` are label and value, ``warnings`` stand out, ``grid`` is the main table."""
 
     title: str
     subtitle: str
     facts: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+    grid_title: str
     grid: Grid
     legend: tuple[str, ...]
     sections: tuple[Section, ...]

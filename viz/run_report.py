@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -26,11 +27,11 @@ from pipeline.runs.step_table import STAGES
 from pipeline.settings import read_layer
 from pipeline.trajectory import read_tum
 from viz import course_figures as figures
-from viz.compare_report import AROUND_M, REPORT_FILE, provenance_folds
 from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats, colour_of
-from viz.map_figures import map_picture
-from viz.report import Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from viz.map_figures import AROUND_M, map_picture
+from viz.provenance_folds import provenance_folds
+from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
 
 def write_run_report(directory: Path) -> None:
@@ -43,6 +44,7 @@ def write_run_report(directory: Path) -> None:
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
         warnings=(made.stopped,) if made.stopped else (),
+        grid_title="Time of a scan",
         grid=_stages(metrics),
         legend=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
@@ -81,7 +83,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
 
 def _stages(metrics: Metrics) -> Grid:
     """Time by stage."""
-    heads = (Head("time of a scan"), *(Head(stage, "ms") for stage in STAGES), Head("all but read", "ms"))
+    heads = (Head("stage"), *(Head(stage, "ms") for stage in STAGES), Head("all but read", "ms"))
     names = (*STAGES, "all_but_read")
     rows = [
         Row(name, tuple(Cell(f"{figures_ms[stage]:.2f}") for stage in names))
@@ -92,7 +94,7 @@ def _stages(metrics: Metrics) -> Grid:
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     steps = pq.read_table(directory / "steps.parquet")
-    trajectory, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
+    trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
     T = np.eye(4) if truth is None else _alignment(pair(trajectory, truth))
@@ -103,14 +105,15 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     is_planar = metrics.dimension == 2
     way = None if truth is None else truth.poses[:, :3, 3]
     text = "Each moved onto the truth as for the ATE." if truth is not None else ""
-    yield way_section(courses, courses, way, is_planar=is_planar, text=text)
-    yield _map(directory, courses[0], T, is_planar=is_planar)
+    section = way_section(courses, courses, way, is_planar=is_planar, text=text)
+    drawings = (*section.drawings, _map(directory, courses[0], T, metrics.dimension))
+    yield replace(section, title="Trajectory and map", drawings=drawings)
     if metrics.ground_truth is not None:
         yield from error_section(courses, metrics.ground_truth.source)
     yield from time_section(courses[:1])
     limit = float(read_layer(directory / "config.toml")["matching.min_information"])
     yield from knowledge_section(courses[:1], limit, is_planar=is_planar)
-    yield from loop_section(courses[0], directory / "loops.parquet")
+    yield from loop_section(courses[0], directory / "loops.parquet", "Loop closures")
 
 
 def _course(
@@ -137,6 +140,15 @@ def _course(
     )
 
 
+def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
+    """The poses of columns whose names begin so."""
+    columns = [steps[f"{prefix}{name}"].to_numpy() for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    poses = np.tile(np.eye(4), (len(steps), 1, 1))
+    poses[:, :3, :3] = lie.from_quaternion(np.stack(columns[3:], axis=1))
+    poses[:, :3, 3] = np.stack(columns[:3], axis=1)
+    return Trajectory(steps["stamp_ns"].to_numpy(), poses)
+
+
 def _alignment(pairs: Pairs) -> Pose:
     """As for the ATE: rigid, or by the first pose where a straight way leaves that open."""
     try:
@@ -151,18 +163,13 @@ def _seconds(steps: pa.Table) -> Floats:
 
 
 def _nees(steps: pa.Table, truth: Trajectory) -> Floats:
-    columns = [steps[f"odom_{name}"].to_numpy() for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    poses = np.tile(np.eye(4), (len(steps), 1, 1))
-    poses[:, :3, :3] = lie.from_quaternion(np.stack(columns[3:], axis=1))
-    poses[:, :3, 3] = np.stack(columns[:3], axis=1)
-    return nees_of_steps(steps, Trajectory(steps["stamp_ns"].to_numpy(), poses), truth)
+    return nees_of_steps(steps, _trajectory(steps, "odom_"), truth)
 
 
-def _map(directory: Path, course: Course, T: Pose, *, is_planar: bool) -> Section:
-    """The occupied cells of a 2D run, the point cloud of a 3D one, with the ways."""
-    around_m = AROUND_M[2 if is_planar else 3]
+def _map(directory: Path, course: Course, T: Pose, dimension: int) -> Drawing:
+    """The points of the map around the way."""
     low, high = figures.frame([course], None)
-    low, high = low - around_m, high + around_m
+    low, high = low - AROUND_M[dimension], high + AROUND_M[dimension]
     points = lie.transform(T, read_ply(directory / "map.ply"))
     picture = map_picture("map", points, low, high, figures.proportions(low, high))
-    return Section("Map", drawings=(Drawing("Seen from above", "map.ply", picture),))
+    return Drawing("Map", "map.ply, seen from above.", picture)

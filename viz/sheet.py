@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 WIDTH_INCHES = 4.6
 INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
-_DPI = 170  # of what is drawn as pixels
+_DPI = 140  # of what is drawn as pixels
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
 _SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.size": 8.0,
@@ -48,8 +49,11 @@ class Sheet:
 
         self._context = mpl.rc_context(cast("Any", _SETTINGS | {"svg.hashsalt": name}))
         self._context.__enter__()
-        self.figure: Figure = Figure(figsize=(WIDTH_INCHES, height_inches), layout="constrained")
+        self.figure: Figure = Figure(figsize=(WIDTH_INCHES, height_inches))
         self.axes: Axes = self.figure.add_subplot()
+        self.figure.subplots_adjust(  # a layout engine would draw everything twice
+            _LEFT / WIDTH_INCHES, _BOTTOM / height_inches, 1 - _RIGHT / WIDTH_INCHES, 1 - _TOP / height_inches
+        )
 
     def __enter__(self) -> Sheet:
         return self

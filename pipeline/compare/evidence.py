@@ -12,8 +12,7 @@ import tomli_w
 from pipeline.compare.judging import Judged, representative
 from pipeline.compare.maps import picture_points
 from pipeline.compare.methods import Method
-from pipeline.compare.outcome import Outcome
-from pipeline.compare.runner import CLOSURES_FILE, STEPS_FILE
+from pipeline.compare.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
 from pipeline.compare.scan_store import StoredScans
 from pipeline.compare.scan_table import RunOfMethod, write_scans
 from pipeline.data import Points, Trajectory

@@ -101,7 +101,16 @@ COLUMNS = (
     Column(
         "kitti_rad_per_m", "KITTI rot.", "deg/m", _DEGREES, 4, "low", False, "mean turn per metre over the same"
     ),
-    Column("paired_share", "paired", "%", 100.0, 1, "", False, "share of the poses that a true one belongs to"),
+    Column(
+        "paired_share",
+        "paired",
+        "%",
+        100.0,
+        1,
+        "",
+        False,
+        "share of the shorter trajectory's poses that were paired",
+    ),
     Column("relations_m", "relations", "m", 1.0, 4, "low", True, "mean absolute error over relations set by hand"),
     Column("relations_rad", "relations", "deg", _DEGREES, 3, "low", True, "the same, of the angle"),
     Column("nees", "NEES", "", 1.0, 2, "one", False, "squared error of a motion over its covariance; 1 is exact"),

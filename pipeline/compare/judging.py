@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.compare.figures import Figures
-from pipeline.compare.outcome import Outcome
-from pipeline.compare.runner import STEPS_FILE
+from pipeline.compare.outcome import STEPS_FILE, Outcome
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
@@ -22,6 +21,7 @@ from pipeline.evaluate import (
     Alignment,
     Pairs,
     Relations,
+    RelativeError,
     absolute_error,
     kitti_error,
     lengths_for,
@@ -95,10 +95,8 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     every = 10 if lengths_m == KITTI_LENGTHS_M else 1
     kitti = _or_none(lambda: kitti_error(pairs, lengths_m, every=every))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
-    stretches = [
-        _or_none(lambda length_m=length_m: relative_error_over_distance(pairs, length_m))
-        for length_m in (10.0, 100.0)
-    ]
+    over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
+    over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
     nees = _nees(outcome, truth)
     place = pairs.indices[:, 0]
     errors_m, errors_rad = judged.errors_m.copy(), judged.errors_rad.copy()
@@ -108,17 +106,21 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
         ate_m=ate.translation_m.rmse,
         ate_share=ate.share_of_path if ate.path_length_m else None,
         ate_rotation_rad=ate.rotation_rad.rmse,
-        rpe_1_s_m=None if second is None else second.translation_m.rmse,
-        rpe_10_m_m=None if stretches[0] is None else stretches[0].translation_m.rmse,
-        rpe_100_m_m=None if stretches[1] is None else stretches[1].translation_m.rmse,
+        rpe_1_s_m=_rmse_m(second),
+        rpe_10_m_m=_rmse_m(over_10_m),
+        rpe_100_m_m=_rmse_m(over_100_m),
         kitti_share=None if kitti is None else kitti.translation_share,
         kitti_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
         paired_share=pairs.share,
         nees=float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
     )
-    found = [ate.definition, *(each.definition for each in (second, *stretches, kitti) if each is not None)]
+    found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
     definitions = (*judged.definitions, *found)
     return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, definitions)
+
+
+def _rmse_m(error: RelativeError | None) -> float | None:
+    return None if error is None else error.translation_m.rmse
 
 
 def _absolute(pairs: Pairs) -> AbsoluteError:

@@ -14,6 +14,7 @@ from pipeline.data import Matrix, Trajectory
 
 POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"
 TRAJECTORY_FILE, REPORT_FILE = "trajectory.npy", "end.json"
+STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
 
 class Status(StrEnum):
