@@ -1,4 +1,4 @@
-"""Judging how a damaged log is read: in time, in bounded memory, InputErrors alone, all that is whole recovered."""
+"""Judging how a damaged log is read: in time, in bounded memory, InputErrors alone, all that is whole kept."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ _LEAST_BYTES = {
     15: 4,
 }
 _EXACT_BYTES = {2: 20, 14: 17, 15: 4}  # footer, summary offset, end of data
+_PARTS = {1: (0, 2), 3: (2, 3), 4: (4, 3), 9: (16, 2), 12: (0, 2)}  # fixed bytes, then parts behind their length
 _PRIVATE = 0x80  # opcodes from here on are those of applications
 _COMPRESSIONS = 64  # bytes; no name of a compression is longer
 _COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
@@ -48,7 +49,7 @@ def record_end(data: mmap.mmap | bytes, offset: int) -> int:
         return 0
     if opcode >= _PRIVATE:
         return end
-    if length < _LEAST_BYTES.get(opcode, len(data)):
+    if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
         return 0
     return end if vouches_for_itself(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
 
@@ -103,6 +104,17 @@ def _next(data: mmap.mmap | bytes, offset: int, sought: AbstractSet[int]) -> int
 def is_end(data: mmap.mmap | bytes, offset: int) -> bool:
     """Whether nothing but the closing magic is left."""
     return offset == len(data) - len(MAGIC) and data[offset:] == MAGIC
+
+
+def _has_parts(data: mmap.mmap | bytes, offset: int, end: int) -> bool:
+    """Whether the strings and other parts that a record begins with end inside it."""
+    fixed, count = _PARTS.get(data[offset], (0, 0))
+    at = offset + RECORD.size + fixed
+    for _ in range(count):
+        if at + 4 > end:
+            return False
+        at += 4 + struct.unpack_from("<I", data, at)[0]
+    return at <= end
 
 
 def _begins_chunk(data: mmap.mmap | bytes, offset: int) -> bool:

@@ -3,10 +3,12 @@
 python -m tests.benchmarks.fuzz_guided CORPUS -max_total_time=300 [any flag of libFuzzer]
 """
 
+import os
 import sys
 import tempfile
 from pathlib import Path
 
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # instrumented Python does not compile
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import atheris
