@@ -27,7 +27,7 @@ def main():
         damaged.write_bytes(b"\x89MCAP0\r\n" + data[8:])
         fuzzing.read(damaged)
 
-    limits = ["-timeout=5", "-rss_limit_mb=1200", "-max_len=30000"]
+    limits = ["-timeout=5", "-rss_limit_mb=8000", "-max_len=30000"]
     atheris.Setup([*sys.argv, *limits], read)
     atheris.Fuzz()
 
