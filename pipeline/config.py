@@ -177,6 +177,15 @@ class RecordingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     max_map_points: Count = 20000
 
 
+class OutputsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """What a run directory holds beside the files that are always there.
+
+    ``mcap`` adds results.mcap, the poses and maps as ROS 2 messages.
+    """
+
+    mcap: bool = False
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole tree; a module receives its own branch."""
 
@@ -189,3 +198,4 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     graph: GraphConfig = GraphConfig()
     maps: MapsConfig = MapsConfig()
     recording: RecordingConfig = RecordingConfig()
+    outputs: OutputsConfig = OutputsConfig()

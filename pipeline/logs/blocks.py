@@ -66,13 +66,13 @@ def release(index: FileIndex, block: Block) -> None:
 
 
 def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of each record. Raises struct.error where the last one reaches beyond the payload."""
+    """Opcode, begin and end of each record. Raises struct.error for one that does not belong there."""
     offset = 0
     while offset < len(payload):
         opcode, length = RECORD.unpack_from(payload, offset)
         begin, offset = offset + RECORD.size, offset + RECORD.size + length
-        if offset > len(payload):
-            raise struct.error("record beyond the end")
+        if offset > len(payload) or opcode not in (SCHEMA, CHANNEL, MESSAGE):
+            raise struct.error("record beyond the end, or of no kind that a chunk may hold")
         yield opcode, begin, offset
 
 

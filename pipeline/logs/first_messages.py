@@ -16,12 +16,11 @@ _BLOCKS = 8  # of a topic, from the first on, that are searched
 
 def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
     """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
-    channels = {channel.key for index in indexes for channel in index.channels.values() if channel.topic == topic}
     blocks = [
         block
         for index in indexes
         for block in index.blocks
-        if not block.entries or any((block.file, entry.channel) in channels for entry in block.entries)
+        if index.may_hold(block, {n for n, channel in index.channels.items() if channel.topic == topic})
     ]
     for block in sorted(blocks, key=lambda block: block.start_ns)[:_BLOCKS]:
         for message in messages_of(indexes[block.file], block):

@@ -104,7 +104,7 @@ def parse(data: memoryview, kind: type[T]) -> T:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
         raise MalformedMessageError(f"it does not fit its type: {error}") from error
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, UnicodeDecodeError):
         pass
     try:
         return msgspec.convert(json.loads(bytes(data)), kind)

@@ -27,7 +27,7 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 
 def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, notes: list[str]) -> Pose:
     """T_base_lidar (4, 4); the identity where the log does not say, with a note where that is an assumption."""
-    transforms = _static_transforms(indexes)
+    transforms = static_transforms(indexes)
     if not transforms and wheels is None:
         return np.eye(4)
     read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
@@ -47,6 +47,16 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     return np.eye(4)
 
 
+def root_frame(transforms: Sequence[StampedPose], frame: str) -> str:
+    """The topmost frame to which fixed transforms join a frame; the frame itself where there are none."""
+    parents = {each.child.lstrip("/"): each.parent.lstrip("/") for each in transforms}
+    seen: list[str] = []
+    while frame in parents and frame not in seen:
+        seen.append(frame)
+        frame = parents[frame]
+    return frame
+
+
 def is_upside_down(T_base_lidar: Pose) -> bool:
     """Whether the lidar's z axis points downwards."""
     return bool(T_base_lidar[2, 2] < 0.0)
@@ -63,7 +73,8 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     return lie.flatten(T_base_lidar)
 
 
-def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
+def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
+    """Every transform of the topics that tell fixed ones."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):

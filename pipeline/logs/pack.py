@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -90,13 +91,47 @@ def pack_odometry(
     return bytes(cdr.data)
 
 
-def pack_transform(stamp_ns: int, parent: str, child: str, pose: Place) -> bytes:
-    """A tf2_msgs/TFMessage of one transform: pose of ``child`` in ``parent``."""
+class Link(NamedTuple):
+    """The pose of the frame ``child`` in ``parent``."""
+
+    parent: str
+    child: str
+    pose: Place
+
+
+def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
+    """A tf2_msgs/TFMessage."""
     cdr = _Cdr()
-    cdr.numbers("I", 1)
-    cdr.header(stamp_ns, parent)
-    cdr.string(child)
-    cdr.numbers("d", *pose)
+    cdr.numbers("I", len(links))
+    for link in links:
+        cdr.header(stamp_ns, link.parent)
+        cdr.string(link.child)
+        cdr.numbers("d", *link.pose)
+    return bytes(cdr.data)
+
+
+def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
+    """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
+    cdr = _Cdr()
+    cdr.header(stamp_ns, frame)
+    cdr.numbers("I", len(poses))
+    for each_ns, pose in zip(stamps_ns, poses, strict=True):
+        cdr.header(each_ns, frame)
+        cdr.numbers("d", *pose)
+    return bytes(cdr.data)
+
+
+def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
+    """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
+    rows, columns = cells.shape
+    cdr = _Cdr()
+    cdr.header(stamp_ns, frame)
+    cdr.stamp(stamp_ns)
+    cdr.numbers("f", resolution_m)
+    cdr.numbers("I", columns, rows)
+    cdr.numbers("d", *origin)
+    cdr.numbers("I", cells.size)
+    cdr.data += np.ascontiguousarray(cells, np.int8).tobytes()
     return bytes(cdr.data)
 
 
@@ -119,7 +154,10 @@ class _Cdr:
         self.data += encoded
 
     def header(self, stamp_ns: int, frame: str) -> None:
+        self.stamp(stamp_ns)
+        self.string(frame)
+
+    def stamp(self, stamp_ns: int) -> None:
         seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
         self.numbers("i", seconds)
         self.numbers("I", nanoseconds)
-        self.string(frame)

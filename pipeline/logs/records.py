@@ -98,6 +98,8 @@ class FileIndex:
     data : the bytes of an MCAP file; of another format ``make`` makes the contents of a block, of all channels or
         of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
+    doubted : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
+    is_trusted : whether what blocks say about their channels agrees with what the file says about itself
     """
 
     path: Path
@@ -111,7 +113,9 @@ class FileIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
+    is_trusted: bool = True
     has_summary: bool = False
+    doubted: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -131,6 +135,23 @@ class FileIndex:
         encoding, _ = read_string(body, offset)
         known = self.schemas.get(schema, ("", "", b""))
         self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
+
+    def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
+        """Whether a block can have messages of the channels."""
+        if not self.is_trusted or not block.entries:
+            return True
+        return any(entry.channel in channels for entry in block.entries)
+
+    def believe(self, wanted: AbstractSet[int]) -> None:
+        """Take channels in from a damaged summary, as nothing else tells of them."""
+        for opcode, body in self.doubted:
+            try:
+                if opcode == SCHEMA:
+                    self.add_schema(self.data, body)
+                elif opcode == CHANNEL and struct.unpack_from("<H", self.data, body)[0] in wanted:
+                    self.add_channel(self.data, body)
+            except (struct.error, UnicodeDecodeError):
+                continue
 
     def note_damage(self, line: str) -> None:
         """Note a line once, however often the damage is met."""

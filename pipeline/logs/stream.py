@@ -17,7 +17,7 @@ from pipeline.logs.selection import Span
 Decoders = Mapping[str, Callable[[memoryview], object]]
 
 _THREADS = 2
-_MOST_BYTES_AHEAD = 512_000_000
+_MOST_BYTES_AHEAD = 256_000_000
 
 
 class Decoded(NamedTuple):
@@ -53,8 +53,7 @@ def decoded_messages(
         block
         for index in indexes
         for block in index.blocks
-        if span.meets(block)
-        and (not block.entries or any(entry.channel in wanted[block.file] for entry in block.entries))
+        if span.meets(block) and index.may_hold(block, wanted[block.file])
     ]
     blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
     waiting: list[tuple[int, int, int, int, Decoded]] = []

@@ -37,7 +37,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     if not lidars:
         raise InputError(
             f"{path}: has no lidar topic of a type that is understood ({_UNDERSTOOD}); "
-            f"it holds: {_listed(channels.values())}"
+            f"it holds: {_listed(channels.values())}{_damage(indexes)}"
         )
     if len(lidars) > 1:
         raise InputError(f"{path}: has several lidar topics; choose one with --topic: {_listed(lidars)}")
@@ -83,6 +83,12 @@ def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
 
 def _is_lidar(channel: Channel) -> bool:
     return is_scan(channel) or is_cloud(channel)
+
+
+def _damage(indexes: Sequence[FileIndex]) -> str:
+    """What may be why a topic is not there."""
+    damage = [line for index in indexes for line in index.damage]
+    return f"; it is damaged in {len(damage)} places, the first: {damage[0]}" if damage else ""
 
 
 def _listed(channels: Iterable[Channel]) -> str:

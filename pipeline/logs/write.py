@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix, Pose
 from pipeline.errors import InputError
-from pipeline.logs.pack import pack_cloud, pack_laser_scan, pack_odometry, pack_transform, place
+from pipeline.logs.pack import Link, pack_cloud, pack_laser_scan, pack_odometry, pack_transforms, place
 from pipeline.logs.records import Channel
 from pipeline.logs.ros2_definitions import schema_text
 
@@ -84,7 +84,7 @@ class LogWriter:
             time_increment_s=time_increment_s,
             scan_time_s=scan_time_s,
         )
-        self._append(topic, "sensor_msgs/msg/LaserScan", data, stamp_ns, log_time_ns)
+        self.append(topic, "sensor_msgs/msg/LaserScan", data, stamp_ns, log_time_ns)
 
     def point_cloud(
         self,
@@ -117,9 +117,7 @@ class LogWriter:
         rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
         for name, (_, values) in columns.items():
             rows[name] = values
-        self._append(
-            topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns
-        )
+        self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
 
     def odometry(
         self,
@@ -134,14 +132,14 @@ class LogWriter:
     ) -> None:
         """Append a nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
         data = pack_odometry(stamp_ns, frame, child_frame, place(T), covariance)
-        self._append(topic, "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
+        self.append(topic, "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
 
     def static_transform(
         self, stamp_ns: int, parent: str, child: str, T: Pose, *, log_time_ns: int | None = None
     ) -> None:
         """Append a tf2_msgs/TFMessage to /tf_static: pose of ``child`` in ``parent``."""
-        data = pack_transform(stamp_ns, parent, child, place(T))
-        self._append("/tf_static", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
+        data = pack_transforms(stamp_ns, Link(parent, child, place(T)))
+        self.append("/tf_static", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
 
     def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
         """Append a message of another log as it is, with its topic, type, encoding and definition."""
@@ -151,7 +149,8 @@ class LogWriter:
             self._channels[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
         self._add(self._channels[key], log_time_ns, data)
 
-    def _append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None) -> None:
+    def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:
+        """Append a packed message of the type ``schema``, pkg/msg/Type."""
         time_ns = stamp_ns if log_time_ns is None else log_time_ns
         key = (topic, "cdr", schema, b"")
         if key not in self._channels:

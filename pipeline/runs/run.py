@@ -24,6 +24,7 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
 from pipeline.runs.results import Cloud, write_results
+from pipeline.runs.results_mcap import write_results_mcap
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
@@ -173,6 +174,8 @@ def _process(
         cloud = write_results(folder, result, judged, config, recording)
         write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
         steps.write(folder / "steps.parquet", result.trajectory)
+        if config.outputs.mcap:
+            write_results_mcap(folder, log, steps, result)
         held_s = _hold(recording, progress)
     return _Recorded(result, cloud, judged, tuple(recording.warnings), held_s)
 

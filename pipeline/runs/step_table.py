@@ -76,6 +76,12 @@ class StepTable:
         """Log time from the first step to the last."""
         return (self.rows[-1].log_time_ns - self.rows[0].log_time_ns) * 1e-9 if self.rows else 0.0
 
+    def covariances(self) -> list[Matrix | None]:
+        """Of each scan's match: (k, k) of a twist in the lidar's frame; None where a direction is undetermined."""
+        k = len(self.rows[0].match.information) if self.rows else 0
+        flat = _covariances(np.array([row.match.information for row in self.rows]))
+        return [None if each is None else np.array(each).reshape(k, k) for each in flat]
+
     def states(self) -> Counter[State]:
         """How many steps ended in each state."""
         return Counter(row.state for row in self.rows)

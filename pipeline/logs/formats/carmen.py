@@ -18,7 +18,7 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
 from pipeline.logs.formats.made import made_block, made_channel, made_index
-from pipeline.logs.pack import pack_transform
+from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 
 _LINES_A_BLOCK = 512
@@ -80,7 +80,7 @@ class _Carmen:
             offset_m, reach_m = (self.parameters.get(name, 0.0) for name in _PARAMETERS)
             told = read_scan(words, line.stamp_ns, reach_m, offset_m)
             if is_first:
-                data = pack_transform(line.stamp_ns, "base_link", "laser", told.mounting)
+                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", told.mounting))
                 yield self._message(self.mounting, line, data)
             yield self._message(self.odometry, line, told.odometry)
             yield self._message(self.scan, line, told.scan)

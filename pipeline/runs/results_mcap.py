@@ -1,0 +1,91 @@
+"""results.mcap: poses and maps as ROS 2 messages, for Foxglove and RViz beside the original log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Matrix, Points, Pose
+from pipeline.logs import Log
+from pipeline.logs.frames import MovingFrame, moving_frame
+from pipeline.logs.pack import (
+    ORIGIN,
+    Link,
+    pack_cloud,
+    pack_grid,
+    pack_odometry,
+    pack_path,
+    pack_transforms,
+    place,
+)
+from pipeline.logs.write import LogWriter
+from pipeline.maps import read_map, read_ply
+from pipeline.runs.step_table import StepTable
+from pipeline.slam import SlamResult
+
+FILE = "results.mcap"
+_WORLD, _ODOM = "world", "odom"
+_PLANAR = [0, 1, 5]  # x, y, yaw among x, y, z, roll, pitch, yaw
+
+
+def write_results_mcap(folder: Path, log: Log, steps: StepTable, result: SlamResult) -> None:
+    """Write /tf and /odometry scan by scan, and /path, /map and /map_cloud at the log time of the first.
+
+    world → odom is the correction by loop closures, odom → the robot the odometry; the robot's frame is the root
+    of the log's fixed transforms, so that the log's own sensors follow it. ``folder`` holds the maps.
+    """
+    moving = moving_frame(log)
+    first_ns, first_log_ns = steps.rows[0].stamp_ns, steps.rows[0].log_time_ns
+    with LogWriter(folder / FILE) as writer:
+        trajectory = result.trajectory
+        path = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
+        data = pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), path)
+        writer.append("/path", "nav_msgs/msg/Path", data, first_ns, first_log_ns)
+        cells, resolution_m, (x_m, y_m) = read_map(folder)
+        data = pack_grid(first_ns, _WORLD, cells, resolution_m, ORIGIN._replace(x=x_m, y=y_m))
+        writer.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
+        data = pack_cloud(first_ns, _WORLD, _rows(read_ply(folder / "map.ply")))
+        writer.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)
+        _write_motion(writer, moving, steps, trajectory.poses)
+
+
+def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
+    """A covariance (6, 6) as nav_msgs/Odometry tells it: x, y, z, and turns about the fixed axes of its frame.
+
+    covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); None, where a
+        direction is undetermined, becomes zeros, which stand for unknown
+    T : that frame's pose
+    """
+    spread = np.zeros((6, 6))
+    if covariance is None:
+        return spread
+    places = _PLANAR if len(covariance) == 3 else list(range(6))
+    spread[np.ix_(places, places)] = covariance
+    turn = np.kron(np.eye(2), lie.lift(T)[:3, :3])
+    return turn @ spread @ turn.T
+
+
+def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, poses: Matrix) -> None:
+    T_lidar_frame = moving.T_lidar_frame
+    adjoint = lie.adjoint(lie.inverse(T_lidar_frame))
+    for row, T_world_lidar, covariance in zip(steps.rows, poses, steps.covariances(), strict=True):
+        T_odom_frame = row.T_odom_lidar @ T_lidar_frame
+        T_world_odom = T_world_lidar @ lie.inverse(row.T_odom_lidar)
+        here = place(T_odom_frame)
+        links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
+        data = pack_transforms(row.stamp_ns, *links)
+        writer.append("/tf", "tf2_msgs/msg/TFMessage", data, row.stamp_ns, row.log_time_ns)
+        told = None if covariance is None else adjoint @ covariance @ adjoint.T
+        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(told, T_odom_frame))
+        writer.append("/odometry", "nav_msgs/msg/Odometry", data, row.stamp_ns, row.log_time_ns)
+
+
+def _rows(points: Points) -> NDArray[np.void]:
+    """Points (N, d) as rows of x, y, z, which is 0 in the plane."""
+    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"])
+    for axis in range(points.shape[1]):
+        rows["xyz"[axis]] = points[:, axis]
+    return rows

@@ -1,0 +1,212 @@
+"""Judging how a damaged log is read: in time, in bounded memory, InputErrors alone, all that is whole kept."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import tempfile
+import traceback
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import recorders
+from mcap.reader import make_reader
+from mutations import Seed, cut_at, mutant, mutated_message
+from naive_logs import STAMP_NS, cloud_said, odometry, odometry_said, office, point_cloud, write
+
+from pipeline.config import LogConfig
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+from pipeline.logs.cdr import MalformedMessageError
+from pipeline.logs.laser_scan import LaserScanDecoder
+from pipeline.logs.limits import RangeLimits
+from pipeline.logs.point_cloud import PointCloudDecoder
+from pipeline.logs.point_times import PointTimes
+from pipeline.logs.readers import (
+    cloud_reader,
+    has_poses,
+    has_transforms,
+    is_cloud,
+    is_scan,
+    pose_reader,
+    scan_reader,
+    transforms_reader,
+)
+from pipeline.logs.records import Channel
+
+LONGEST_S = 5.0
+MOST_BYTES = 500_000_000
+
+
+class Hang(BaseException):
+    """A case that took too long."""
+
+
+def seeds(folder):
+    """Small healthy files of every make: chunked and not, compressed, summarised, with and without CRCs."""
+    clouds = [
+        cloud_said(cloud.stamp_ns, point_cloud(cloud.stamp_ns, cloud.rows)) for cloud in recorders.clouds(8, 20)
+    ]
+    clouds += [odometry_said(STAMP_NS + k, odometry(STAMP_NS, k, 0.0)) for k in range(4)]
+    makes = [
+        ("office", office(16), {"compression": compression, "summary": summary, "crcs": crcs})
+        for compression in ("none", "lz4", "zstd")
+        for summary, crcs in ((True, True), (False, True), (True, False))
+    ]
+    makes += [("loose", office(12), {"chunked": False, "summary": summary}) for summary in (True, False)]
+    makes += [("clouds", clouds, {"compression": compression}) for compression in ("none", "zstd")]
+    for number, (name, said, options) in enumerate(makes):
+        path = write(folder / f"{name}_{number}.mcap", said, chunk_size=1500, **options)
+        yield seed_of(path, f"{name} {options}", has_crcs=options.get("crcs", name != "loose"))
+
+
+def seed_of(path, name, *, has_crcs):
+    log = open_log(path)
+    scans = {scan.log_time_ns: _content(scan) for scan in log.scans()}
+    return Seed(name, path.read_bytes(), scans, log.lidar.key[1], has_crcs)
+
+
+def mutants(seed, rng, count):
+    """Cuts at every boundary of its records and beside them, then ``count`` random ones."""
+    for record in seed.records:
+        for length in (record.begin, record.begin + 1, record.begin + 9, record.end - 1):
+            yield cut_at(seed, length)
+    for _ in range(count):
+        yield mutant(seed, rng)
+
+
+def complaint(seed, damaged, path):
+    """What is wrong with how a damaged file is read, empty where nothing is."""
+    path.write_bytes(damaged.data)
+    before = _peak_bytes()
+    try:
+        with at_most(LONGEST_S):
+            scans, told = read(path)
+    except Hang:
+        return f"takes more than {LONGEST_S} s"
+    except Exception:
+        return traceback.format_exc()
+    if _peak_bytes() - before > MOST_BYTES:
+        return f"took {(_peak_bytes() - before) >> 20} MB more"
+    return _verdict(seed, damaged, scans, told)
+
+
+def read(path):
+    """The scans recovered, as (stamp, points), and the lines told about what was not."""
+    scans = []
+    try:
+        log = open_log(path, LogConfig(bad_scans="skip"))
+        for scan in log.scans():
+            scans.append((scan.log_time_ns, _content(scan)))
+    except InputError as error:
+        assert "\n" not in str(error) and str(path) in str(error), f"no line of ours: {error}"
+        return scans, [str(error)]
+    return scans, log.damage
+
+
+def _verdict(seed, damaged, scans, told):
+    expected = seed.expected(damaged.touched)
+    counted = Counter(scans)
+    missing = sorted(time_ns for time_ns in expected if not counted[time_ns, seed.scans[time_ns]])
+    if missing:
+        return f"{len(missing)} of {len(expected)} untouched scans are missing ({missing[:3]}); told: {told}"
+    lost = [time_ns for time_ns, content in seed.scans.items() if not counted[time_ns, content]]
+    if lost and not told and seed.has_crcs and not damaged.is_seamless:
+        return f"{len(lost)} scans are missing or changed and nothing is told"
+    return ""
+
+
+def payload_complaints(folder, rng, count):
+    """What decoders do with damaged messages other than decode them or call them malformed."""
+    said = list(_messages(folder))
+    for number in range(count):
+        channel, data, decode = said[number % len(said)]
+        changed = mutated_message(data, rng)
+        before = _peak_bytes()
+        try:
+            with at_most(LONGEST_S), np.errstate(all="ignore"):
+                decode(memoryview(changed))
+        except MalformedMessageError as error:
+            if "\n" in str(error):
+                yield f"{channel.type_name}: more than a line: {error}"
+        except Hang:
+            yield f"{channel.type_name}: takes more than {LONGEST_S} s: {changed!r}"
+        except Exception:
+            yield f"{channel.type_name} in {channel.encoding}: {changed!r}\n{traceback.format_exc()}"
+        if _peak_bytes() - before > MOST_BYTES:
+            yield f"{channel.type_name}: took {(_peak_bytes() - before) >> 20} MB: {changed!r}"
+
+
+def _messages(folder):
+    """One or several messages of every type and encoding that is understood, each with its decoder."""
+    for path in _recorded(folder):
+        with path.open("rb") as stream:
+            for schema, channel, message in make_reader(stream).iter_messages():
+                known = Channel(
+                    (0, channel.id), channel.topic, channel.message_encoding, schema.id, schema.name,
+                    schema.encoding, schema.data,
+                )  # fmt: skip
+                yield known, message.data, decoder_of(known)
+
+
+def decoder_of(channel):
+    limits = RangeLimits(0.0, float("inf"))
+    if is_scan(channel):
+        return LaserScanDecoder(limits, scan_reader(channel)).decode
+    if is_cloud(channel):
+        return PointCloudDecoder(limits, PointTimes(LogConfig()), cloud_reader(channel)).decode
+    if has_transforms(channel):
+        return transforms_reader(channel)
+    assert has_poses(channel), channel
+    return pose_reader(channel, 2)
+
+
+def _recorded(folder):
+    for name, store in (("ros1", recorders.ROS1), ("ros2", recorders.ROS2)):
+        ros = recorders.Ros(store)
+        livox, echoes = "livox_ros_driver2/msg/CustomMsg", "sensor_msgs/msg/MultiEchoLaserScan"
+        told = [*ros.drive(), *ros.sweeps()]
+        told += [
+            ("/livox", livox, cloud.stamp_ns, ros.livox(cloud, "livox_ros_driver2"))
+            for cloud in recorders.clouds(1)
+        ]
+        told += [("/echoes", echoes, scan.stamp_ns, ros.multi_echo(scan)) for scan in recorders.planar(1)]
+        yield recorders.mcap_of(folder / f"{name}.mcap", ros, told)
+    for name, said in (("scan", recorders.planar(1)), ("cloud", recorders.clouds(1))):
+        yield recorders.foxglove_protobuf(folder / f"protobuf_{name}.mcap", said)
+        yield recorders.foxglove_json(folder / f"json_{name}.mcap", said)
+
+
+@contextmanager
+def at_most(seconds):
+    """Raise Hang in what takes longer."""
+
+    def ring(*_):
+        raise Hang
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _content(scan):
+    return scan.stamp_ns, scan.points.tobytes()
+
+
+def _peak_bytes():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def file_complaints(seed, rng, count):
+    """Each damaged file that is read badly: (what was done, what is wrong)."""
+    with tempfile.TemporaryDirectory() as folder:
+        for damaged in mutants(seed, rng, count):
+            wrong = complaint(seed, damaged, Path(folder) / "damaged.mcap")
+            if wrong:
+                yield damaged, wrong

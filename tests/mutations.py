@@ -1,0 +1,222 @@
+"""Damage done to MCAP files on purpose, and which of their scans no damage has touched."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from functools import cache
+
+import lz4.frame
+import numpy as np
+import zstandard
+
+MAGIC = b"\x89MCAP0\r\n"
+SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 3, 4, 5, 6, 11, 15
+LIES = (0, 1, 8, 2**31 - 1, 2**32 - 1, 2**40, 2**63, 2**64 - 1)
+BOMB_BYTES = 900_000_000
+
+
+@dataclass
+class Record:
+    """A record at the top level of a file, from ``begin`` to ``end``; the log times of the scans in it."""
+
+    opcode: int
+    begin: int
+    end: int
+    times_ns: set[int] = field(default_factory=set)
+    defines: bool = False
+
+    def is_touched(self, touched):
+        return any(begin < self.end and end > self.begin for begin, end in touched)
+
+
+@dataclass
+class Seed:
+    """A healthy file: its bytes, its records, and the scans in it by log time."""
+
+    name: str
+    data: bytes
+    scans: dict[int, tuple[int, bytes]]
+    lidar: int
+    has_crcs: bool
+    records: list[Record] = field(default_factory=list)
+
+    def __post_init__(self):
+        self.records = list(_records(self.data, self.lidar))
+
+    @property
+    def is_summarised(self):
+        return any(record.opcode == STATISTICS for record in self.records)
+
+    def expected(self, touched):
+        """Log times of the scans that lie in records, and are described by others, which nothing has touched."""
+        if not self._is_described(touched):
+            return set()
+        whole = [r for r in self.records if r.opcode in (CHUNK, MESSAGE) and not r.is_touched(touched)]
+        return {time_ns for record in whole for time_ns in record.times_ns} & set(self.scans)
+
+    def _is_described(self, touched):
+        """Whether the channels are told in the summary or the data, and no other telling can be false unseen."""
+        end = next(r.begin for r in self.records if r.opcode == DATA_END)
+        groups = (
+            [r for r in self.records if r.defines and r.begin < end],
+            [r for r in self.records if r.begin >= end],
+        )
+        sound = [not any(r.is_touched(touched) for r in group) for group in groups]
+        told = [any(r.defines for r in group) for group in groups]
+        said = [good for good, there in zip(sound, told, strict=True) if there]
+        return any(said) if self.has_crcs and any(r.opcode == CHUNK for r in self.records) else all(said)
+
+
+@dataclass
+class Mutant:
+    """A damaged file, what was done to it, and the bytes of the healthy one that were touched.
+
+    ``is_seamless`` where a whole chunk is gone from a file that counts its chunks nowhere: nothing can tell.
+    """
+
+    data: bytes
+    what: str
+    touched: list[tuple[int, int]]
+    is_seamless: bool = False
+
+
+def mutant(seed, rng):
+    """A file damaged in one or several ways."""
+    kinds = (flipped, overwritten, lying, lying, lying, spliced, cut, bombed)
+    return kinds[rng.integers(len(kinds))](seed, rng)
+
+
+def flipped(seed, rng):
+    data = bytearray(seed.data)
+    places = rng.integers(8, len(data), rng.integers(1, 9)).tolist()
+    for at in places:
+        data[at] ^= 1 << rng.integers(8)
+    return Mutant(bytes(data), f"bits flipped at {places}", [(at, at + 1) for at in places])
+
+
+def overwritten(seed, rng):
+    begin = int(rng.integers(8, len(seed.data)))
+    filling = (bytes(64), b"\xff" * 64, rng.bytes(64), MAGIC * 8)[rng.integers(4)][: rng.integers(1, 65)]
+    end = min(begin + len(filling), len(seed.data))
+    data = seed.data[:begin] + filling[: end - begin] + seed.data[end:]
+    return Mutant(data, f"bytes {begin} to {end} overwritten with {filling[:8]!r}...", [(begin, end)])
+
+
+def lying(seed, rng):
+    """A number in the head of some record is another: its opcode, length, or any number behind."""
+    record = seed.records[rng.integers(len(seed.records))]
+    size = int(rng.choice([1, 2, 4, 8]))
+    offset = int(rng.choice([0, 1, 9, 11, 13, 17, 25, 33, 37, 41, 45]))
+    at = min(record.begin + offset, len(seed.data) - size)
+    true = int.from_bytes(seed.data[at : at + size], "little")
+    near = [true + 1, true - 1, 2 * true, true // 2, true + len(seed.data) // 2]
+    value = int(rng.choice(near) if rng.integers(2) else LIES[rng.integers(len(LIES))]) % (1 << 8 * size)
+    data = seed.data[:at] + value.to_bytes(size, "little") + seed.data[at + size :]
+    return Mutant(data, f"{size} bytes at {at} say {value} instead of {true}", [(at, at + size)])
+
+
+def spliced(seed, rng):
+    """Bytes or whole records left out, written twice, or moved in from elsewhere."""
+    if rng.integers(2):
+        begin, end = sorted(int(at) for at in rng.integers(8, len(seed.data), 2))
+        end = min(end, begin + 500)
+    else:
+        record = seed.records[rng.integers(len(seed.records))]
+        begin, end = record.begin, record.end
+    piece = seed.data[begin:end]
+    if rng.integers(2):
+        what = f"bytes {begin} to {end} left out"
+        seamless = not seed.is_summarised and any(record.begin == begin for record in seed.records)
+        return Mutant(seed.data[:begin] + seed.data[end:], what, [(begin, end)], seamless)
+    at = int(rng.integers(8, len(seed.data))) if rng.integers(2) else end
+    data = seed.data[:at] + piece + seed.data[at:]
+    return Mutant(data, f"bytes {begin} to {end} written once more at {at}", [(at - 1, at + 1)])
+
+
+def cut(seed, rng):
+    return cut_at(seed, int(rng.integers(1, len(seed.data))))
+
+
+def cut_at(seed, length):
+    return Mutant(seed.data[:length], f"cut off at byte {length}", [(length, len(seed.data))])
+
+
+def bombed(seed, rng):
+    """A chunk's contents are zeros without end, and its head admits some of them."""
+    chunks = [record for record in seed.records if record.opcode == CHUNK]
+    if not chunks:
+        return flipped(seed, rng)
+    chunk = chunks[rng.integers(len(chunks))]
+    name = ("zstd", "lz4")[rng.integers(2)]
+    admitted = int(rng.choice([BOMB_BYTES, 1 << 20, 1 << 25, 1 << 27, 1 << 62]))
+    payload = bomb(name)
+    head = seed.data[chunk.begin + 9 : chunk.begin + 25] + struct.pack("<QI", admitted, 0)
+    body = head + struct.pack("<I", len(name)) + name.encode() + struct.pack("<Q", len(payload)) + payload
+    record = struct.pack("<BQ", CHUNK, len(body)) + body
+    data = seed.data[: chunk.begin] + record + seed.data[chunk.end :]
+    what = f"the chunk at byte {chunk.begin} is a {name} bomb that admits {admitted} bytes"
+    return Mutant(data, what, [(chunk.begin, chunk.end)])
+
+
+@cache
+def bomb(name):
+    """Much of the same, compressed without saying how much it is: zeros in one form, messages in the other."""
+    packer = zstandard.ZstdCompressor().compressobj() if name == "zstd" else lz4.frame.LZ4FrameCompressor()
+    parts = [packer.begin()] if name == "lz4" else []
+    filling = bytes(12_400) if name == "zstd" else struct.pack("<BQHIQQ12369x", MESSAGE, 12_391, 1, 0, 0, 0)
+    parts += [packer.compress(filling * 1000) for _ in range(BOMB_BYTES // 12_400_000)]
+    return b"".join([*parts, packer.flush()])
+
+
+def mutated_message(data, rng):
+    """A message damaged in one place or several, cut short, or made longer."""
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        at = int(rng.integers(0, max(1, len(changed))))
+        kind = rng.integers(5)
+        if kind == 0 and changed:
+            changed[at] ^= 1 << rng.integers(8)
+        elif kind == 1:
+            del changed[at:]
+        elif kind == 2:
+            size = int(rng.choice([1, 4, 8]))
+            at -= at % 4
+            changed[at : at + size] = (LIES[rng.integers(len(LIES))] % (1 << 8 * size)).to_bytes(size, "little")
+        elif kind == 3:
+            number = float(rng.choice([np.nan, np.inf, -np.inf, 1e38, -0.0]))
+            at -= at % 4
+            changed[at : at + 4] = struct.pack("<f", number)
+        else:
+            changed[at:at] = rng.bytes(rng.integers(1, 20))
+    return bytes(changed)
+
+
+def _records(data, lidar):
+    offset = len(MAGIC)
+    while offset < len(data) - len(MAGIC):
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        begin, offset = offset, offset + 9 + length
+        record = Record(opcode, begin, offset, defines=opcode in (SCHEMA, CHANNEL))
+        inside = _unpacked(data[begin + 9 : offset]) if opcode == CHUNK else data[begin:offset]
+        for inner, body in _walk(inside) if opcode in (CHUNK, MESSAGE) else ():
+            if inner == MESSAGE and struct.unpack_from("<H", body)[0] == lidar:
+                record.times_ns.add(struct.unpack_from("<Q", body, 6)[0])
+            record.defines |= inner in (SCHEMA, CHANNEL)
+        yield record
+
+
+def _walk(data):
+    offset = 0
+    while offset < len(data):
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        yield opcode, data[offset + 9 : offset + 9 + length]
+        offset += 9 + length
+
+
+def _unpacked(body):
+    (size,) = struct.unpack_from("<I", body, 28)
+    name, stored = body[32 : 32 + size], body[40 + size :]
+    if name == b"zstd":
+        return zstandard.decompress(stored, max_output_size=1 << 20)
+    return lz4.frame.decompress(stored) if name == b"lz4" else stored
