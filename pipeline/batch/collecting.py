@@ -22,7 +22,10 @@ def collect(named: Sequence[Path], manifests: Sequence[Path]) -> tuple[Path, ...
         paths += _matched(_listed(manifest), str(manifest))
     if not paths:
         raise InputError("no log is named; name some, or a --manifest that does")
-    return tuple({path.resolve(): path for path in reversed(paths)}.values())[::-1]
+    first: dict[Path, Path] = {}
+    for path in paths:
+        first.setdefault(path.resolve(), path)
+    return tuple(first.values())
 
 
 def _listed(manifest: Path) -> list[Path]:

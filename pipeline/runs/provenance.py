@@ -47,8 +47,14 @@ class Provenance(Struct, frozen=True):
     versions: dict[str, str]
 
     def write(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+        """Write as JSON, whole or not at all."""
+        new = path.with_name(f"{path.name}.new")
+        try:
+            new.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+            new.replace(path)
+        except OSError:
+            new.unlink(missing_ok=True)
+            raise
 
     def hashed(self, hashing: Hashing) -> Provenance:
         """With the hashes of its logs, waited for."""
