@@ -94,7 +94,7 @@ def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(offi
 @pytest.mark.parametrize(
     "name, count, changes",
     [
-        ("office", 300, {"loops.min_travel_m": 3.0, "loops.optimise_every": 2}),
+        ("office", 300, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
         ("2d/intel.mcap", 400, {"matching.matcher": "svd", "loops.enabled": False}),
         ("3d/kitti_0001_first54.mcap", 54, {"loops.min_travel_m": 3.0, "loops.place_radius_m": 4.0}),
     ],
