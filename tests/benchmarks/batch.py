@@ -1,6 +1,6 @@
 """How a batch grows with its workers: ``python -m tests.benchmarks.batch [LOGS]``.
 
-The same logs with one worker and with two, in turn, three rounds; the ratio of the medians. Nothing else should run.
+The same logs with one worker and with two, in turn, three rounds; the ratio of the medians. On an idle machine.
 """
 
 import sys
