@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.batch import batch
 from pipeline.commands.compare import compare
 from pipeline.commands.config import config
 from pipeline.commands.convert import convert
@@ -46,7 +47,9 @@ def scanchain() -> None:
     """
 
 
-_COMMANDS = (run, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config, sequence)
+_COMMANDS = (
+    run, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config, sequence,
+)  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)
 

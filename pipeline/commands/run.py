@@ -42,6 +42,15 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: a TUM file or a topic. [default: /ground_truth]")
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
+@click.option("--resume", is_flag=True, help="Go on from the last checkpoint of a run that was killed or stopped.")
+@click.option(
+    "--checkpoint",
+    type=click.FloatRange(0.0),
+    default=10.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time between checkpoints; at most a twentieth of it goes into them.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context
 def run(
@@ -52,6 +61,8 @@ def run(
     rerun: str,
     gt: str | None,
     force: bool,
+    resume: bool,
+    checkpoint: float,
     as_json: bool,
     **shortcuts: str | bool | None,
 ) -> None:
@@ -67,6 +78,7 @@ def run(
       scanchain run intel.clf.bz2 --out runs/intel
       scanchain run scans/ --out runs/scans --log.rate_hz 10
       scanchain run part_0.mcap part_1.mcap --out runs/log --topic /lidar_front/points
+      scanchain run log.mcap --out runs/log --resume
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
@@ -83,6 +95,8 @@ def run(
         sinks=_sinks(rerun),
         ground_truth=truth_file,
         force=force,
+        resume=resume,
+        checkpoint_s=checkpoint,
         command=tuple(sys.argv),
     )
     viewing: Viewing = ctx.obj

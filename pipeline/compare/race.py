@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.compare.memory import available_mib
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import Outcome, Status, read_outcome
 from pipeline.compare.scan_store import StoredScans
-from pipeline.compare.watch import Limits, run_watched
+from pipeline.compare.watch import run_watched
+from pipeline.memory import available_mib
 from pipeline.runs.progress import Progress
+from pipeline.watched import Limits
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # of the time limit
 _SHARE = 0.75  # of the memory that is free

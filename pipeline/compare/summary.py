@@ -13,10 +13,10 @@ from pipeline.compare.maps import sharpness_of
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import EndReport, Status
 from pipeline.compare.table import Row, Table
-from pipeline.compare.watch import Limits
 from pipeline.evaluate import Sharpness, disagreement
 from pipeline.logs import Log
 from pipeline.runs.provenance import Provenance, package_version
+from pipeline.watched import Limits
 
 
 def summarise(evidence: Evidence, log: Log, limits: Limits, provenance: Provenance) -> Table:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.lib.format import open_memmap
 
 from pipeline.compare import runner
-from pipeline.compare.memory import die_first, peak_mib
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import (
     CPU_FILE,
@@ -31,6 +30,7 @@ from pipeline.compare.outcome import (
 from pipeline.compare.scan_store import StoredScans, open_store
 from pipeline.data import Trajectory
 from pipeline.errors import MissingExtraError
+from pipeline.memory import die_first, peak_mib
 
 METHOD_FILE = "method.msgpack"
 WARM_UP_SCANS = 4

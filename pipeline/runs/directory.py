@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+from glob import escape
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+import psutil
 
 from pipeline.errors import InputError
 
@@ -25,8 +28,10 @@ class RunDirectory:
     destination : the name it will have; path : where its files are now
     """
 
-    def __init__(self, destination: Path, *, force: bool) -> None:
+    def __init__(self, destination: Path, *, force: bool, left: Path | None = None) -> None:
+        """Left : a directory marked partial that is gone on with instead of an empty one."""
         _check(destination, force)
+        self.left = left
         self.destination = destination.resolve()
         self.force = force
         self.path = self.destination.with_name(f"{self.destination.name}.partial-{os.getpid()}")
@@ -35,9 +40,13 @@ class RunDirectory:
     def __enter__(self) -> Self:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            if self.path.exists():  # a dead process had the same number
+            if self.path.exists() and self.path != self.left:  # a dead process had the same number
                 shutil.rmtree(self.path)
-            self.path.mkdir()
+            if self.left is None:
+                self.path.mkdir()
+            else:
+                self.left.rename(self.path)
+                self.is_worth_keeping = True
         except OSError as error:
             raise InputError(
                 f"{self.destination}: cannot be made ({error.strerror}); choose another --out"
@@ -66,6 +75,35 @@ class RunDirectory:
         self.path.rename(self.destination)
         self.path = self.destination
         shutil.rmtree(old, ignore_errors=True)
+
+
+def left_behind(destination: Path, marked_by: str) -> Path | None:
+    """The latest directory marked partial that holds the file ``marked_by``; None where there is none.
+
+    Raises InputError where the process that writes it still runs.
+    """
+    destination = destination.resolve()
+    left = [
+        path
+        for path in destination.parent.glob(f"{escape(destination.name)}.partial-*")
+        if (path / marked_by).is_file() and (path / RUN_FILE).is_file()
+    ]
+    if not left:
+        return None
+    latest = max(left, key=lambda path: (path / marked_by).stat().st_mtime_ns)
+    number = latest.name.rpartition("-")[2]
+    if number.isdigit() and int(number) != os.getpid() and _is_written_by(int(number), latest / RUN_FILE):
+        raise InputError(f"{latest}: is being written by process {number}; wait for its end or stop it")
+    return latest
+
+
+def _is_written_by(pid: int, run_file: Path) -> bool:
+    """Whether that process was there when the file was written; a later one has the number by chance."""
+    try:
+        process = psutil.Process(pid)
+        return process.status() != psutil.STATUS_ZOMBIE and process.create_time() < run_file.stat().st_mtime
+    except psutil.Error:
+        return False
 
 
 def _check(destination: Path, force: bool) -> None:

@@ -47,8 +47,14 @@ class Provenance(Struct, frozen=True):
     versions: dict[str, str]
 
     def write(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+        """Write as JSON, whole or not at all."""
+        new = path.with_name(f"{path.name}.new")
+        try:
+            new.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
+            new.replace(path)
+        except OSError:
+            new.unlink(missing_ok=True)
+            raise
 
     def hashed(self, hashing: Hashing) -> Provenance:
         """With the hashes of its logs, waited for."""
@@ -99,22 +105,24 @@ class Hashing:
 
     def _work(self) -> None:
         for path in self._paths:
-            digest = hashlib.sha256()
-            try:
-                for file in files_of(path):
-                    if path.is_dir():
-                        digest.update(file.relative_to(path).as_posix().encode() + b"\0")
-                    self._feed(digest, file)
-            except OSError:
-                continue
-            if self._cancelled.is_set():
-                return
-            self._digests[path] = digest.hexdigest()
+            self._digests[path] = sha256_of(path, self._cancelled)
 
-    def _feed(self, digest: hashlib._Hash, path: Path) -> None:
-        with path.open("rb") as file:
-            while (block := file.read(_BLOCK)) and not self._cancelled.is_set():
-                digest.update(block)
+
+def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
+    """SHA-256 of a file, or of a folder as of a ``LogFile``; empty where it cannot be read or was cancelled."""
+    digest = hashlib.sha256()
+    try:
+        for file in files_of(path):
+            if path.is_dir():
+                digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+            with file.open("rb") as stream:
+                while block := stream.read(_BLOCK):
+                    if cancelled is not None and cancelled.is_set():
+                        return ""
+                    digest.update(block)
+    except OSError:
+        return ""
+    return digest.hexdigest()
 
 
 def package_version(package: str) -> str:

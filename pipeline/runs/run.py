@@ -16,15 +16,18 @@ from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError, ScanchainError
 from pipeline.logs import Log, open_log
+from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoints
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.directory import RUN_FILE, RunDirectory
+from pipeline.runs.journal import JOURNAL_FILE, Journal
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
+from pipeline.runs.resuming import Left, after, find_left, set_aside_recording
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
@@ -50,6 +53,8 @@ class Job:
     sinks : where the recording goes
     ground_truth : a TUM file; None where the log's own is good
     force : whether a run directory of that name is replaced
+    resume : whether to go on from the last checkpoint of a run that was killed, where there is one
+    checkpoint_s : seconds between two checkpoints, or more where they are large
     command : the command line, for run.json
     """
 
@@ -60,6 +65,8 @@ class Job:
     sinks: frozenset[SinkName] = frozenset({"save"})
     ground_truth: Path | None = None
     force: bool = False
+    resume: bool = False
+    checkpoint_s: float = 10.0
     command: tuple[str, ...] = ()
 
 
@@ -89,18 +96,23 @@ def run(
     _check_distinct(job.logs)
     reference = None if job.ground_truth is None else read_tum(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
-    directory = RunDirectory(job.out, force=job.force)
+    RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
+    left = find_left(job.out, dump(settings.config)) if job.resume else None
+    directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
-    steps = StepTable()
+    steps = StepTable() if left is None else left.steps
+    if left is not None:
+        started -= left.checkpoint.run_s
+        progress.tell(f"going on after {len(steps):,} scans of {left.folder.name}")
     with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress):
         provenance.write(directory.path / RUN_FILE)
         (directory.path / "config.toml").write_text(dump(settings.config), encoding="utf-8")
         try:
-            recorded = _process(job, log, settings.config, directory.path, record, progress, steps)
+            recorded = _process(job, log, settings.config, directory.path, record, progress, steps, left)
             truth, note = _judge(job, log, recorded.result, reference, directory.path)
             warnings = (*log.damage, *recorded.warnings, *note)
             run_s = perf_counter() - started - recorded.held_s
@@ -152,9 +164,15 @@ def _process(
     record: OpenRecorder,
     progress: Progress,
     steps: StepTable,
+    left: Left | None,
 ) -> _Recorded:
     """Every scan through the chain and into the recording, then the results into files."""
-    slam = Slam(config, log.T_base_lidar)
+    slam, scans, notes = Slam(config, log.T_base_lidar), log.scans(), ()
+    if left is not None:
+        slam, scans = left.checkpoint.slam, after(tuple(steps.rows), scans, left.folder)
+        notes = _resumed(folder, len(steps))
+    journal = Journal(folder / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
+    checkpoints = Checkpoints(folder, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
     recorder = record(
         folder / "recording.rrd",
         dimension=log.dimension,
@@ -162,12 +180,15 @@ def _process(
         sinks=job.sinks,
         config=config.recording,
     )
-    with recorder as recording:
+    with recorder as recording, journal:
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
-        for step in map(slam.process, progress.track(log.scans(), log.scan_count)):
+        for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
             recording.log(step)
-            steps.append(step)
+            journal.append(steps.append(step))
+            checkpoints.look(slam, len(steps))
+        if progress.stopped:
+            checkpoints.write(slam, len(steps))
         progress.say("optimising and writing")
         result = slam.finish()
         judged = final_verdicts(result.closures, result.state)
@@ -177,7 +198,13 @@ def _process(
         if config.outputs.mcap:
             write_results_mcap(folder, log, steps, result)
         held_s = _hold(recording, progress)
-    return _Recorded(result, cloud, judged, tuple(recording.warnings), held_s)
+    return _Recorded(result, cloud, judged, (*notes, *recording.warnings), held_s)
+
+
+def _resumed(folder: Path, scans: int) -> tuple[str, ...]:
+    """What to say of a run that went on after so many scans."""
+    before = set_aside_recording(folder)
+    return (f"went on after {scans:,} scans" + (f"; the recording up to there is {before}" if before else ""),)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:
@@ -233,6 +260,8 @@ def _complete(
         return _report(directory.path, report)
     replaced = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=duration_s)
     replaced.write(directory.path / RUN_FILE)
+    for file in (JOURNAL_FILE, CHECKPOINT_FILE):
+        (directory.path / file).unlink(missing_ok=True)
     warnings = _report(directory.path, report)
     directory.complete()
     return warnings
@@ -256,16 +285,33 @@ def _rescued(
         return error
     directory.worth_keeping()
     reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
-    msgspec.structs.replace(provenance, stopped=reason).write(directory.path / RUN_FILE)
-    if is_bug:
-        text = "".join(traceback.format_exception(error))
-        (directory.path / "traceback.txt").write_text(text, encoding="utf-8")
-    if len(steps) and not (directory.path / "metrics.json").exists():  # else the results are better
-        write_tum(directory.path / "odometry.tum", steps.odometry)
-        steps.write(directory.path / "steps.parquet", steps.best_known)
     what = "traceback.txt and the " if is_bug else ""
     where = f"{what}{len(steps):,} scans until then are in {directory.path}"
+    try:
+        _keep(
+            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
+        )
+    except OSError as failure:
+        where = (
+            f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone ({failure.strerror})"
+        )
     if isinstance(error, InputError):
         return InputError(f"{error}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""
     return PartialRunError(f"{kind}{reason}; {where}")
+
+
+def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
+    """Write what there is. Raises OSError where the disk is full, after which nothing half-written is left."""
+    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
+    try:
+        provenance.write(folder / RUN_FILE)
+        if bug is not None:
+            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
+        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
+            write_tum(written[0], steps.odometry)
+            steps.write(written[1], steps.best_known)
+    except OSError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise

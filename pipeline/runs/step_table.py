@@ -41,8 +41,8 @@ class StepTable:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def append(self, step: Step) -> None:
-        """Keep one step."""
+    def append(self, step: Step) -> StepRow:
+        """Keep one step; what is kept of it."""
         scan = step.scan
         self.rows.append(
             StepRow(
@@ -60,6 +60,7 @@ class StepTable:
                 step.timing,
             )
         )
+        return self.rows[-1]
 
     @property
     def odometry(self) -> Trajectory:

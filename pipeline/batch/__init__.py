@@ -1,0 +1,1 @@
+"""Many logs, each in a process of its own."""

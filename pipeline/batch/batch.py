@@ -1,0 +1,153 @@
+"""Many logs: what is missing is run, each log in a process of its own, and all of them become one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Protocol
+
+from pipeline.batch.attempt import attempt
+from pipeline.batch.table import write_table
+from pipeline.batch.task import Row, State, Task, finished_row, key_of, unfinished_row
+from pipeline.errors import InputError
+from pipeline.memory import available_mib
+from pipeline.runs.provenance import sha256_of
+from pipeline.settings import Override
+
+_SHARE = 0.75  # of the memory that is free, for all workers together
+
+Work = Callable[[Sequence[Task]], Iterator[Row]]
+
+
+class BatchProgress(Protocol):
+    """Whoever watches a batch."""
+
+    def say(self, line: str) -> None:
+        """Tell something that happens."""
+        ...
+
+    def count(self, done: int, total: int) -> None:
+        """Show that so many logs of all are done."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What is to be run.
+
+    Attributes
+    ----------
+    logs : a file or folder each
+    out : the batch's directory, made or gone on with
+    config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
+    workers : processes at a time on this machine
+    time_s : what a log may take; memory_mib : as well, None for a fair share of what is free
+    retries : further tries of a log that crashed its process
+    """
+
+    logs: tuple[Path, ...]
+    out: Path
+    config_file: Path | None = None
+    overrides: tuple[Override, ...] = ()
+    arguments: tuple[str, ...] = ()
+    workers: int = 1
+    time_s: float = float("inf")
+    memory_mib: float | None = None
+    retries: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Batched:
+    """A batch that came to its end; ``kept`` of the rows are those of earlier calls."""
+
+    rows: tuple[Row, ...]
+    kept: int
+    summary: str
+
+    @property
+    def unfinished(self) -> int:
+        """How many logs have no result."""
+        return sum(row.state is not State.DONE for row in self.rows)
+
+
+def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:
+    """Run what has no result yet and write the table; logs of the same contents are run once.
+
+    work : where the tasks are run; None for processes on this machine
+    On Ctrl-C what runs is killed, and the table says what was not run. Raises InputError for a directory that
+    cannot be made and a configuration that is wrong.
+    """
+    key_of("", batch.config_file, batch.overrides)  # what is wrong with it is wrong for every log
+    try:
+        (batch.out / "rows").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{batch.out}: cannot be made ({error.strerror}); choose another --out") from error
+    tasks = _tasks(batch)
+    rows = {task.key: row for task in tasks if (row := finished_row(task)) is not None}
+    kept = sum(task.key in rows for task in tasks)
+    missing = {task.key: task for task in tasks if task.key not in rows}
+    readable = [task for task in missing.values() if task.sha256]
+    if kept:
+        progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
+    try:
+        for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
+            row.write(missing[row.key].row_file)
+            rows[row.key] = row
+            progress.say(f"{row.log}: {row.state}{row.reason and f': {row.reason}'}")
+            progress.count(kept + done, len(tasks))
+    except KeyboardInterrupt:
+        progress.say("stopped")
+    table = tuple(_row_of(task, rows) for task in tasks)
+    return Batched(table, kept, write_table(batch.out, table))
+
+
+def _tasks(batch: Batch) -> list[Task]:
+    memory_mib = batch.memory_mib
+    if memory_mib is None:
+        memory_mib = _SHARE * available_mib() / batch.workers
+    tasks = []
+    for log in batch.logs:
+        sha256 = sha256_of(log)
+        tasks.append(
+            Task(
+                log=str(log.absolute()),
+                sha256=sha256,
+                key=key_of(sha256 or str(log), batch.config_file, batch.overrides),
+                out=str(batch.out),
+                arguments=batch.arguments,
+                time_s=batch.time_s,
+                memory_mib=memory_mib,
+                retries=batch.retries,
+            )
+        )
+    return tasks
+
+
+def _row_of(task: Task, rows: dict[str, Row]) -> Row:
+    """The row of a task: its own, that of a log with the same contents, or why there is none."""
+    if task.key in rows:
+        row = rows[task.key]
+        return Row(task.log, *(getattr(row, name) for name in row.__struct_fields__[1:]))
+    if not task.sha256:
+        return unfinished_row(task, State.FAILED, "cannot be read; check the path")
+    return unfinished_row(task, State.NOT_RUN, "stopped by the user")
+
+
+def _local(workers: int) -> Work:
+    """Processes on this machine, so many at a time."""
+
+    def work(tasks: Sequence[Task]) -> Iterator[Row]:
+        stop = Event()
+        with ThreadPoolExecutor(workers, "batch") as pool:
+            futures: list[Future[Row]] = [pool.submit(attempt, task, stop) for task in tasks]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            finally:
+                stop.set()
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    return work

@@ -1,0 +1,88 @@
+"""batch.parquet: one row a log; summary.txt: how they ended, and why not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.batch.task import Row, State
+from pipeline.runs.metrics import Metrics
+
+TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
+_NUMBERS = ("scans", "dimension", "ok", "degenerate", "lost", "keyframes", "closures_tried", "closures_accepted")
+_FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "travelled_m", "chi2", "median_residual_m")
+_ERRORS = ("ate_rmse_m", "ate_share_of_path", "kitti_translation_share", "kitti_rotation_rad_per_m")
+
+
+def write_table(folder: Path, rows: Sequence[Row]) -> str:
+    """Write table and summary, each whole or not at all; the summary's text."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.schema(
+        [(name, pa.string()) for name in ("log", "sha256", "key", "run", "state", "reason")]
+        + [("tries", pa.int64()), ("duration_s", pa.float64()), ("peak_mib", pa.float64())]
+        + [(name, pa.int64()) for name in _NUMBERS]
+        + [(name, pa.float64()) for name in (*_FIGURES, *_ERRORS, "odometry_ate_rmse_m")]
+    )
+    notes = {
+        "run": "directory of the result, beside this file; empty where there is none",
+        "duration_s, peak_mib": "of the whole process of the last try",
+        "ate_*, kitti_*": "against the ground truth in the log, after optimisation; null without any",
+    }
+    table = pa.Table.from_pylist([_cells(row) for row in rows], schema=schema.with_metadata(notes))
+    pq.write_table(table, folder / f"{TABLE_FILE}.new", compression="zstd")
+    (folder / f"{TABLE_FILE}.new").replace(folder / TABLE_FILE)
+    text = summary(rows)
+    (folder / f"{SUMMARY_FILE}.new").write_text(text, encoding="utf-8")
+    (folder / f"{SUMMARY_FILE}.new").replace(folder / SUMMARY_FILE)
+    return text
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """How many ended how, what all results amount to, and each log without one."""
+    counts = Counter(row.state for row in rows)
+    ended = ", ".join(f"{counts[state]:,} {state}" for state in State if counts[state])
+    lines = [f"logs           {len(rows):,}: {ended}"]
+    results = [row.metrics for row in rows if row.metrics is not None]
+    if results:
+        lines += _totals(results)
+    lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
+    return "\n".join(lines) + "\n"
+
+
+def _totals(results: Sequence[Metrics]) -> list[str]:
+    scans, lost = sum(each.scans for each in results), sum(each.lost for each in results)
+    way_km = 1e-3 * sum(each.travelled_m for each in results)
+    hours = sum(each.log_span_s for each in results) / 3600.0
+    speed = np.array([each.times_real_time for each in results])
+    lines = [
+        f"scans          {scans:,}, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h",
+        f"speed          {np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least",
+    ]
+    errors_m = [each.ground_truth.optimised.ate_rmse_m for each in results if each.ground_truth is not None]
+    if errors_m:
+        lines.append(
+            f"ATE            rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
+            f"{len(errors_m):,} logs with ground truth"
+        )
+    return lines
+
+
+def _cells(row: Row) -> dict[str, object]:
+    metrics = row.metrics
+    cells: dict[str, object] = {
+        name: getattr(row, name) for name in ("log", "sha256", "key", "run", "reason", "tries", "duration_s")
+    }
+    cells |= {"state": str(row.state), "peak_mib": row.peak_mib}
+    if metrics is None:
+        return cells
+    cells |= {name: getattr(metrics, name) for name in (*_NUMBERS, *_FIGURES)}
+    if metrics.ground_truth is not None:
+        truth = metrics.ground_truth
+        cells |= {name: getattr(truth.optimised, name) for name in _ERRORS}
+        cells["odometry_ate_rmse_m"] = truth.odometry.ate_rmse_m
+    return cells

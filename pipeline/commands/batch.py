@@ -1,0 +1,110 @@
+"""``scanchain batch``: many logs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.errors import InputError, ScanchainError
+from pipeline.settings import Override
+
+_PATH = click.Path(path_type=Path)
+_MIB_PER_GIB = 1024.0
+
+
+@click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
+@click.argument("logs", metavar="LOG...", nargs=-1, type=_PATH)
+@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to make, or to go on with.")
+@click.option(
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="A list of logs, one a line."
+)
+@click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
+@click.option("--workers", type=click.IntRange(1), metavar="N", help="Logs at a time. [default: one a core]")
+@click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
+@click.option(
+    "--time-limit",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="SECONDS",
+    default=86400.0,
+    show_default=True,
+    help="What a log may take.",
+)
+@click.option(
+    "--memory-limit",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="GIB",
+    help="What a log may take. [default: its share of three quarters of what is free]",
+)
+@click.option(
+    "--retries",
+    type=click.IntRange(0),
+    default=1,
+    show_default=True,
+    help="Further tries of a log that crashed its process.",
+)
+@click.option("--rerun", type=click.Choice(["save", "off"]), default="off", show_default=True, help="Recordings.")
+@click.pass_context
+def batch(
+    ctx: click.Context,
+    logs: tuple[Path, ...],
+    out: Path,
+    manifests: tuple[Path, ...],
+    config: Path | None,
+    workers: int | None,
+    ray: str | None,
+    time_limit: float,
+    memory_limit: float | None,
+    retries: int,
+    rerun: str,
+) -> None:
+    """Run many logs, each in a process of its own.
+
+    LOG is a file or folder that scanchain run takes, or a pattern in quotes. A log that crashes its process, hangs
+    or takes all memory is a row that says so; the others finish, and the exit code is 1. Called again, only what
+    has no result is run: a result belongs to the log's contents and the configuration in effect. DIR gets a run
+    directory a log, batch.parquet with a row a log, and summary.txt.
+
+    \b
+    Examples:
+      scanchain batch *.mcap --out runs/all
+      scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
+      scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
+      scanchain batch --manifest logs.txt --out /shared/all --ray auto
+    """
+    from pipeline.batch.batch import Batch, run_batch
+    from pipeline.batch.cluster import on_cluster
+    from pipeline.batch.collecting import collect
+    from pipeline.commands.terminal import Terminal
+
+    if ray is not None and workers is not None:
+        raise InputError("--workers is for this machine alone; on a cluster every core takes a log")
+    changes = overrides(ctx)
+    job = Batch(
+        logs=collect(logs, manifests),
+        out=out.resolve(),
+        config_file=config,
+        overrides=changes,
+        arguments=("--rerun", rerun, *_arguments(config, changes)),
+        workers=workers or os.cpu_count() or 1,
+        time_s=time_limit,
+        memory_mib=None if memory_limit is None else _MIB_PER_GIB * memory_limit,
+        retries=retries,
+    )
+    with Terminal("logs") as terminal:
+        batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
+    click.echo(batched.summary, nl=False)
+    click.echo(f"written        {out}: batch.parquet, summary.txt; {batched.kept:,} results were there before")
+    if batched.unfinished:
+        total = len(batched.rows)
+        raise ScanchainError(
+            f"{batched.unfinished:,} of {total:,} logs have no result; {out}/summary.txt says why"
+        )
+
+
+def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:
+    """The same configuration for scanchain run."""
+    file = () if config is None else ("--config", str(config.resolve()))
+    return (*file, *(f"--{change.key}={change.text}" for change in changes))

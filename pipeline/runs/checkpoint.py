@@ -1,0 +1,90 @@
+"""state.checkpoint: the whole chain as it was after some scan, to go on from."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+from pipeline import config, data
+from pipeline.graph.growing_array import GrowingArray
+from pipeline.graph.pose_graph import PoseGraph
+from pipeline.kernels.voxels import Voxels
+from pipeline.loops.closer import LoopCloser
+from pipeline.loops.doubt import Doubt
+from pipeline.loops.gallery import Gallery
+from pipeline.loops.near_closer import NearCloser
+from pipeline.loops.place import Place
+from pipeline.loops.place_closer import PlaceCloser
+from pipeline.loops.planar_search import PlanarSearch
+from pipeline.loops.recognition import Recognition
+from pipeline.loops.submaps import Submaps
+from pipeline.loops.verification import Verifier
+from pipeline.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
+from pipeline.odometry import Odometry
+from pipeline.odometry.experience import Experience
+from pipeline.odometry.prediction import Predictor
+from pipeline.preprocess import Resolution, Sweep
+from pipeline.runs.provenance import package_version
+from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
+from pipeline.slam import Slam
+
+CHECKPOINT_FILE = "state.checkpoint"
+_LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """The chain after ``scans`` scans, which took ``run_s`` seconds; ``version`` of scanchain made it."""
+
+    version: str
+    scans: int
+    run_s: float
+    slam: Slam
+
+
+_CLASSES = Classes(
+    [
+        Checkpoint, Slam, Odometry, Predictor, Experience, Resolution, Sweep, VoxelMap, Voxels,
+        PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
+        Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
+        data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
+        config.Config, config.LogConfig, config.PreprocessConfig, config.LocalMapConfig, config.MatchingConfig,
+        config.OdometryConfig, config.LoopsConfig, config.GraphConfig, config.MapsConfig, config.RecordingConfig,
+    ],
+    {
+        (PoseGraph, "_problem"): None,
+        (PoseGraph, "_factor_is_now"): False,
+        (Submaps, "held"): OrderedDict(),
+    },
+)  # fmt: skip
+
+
+class Checkpoints:
+    """Writes the chain down every so often, and so rarely that it takes a twentieth of the time at the most."""
+
+    def __init__(self, folder: Path, every_s: float, run_s: float) -> None:
+        """run_s : that earlier processes took up to the checkpoint gone on from."""
+        self.path = folder / CHECKPOINT_FILE
+        self.every_s = every_s
+        self.began_s = perf_counter() - run_s
+        self.next_s = perf_counter() + every_s
+
+    def look(self, slam: Slam, scans: int) -> None:
+        """Write one if it is time."""
+        if perf_counter() >= self.next_s:
+            self.write(slam, scans)
+
+    def write(self, slam: Slam, scans: int) -> None:
+        """Write one. Raises OSError where the disk is full; the last one stays."""
+        started = perf_counter()
+        version = package_version("scanchain")
+        write_snapshot(self.path, Checkpoint(version, scans, started - self.began_s, slam), _CLASSES)
+        now = perf_counter()
+        self.next_s = now + max(self.every_s, _LEISURE * (now - started))
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """The last checkpoint of a run. Raises InputError for one that is damaged."""
+    return read_snapshot(folder / CHECKPOINT_FILE, _CLASSES)

@@ -1,0 +1,77 @@
+"""steps.journal: every step of a run on disk as soon as it is computed; a killed run leaves it behind."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+
+from pipeline.runs.step_table import StepRow, StepTable
+
+JOURNAL_FILE = "steps.journal"
+_HEAD = struct.Struct("<II")  # bytes of the record that follows, and their CRC-32
+
+
+class Journal:
+    """Appends a record a step; a context. Each is handed to the system before the next scan is looked at.
+
+    A record is its length and CRC-32 (both uint32, little-endian), then a StepRow in MessagePack.
+    """
+
+    def __init__(self, path: Path, *, after_bytes: int = 0) -> None:
+        """after_bytes : of an existing journal that are kept."""
+        self.file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0))
+        os.ftruncate(self.file, after_bytes)
+        os.lseek(self.file, after_bytes, os.SEEK_SET)
+        self.encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self.file)
+
+    def append(self, row: StepRow) -> None:
+        """Write one step. Raises OSError where the disk is full."""
+        body = self.encoder.encode(row)
+        record = _HEAD.pack(len(body), zlib.crc32(body)) + body
+        while record:
+            record = record[os.write(self.file, record) :]
+
+
+def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int]:
+    """The steps that a run got to before it was killed, and how many bytes of the journal they take.
+
+    folder : of the run, named ``NAME.partial-PID``; limit : steps that are read at most
+    The last record of a killed run may be torn: reading ends before the first that is not whole. ``write`` of the
+    table makes a steps.parquet, ``odometry`` and ``best_known`` are its trajectories.
+    """
+    data = (folder / JOURNAL_FILE).read_bytes()
+    decoder = msgspec.msgpack.Decoder(StepRow, dec_hook=_array)
+    steps, place = StepTable(), 0
+    while place + _HEAD.size <= len(data) and (limit is None or len(steps) < limit):
+        size, crc = _HEAD.unpack_from(data, place)
+        body = data[place + _HEAD.size : place + _HEAD.size + size]
+        if len(body) < size or zlib.crc32(body) != crc:
+            break
+        steps.rows.append(decoder.decode(body))
+        place += _HEAD.size + size
+    return steps, place
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} does not belong into a journal")
+
+
+def _array(kind: Any, value: Any) -> Any:
+    return np.array(value, np.float64)

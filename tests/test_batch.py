@@ -1,0 +1,160 @@
+"""Many logs: each is isolated, each is a row, and what is done stays done."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pyarrow.parquet as pq
+import pytest
+from scenes import ROOT
+
+from pipeline.__main__ import main
+from pipeline.batch.collecting import collect
+from pipeline.errors import InputError
+from pipeline.simulate import simulate
+
+POISON = """
+import sys
+words = " ".join(sys.argv)
+if "-m" in sys.orig_argv and "crashing" in words:
+    import ctypes
+    ctypes.string_at(0)
+if "-m" in sys.orig_argv and "hungry" in words:
+    import time
+    eaten = []
+    for _ in range(64):
+        eaten.append(b"x" * (64 << 20))
+        time.sleep(0.05)
+"""
+
+
+@pytest.fixture(scope="module")
+def drawers(tmp_path_factory):
+    """24 logs of two seconds each, no two alike, one in a drawer of its own; two of them are poison."""
+    folder = tmp_path_factory.mktemp("logs")
+    names = [f"log_{k:02}" for k in range(22)] + ["crashing", "hungry"]
+    for seed, name in enumerate(names):
+        simulate("office", folder / f"{name}.mcap", duration_s=2.0, seed=seed)
+    return folder
+
+
+@pytest.fixture
+def poisoned(tmp_path, monkeypatch):
+    """Interpreters in which two of the logs crash the process, or eat its memory."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(POISON)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}")
+
+
+def table(folder):
+    return {row["log"].rsplit("/", 1)[1]: row for row in pq.read_table(folder / "batch.parquet").to_pylist()}
+
+
+def made(folder):
+    """When each run directory came to be."""
+    return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
+
+
+def test_of_24_logs_two_are_poison_and_22_have_results_and_a_second_call_runs_only_the_rest(
+    drawers, poisoned, tmp_path, capfd
+):
+    out = tmp_path / "out"
+    words = ["batch", f"{drawers}/*.mcap", "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
+    assert main(words) == 1
+    output, errors = capfd.readouterr()
+    rows, first = table(out), made(out)
+    done = {name: row for name, row in rows.items() if row["state"] == "done"}
+    assert len(rows) == 24 and len(done) == len(first) == 22
+    assert (rows["crashing.mcap"]["state"], rows["crashing.mcap"]["reason"]) == ("crashed", "ended by SIGSEGV")
+    assert (rows["crashing.mcap"]["tries"], rows["hungry.mcap"]["tries"]) == (2, 1)
+    assert rows["hungry.mcap"]["state"] == "out of memory"
+    assert rows["hungry.mcap"]["reason"] == "took more than --memory-limit (1.5 GiB)"
+    assert rows["hungry.mcap"]["scans"] is None
+    for row in done.values():
+        metrics = json.loads((out / row["run"] / "metrics.json").read_text())
+        assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
+        assert row["ate_rmse_m"] == metrics["ground_truth"]["optimised"]["ate_rmse_m"]
+    assert "24: 22 done, 1 crashed, 1 out of memory" in output
+    assert errors == f"error: 2 of 24 logs have no result; {out}/summary.txt says why\n"
+
+    assert main(words) == 1  # only the two are tried again
+    assert made(out) == first and "22 results were there before" in capfd.readouterr()[0]
+
+
+def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(drawers, tmp_path, capfd):
+    log, out = tmp_path / "log.mcap", tmp_path / "out"
+    log.write_bytes((drawers / "log_00.mcap").read_bytes())
+    words = ["batch", str(log), "--out", str(out)]
+    assert main(words) == 0
+    first = made(out)
+    log.rename(tmp_path / "renamed.mcap")
+    assert main(["batch", str(tmp_path / "renamed.mcap"), "--out", str(out)]) == 0
+    assert made(out) == first and list(table(out)) == ["renamed.mcap"]
+    assert main([*words[:1], str(tmp_path / "renamed.mcap"), *words[2:], "--matching.matcher", "svd"]) == 0
+    assert len(made(out)) == 2
+    log.write_bytes((drawers / "log_01.mcap").read_bytes())
+    assert main(words) == 0
+    assert len(made(out)) == 3 and "0 results were there before" in capfd.readouterr()[0].splitlines()[-1]
+
+
+def test_a_result_that_was_thrown_away_is_missing(drawers, tmp_path):
+    words = ["batch", str(drawers / "log_02.mcap"), "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    (run,) = made(tmp_path / "out")
+    (run / "metrics.json").unlink()
+    assert main(words) == 0
+    assert (run / "metrics.json").exists()
+
+
+def test_logs_that_are_damaged_absent_or_slow_are_rows(drawers, tmp_path):
+    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
+    logs = [tmp_path / "bad.mcap", tmp_path / "absent.mcap", drawers / "log_03.mcap"]
+    out = tmp_path / "out"
+    assert main(["batch", *map(str, logs), "--out", str(out), "--time-limit", "0.2"]) == 1
+    rows = table(out)
+    assert rows["absent.mcap"]["state"] == "failed" and "cannot be read" in rows["absent.mcap"]["reason"]
+    assert rows["log_03.mcap"]["reason"] == "took longer than --time-limit (0.2 s)"
+    assert main(["batch", *map(str, logs), "--out", str(out)]) == 1
+    rows = table(out)
+    assert rows["bad.mcap"]["state"] == "failed" and "bad.mcap" in rows["bad.mcap"]["reason"]
+    assert rows["log_03.mcap"]["state"] == "done"
+
+
+def test_a_wrong_configuration_ends_the_batch_before_any_log(drawers, tmp_path, capfd):
+    words = ["batch", str(drawers / "log_00.mcap"), "--out", str(tmp_path / "out"), "--matching.reach", "2"]
+    assert main(words) == 2 and not (tmp_path / "out").exists()
+    assert "--matching.reach" in capfd.readouterr()[1]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "pipeline", "batch", f"{drawers}/log_*.mcap", "--out", str(out)]
+    child = subprocess.Popen(
+        [*command, "--workers", "1"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    while not list(out.glob("rows/*.json")):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    output, errors = child.communicate(timeout=20)
+    assert child.returncode == 1 and b"logs have no result" in errors and b"not run" in output
+    states = [row["state"] for row in table(out).values()]
+    assert len(states) == 22 and 1 <= states.count("done") < 22
+    assert states.count("done") + states.count("not run") == 22
+
+
+def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
+    for name in ("a", "b", "c", "d"):
+        (tmp_path / f"{name}.mcap").touch()
+    (tmp_path / "list.txt").write_text("c.mcap  # the third\n\n# nothing\nd*.mcap\na.mcap\n")
+    found = collect([tmp_path / "[ab].mcap"], [tmp_path / "list.txt"])
+    assert [path.name for path in found] == ["a.mcap", "b.mcap", "c.mcap", "d.mcap"]
+    with pytest.raises(InputError, match=r"x\*\.mcap: matches nothing"):
+        collect([tmp_path / "x*.mcap"], [])
+    with pytest.raises(InputError, match="no log is named"):
+        collect([], [])
+    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
+        collect([], [tmp_path / "none.txt"])

@@ -1,0 +1,261 @@
+"""A run may be killed at any moment: its steps are on disk, and it goes on to the same result."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from itertools import islice
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scenes import ROOT, configured, shared_data
+
+from pipeline.errors import InputError
+from pipeline.logs import open_log
+from pipeline.runs.checkpoint import _CLASSES, CHECKPOINT_FILE, Checkpoints, read_checkpoint
+from pipeline.runs.journal import JOURNAL_FILE, read_journal
+from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
+from pipeline.simulate import simulate
+from pipeline.slam import Slam
+from pipeline.trajectory import read_tum
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+LIVELY = ("--checkpoint", "0.2", "--rerun", "off")
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """Half a minute in the simulated office, 300 scans."""
+    path = tmp_path_factory.mktemp("log") / "office.mcap"
+    simulate("office", path, duration_s=30.0)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(office, tmp_path_factory):
+    """A run of it that nobody disturbed."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert start(office, out, *LIVELY).wait() == 0
+    return out
+
+
+def start(log, out, *words, **options):
+    command = [sys.executable, "-m", "pipeline", "run", str(log), "--out", str(out), *words]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
+    return subprocess.Popen(command, cwd=ROOT, **quiet)
+
+
+def partial(out):
+    """What a killed run left, None before its directory is there."""
+    return next(out.parent.glob(f"{out.name}.partial-*"), None)
+
+
+def steps_on_disk(out):
+    try:
+        return len(read_journal(partial(out) or out)[0])
+    except FileNotFoundError:  # not there yet, or just taking another name
+        return 0
+
+
+def same_result(a, b):
+    for name in ("trajectory.tum", "odometry.tum", "graph.g2o", "map.ply"):
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+    columns = ["index", "stamp_ns", "x", "y", "qz", "odom_x", "covariance", "state", "reason", "keyframe"]
+    tables = [pq.read_table(folder / "steps.parquet", columns=columns) for folder in (a, b)]
+    assert tables[0].equals(tables[1])
+
+
+def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(office, whole, tmp_path):
+    rng, out = random.Random(1), tmp_path / "run"
+    reached = []
+    for _ in range(3):
+        child = start(office, out, *LIVELY, "--resume")
+        enough = steps_on_disk(out) + rng.randrange(20, 60)
+        while steps_on_disk(out) < enough or not (partial(out) / CHECKPOINT_FILE).exists():
+            assert child.poll() is None
+        child.kill()
+        child.wait()
+        table, _ = read_journal(partial(out))
+        reached.append(len(table))
+        np.testing.assert_array_equal(  # readable, and those of the undisturbed run
+            table.odometry.stamps_ns, read_tum(whole / "odometry.tum").stamps_ns[: len(table)]
+        )
+        table.write(tmp_path / "steps.parquet", table.best_known)
+        assert pq.read_metadata(tmp_path / "steps.parquet").num_rows == len(table)
+    assert start(office, out, *LIVELY, "--resume").wait() == 0
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
+    same_result(out, whole)
+    assert "went on after" in (out / "summary.txt").read_text()
+    assert not list(out.glob("*.journal")) and not list(out.glob("*.checkpoint"))
+
+
+@pytest.mark.parametrize(
+    "name, count, changes",
+    [
+        ("office", 300, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
+        ("2d/intel.mcap", 400, {"matching.matcher": "svd", "loops.enabled": False}),
+        ("3d/kitti_0001_first54.mcap", 54, {"loops.min_travel_m": 3.0, "loops.place_radius_m": 4.0}),
+    ],
+)
+def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit(
+    office, tmp_path, name, count, changes
+):
+    log = open_log(office if name == "office" else shared_data(name))
+    scans = list(islice(log.scans(), count))
+    config = configured(log.dimension, changes)
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar)
+    breaks = set(random.Random(2).sample(range(count), 8)) | {0}
+    for scan in scans:
+        a, b = straight.process(scan), broken.process(scan)
+        assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
+        assert a.match.information.tobytes() == b.match.information.tobytes()
+        if scan.index in breaks:
+            Checkpoints(tmp_path, 10.0, 0.0).write(broken, scan.index + 1)
+            broken = read_checkpoint(tmp_path).slam
+    a, b = straight.finish(), broken.finish()
+    assert len(a.closures) == len(b.closures)
+    assert len(a.closures) > 0 or not config.loops.enabled
+    assert a.trajectory.poses.tobytes() == b.trajectory.poses.tobytes()
+    assert a.state.weight.tobytes() == b.state.weight.tobytes()
+
+
+def test_every_step_is_on_disk_within_a_second(office, tmp_path):
+    slow = """
+import sys, time
+from pipeline.__main__ import main
+from pipeline.slam import Slam
+process = Slam.process
+def waiting(self, scan):
+    if scan.index == 40:
+        print("there", flush=True)
+        time.sleep(60)
+    return process(self, scan)
+Slam.process = waiting
+sys.exit(main(sys.argv[1:]))
+"""
+    out = tmp_path / "run"
+    child = subprocess.Popen(
+        [sys.executable, "-c", slow, "run", str(office), "--out", str(out)], cwd=ROOT, stdout=subprocess.PIPE
+    )
+    assert child.stdout.readline() == b"there\n"
+    child.kill()
+    child.communicate()
+    assert steps_on_disk(out) == 40
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, "--checkpoint", "1000", "--rerun", "off", stderr=subprocess.PIPE)
+    while steps_on_disk(out) < 30:
+        assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    errors = child.communicate(timeout=60)[1].decode()
+    assert child.returncode == 1 and errors.startswith("error: stopped by the user after ")
+    stopped_after = len(read_tum(partial(out) / "trajectory.tum"))
+    child = start(office, out, *LIVELY, "--resume", stderr=subprocess.PIPE)
+    errors = child.communicate()[1].decode()
+    assert child.returncode == 0 and f"going on after {stopped_after} scans" in errors
+    same_result(out, whole)
+
+
+def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
+    out, other = tmp_path / "run", tmp_path / "other.mcap"
+    simulate("office", other, duration_s=30.0, seed=5)
+    child = start(office, out, *LIVELY)
+    while not list(tmp_path.glob("*/state.checkpoint")):
+        assert child.poll() is None
+
+    def refusal(log, *words):
+        refused = start(log, out, *LIVELY, "--resume", *words, stderr=subprocess.PIPE)
+        errors = refused.communicate()[1].decode()
+        assert refused.returncode == 2 and errors.count("error: ") == 1
+        return errors
+
+    child.send_signal(signal.SIGSTOP)
+    assert f"is being written by process {child.pid}" in refusal(office)
+    child.kill()
+    child.wait()
+    assert "another configuration" in refusal(office, "--matching.matcher", "svd")
+    assert "scan 0 of the log is not the one that was run" in refusal(other)
+    checkpoint = partial(out) / "state.checkpoint"
+    data = bytearray(checkpoint.read_bytes())
+    data[len(data) // 2] ^= 1
+    checkpoint.write_bytes(data)
+    assert "is no whole snapshot" in refusal(office)
+
+
+def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, whole, tmp_path):
+    assert start(office, tmp_path / "run", *LIVELY, "--resume").wait() == 0
+    same_result(tmp_path / "run", whole)
+
+
+@pytest.mark.parametrize("limit_kib", [64, 400])
+def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib):
+    full = f"""
+import resource, signal, sys
+from pipeline.__main__ import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10))
+sys.exit(main(sys.argv[1:]))
+"""
+    out = tmp_path / "run"
+    words = ["run", str(office), "--out", str(out), *LIVELY]
+    child = subprocess.run([sys.executable, "-c", full, *words], cwd=ROOT, capture_output=True, text=True)
+    assert child.returncode == 1 and child.stderr.startswith("error: ") and child.stderr.count("\n") == 1
+    assert "File too large" in child.stderr and not out.exists()
+    folder = partial(out)
+    assert len(read_journal(folder)[0]) > 0
+    assert b'"complete": false' in (folder / "run.json").read_bytes()
+    for table in folder.glob("*.parquet"):
+        pq.read_table(table)
+    assert not list(folder.glob("*.new"))
+
+
+def test_a_torn_journal_is_read_up_to_the_tear(office, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, *LIVELY)
+    while steps_on_disk(out) < 20:
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    journal = partial(out) / JOURNAL_FILE
+    data = journal.read_bytes()
+    count = len(read_journal(partial(out))[0])
+    for size in range(len(data) - 300, len(data), 7):
+        journal.write_bytes(data[:size])
+        table, read = read_journal(partial(out))
+        assert count - 2 <= len(table) < count and read <= size
+    damaged = bytearray(data)
+    damaged[read // 2] ^= 1
+    journal.write_bytes(damaged)
+    assert 0 < len(read_journal(partial(out))[0]) < count
+
+
+def test_a_snapshot_makes_only_what_is_listed(tmp_path):
+    write_snapshot(tmp_path / "a", {"a": (1, 2.5, None, "x", [np.arange(3)])}, _CLASSES)
+    value = read_snapshot(tmp_path / "a", _CLASSES)
+    assert value["a"][:4] == (1, 2.5, None, "x") and value["a"][4][0].tolist() == [0, 1, 2]
+    with pytest.raises(TypeError, match="is not listed"):
+        write_snapshot(tmp_path / "b", random.Random(1), _CLASSES)
+    assert not list(tmp_path.glob("b*"))
+    config = configured(2)
+    write_snapshot(tmp_path / "c", config, _CLASSES)
+    assert read_snapshot(tmp_path / "c", _CLASSES) == config
+    with pytest.raises(InputError, match="'Config', which does not belong"):
+        read_snapshot(tmp_path / "c", Classes([], {}))
+
+
+def test_arrays_come_back_with_their_order_their_type_and_their_bits(tmp_path):
+    rows = np.arange(12.0).reshape(3, 4)
+    locked = rows.copy()
+    locked.flags.writeable = False
+    arrays = [rows, np.asfortranarray(rows), rows[:, ::2], locked, np.empty((0, 3), np.float32), np.array(-0.0)]
+    arrays.append(rows)
+    write_snapshot(tmp_path / "a", [arrays, np.float32(1.5)], _CLASSES)
+    again, scalar = read_snapshot(tmp_path / "a", _CLASSES)
+    for a, b in zip(arrays, again, strict=True):
+        assert a.tobytes() == b.tobytes() and (a.dtype, a.shape) == (b.dtype, b.shape)
+        assert a.flags.writeable == b.flags.writeable
+    assert again[1].flags.f_contiguous and again[6] is again[0] and type(scalar) is np.float32
