@@ -50,8 +50,7 @@ _CLASSES = Classes(
         PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
         Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
-        config.Config, config.LogConfig, config.PreprocessConfig, config.LocalMapConfig, config.MatchingConfig,
-        config.OdometryConfig, config.LoopsConfig, config.GraphConfig, config.MapsConfig, config.RecordingConfig,
+        config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
         (PoseGraph, "_problem"): None,
