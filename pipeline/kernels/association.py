@@ -13,8 +13,8 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
 
     points : (N, d) metres; T moves them into the map's frame
     reach : voxels searched to each side: the 2ʳᵉᵃᶜʰ-fold of each axis around the point, (2·reach)ᵈ voxels
-    A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all that
-    lies nearer than r − ½ voxels. Returns the number of points with a partner.
+    A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all
+    that lies nearer than r − ½ voxels. Returns the number of points with a partner.
     """
     scale = 1.0 / voxels.size_m
     flat = points.shape[1] == 2
