@@ -22,7 +22,7 @@ demo: $(RUNTIME)
 	@echo "Look at the pictures in runs/, or open the recordings: $(BIN)/scanchain view runs/demo-town"
 
 test: $(DEV)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(DEV)
 	$(BIN)/ruff format --check .
