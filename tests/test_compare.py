@@ -102,7 +102,7 @@ def bad(office, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
         patch.setenv("HANGS_FILE", str(hanging))
-        patch.setattr("pipeline.compare.watch.monotonic", lambda: 1000.0 * hanging.exists())
+        patch.setattr("pipeline.watched.monotonic", lambda: 1000.0 * hanging.exists())
         code = main(
             [
                 "compare", str(office), "--out", str(folder / "out"),
