@@ -9,11 +9,11 @@ from pipeline.slam import Slam
 
 
 class DriftingOdometry:
-    """The odometry of a run, every motion made longer by a share of itself and turned by so much a metre."""
+    """The odometry of a run, every motion between two scans replaced by what ``drifted`` makes of it."""
 
-    def __init__(self, odometry, longer, turn_rad_m):
+    def __init__(self, odometry, drifted):
         self.odometry = odometry
-        self.longer, self.turn_rad_m = longer, turn_rad_m
+        self.drifted = drifted
         self.T_odom_lidar = self.T_drifted = lie.identity(odometry.dimension)
 
     @property
@@ -26,17 +26,33 @@ class DriftingOdometry:
 
     def track(self, scan):
         tracked = self.odometry.track(scan)
-        d = self.odometry.dimension
-        motion = lie.log(lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar)
-        way_m = float(np.linalg.norm(motion[:d]))
-        motion[:d] *= 1.0 + self.longer
-        motion[-1] += self.turn_rad_m * way_m
+        motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
-        self.T_drifted = lie.normalise(self.T_drifted @ lie.exp(motion))
+        self.T_drifted = lie.normalise(self.T_drifted @ self.drifted(motion))
         return replace(tracked, T_odom_lidar=self.T_drifted)
 
 
-def drifting_slam(config, log, longer, turn_rad_m):
-    slam = Slam(config, log.T_base_lidar)
-    slam.odometry = DriftingOdometry(slam.odometry, longer, turn_rad_m)
+def drifting_slam(config, T_base_lidar, drifted):
+    """A chain whose odometry drifts."""
+    slam = Slam(config, T_base_lidar)
+    slam.odometry = DriftingOdometry(slam.odometry, drifted)
     return slam
+
+
+def stretched(longer, turn_rad_m):
+    """Motions made longer by a share of themselves and turned by so much a metre."""
+
+    def drifted(motion):
+        d = len(motion) - 1
+        twist = lie.log(motion)
+        way_m = float(np.linalg.norm(twist[:d]))
+        twist[:d] *= 1.0 + longer
+        twist[-1] += turn_rad_m * way_m
+        return lie.exp(twist)
+
+    return drifted
+
+
+def off_by(error_per_m):
+    """Motions followed by a twist (k,) a metre."""
+    return lambda motion: motion @ lie.exp(float(np.linalg.norm(motion[:-1, -1])) * error_per_m)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drifting import drifting_slam
+from drifting import drifting_slam, stretched
 from scenes import configured, shared_data
 
 from pipeline import lie
@@ -55,7 +55,7 @@ def test_doubt_follows_a_graph_that_grows():
 
 def run(longer, turn_rad_m):
     log = open_log(shared_data("2d/mit_csail.mcap"))
-    slam = drifting_slam(configured(2), log, longer, turn_rad_m)
+    slam = drifting_slam(configured(2), log.T_base_lidar, stretched(longer, turn_rad_m))
     for scan in log.scans():
         slam.process(scan)
     return slam.finish()

@@ -21,7 +21,8 @@ from pipeline.__main__ import _record
 from pipeline.errors import InputError
 from pipeline.runs.directory import RunDirectory
 from pipeline.runs.progress import Unwatched
-from pipeline.runs.run import Job, PartialRunError, run
+from pipeline.runs.rescue import PartialRunError
+from pipeline.runs.run import Job, run
 from pipeline.simulate import simulate
 
 

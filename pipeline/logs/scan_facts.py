@@ -30,7 +30,7 @@ class ScanFacts(NamedTuple):
     limits_m : the least and the largest range that the message believes in, 0 and inf where it tells none
     farthest_m, at_farthest : the largest finite range and how many beams tell just that one
     nearest_m, far_m : 1st and 99th percentile of the ranges that are kept
-    time_span_s, first_time_s : of the per-point times, NaN where there are none
+    time_span_s : of the per-point times, NaN where there are none
     rings : rings with returns, 0 where points do not tell
     digest : of the measurements, equal for equal ones
     outline : (C,) metres, mean distance in each cell of direction, NaN where nothing was seen
@@ -48,7 +48,6 @@ class ScanFacts(NamedTuple):
     nearest_m: float
     far_m: float
     time_span_s: float
-    first_time_s: float
     rings: int
     digest: int
     outline: NDArray[np.float64]
@@ -103,7 +102,6 @@ def _facts(
         nearest_m=float(near_m),
         far_m=float(far_m),
         time_span_s=float(times_s.max() - times_s.min()) if len(times_s) else float("nan"),
-        first_time_s=float(times_s.min()) if len(times_s) else float("nan"),
         rings=rings,
         digest=digest,
         outline=_outline(returns.points),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import msgspec
 from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Trajectory
-from pipeline.errors import InputError, ScanchainError
+from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
 from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoints
 from pipeline.runs.closure_table import write_closures
@@ -25,6 +24,7 @@ from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder, Recorder, SinkName
+from pipeline.runs.rescue import rescued
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
 from pipeline.runs.resuming import Left, after, find_left, set_aside_recording
@@ -81,10 +81,6 @@ class Finished:
     stopped: str
 
 
-class PartialRunError(ScanchainError):
-    """A run that failed after some scans; what there is lies in a directory marked partial."""
-
-
 def run(
     job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None] = _no_report
 ) -> Finished:
@@ -125,7 +121,7 @@ def run(
             (directory.path / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
         except (Exception, KeyboardInterrupt) as error:
-            raise _rescued(error, directory, steps, provenance) from error
+            raise rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
 
 
@@ -274,44 +270,3 @@ def _report(folder: Path, report: Callable[[Path], None]) -> tuple[str, ...]:
     except Exception as error:
         return (f"no report.html: {type(error).__name__}: {error}",)
     return ()
-
-
-def _rescued(
-    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
-) -> BaseException:
-    """The error to raise; what there is of a run that got somewhere is written and said where it lies."""
-    is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
-    if not len(steps) and not is_bug:
-        return error
-    directory.worth_keeping()
-    reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
-    what = "traceback.txt and the " if is_bug else ""
-    where = f"{what}{len(steps):,} scans until then are in {directory.path}"
-    try:
-        _keep(
-            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
-        )
-    except OSError as failure:
-        where = (
-            f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone ({failure.strerror})"
-        )
-    if isinstance(error, InputError):
-        return InputError(f"{error}; {where}")
-    kind = f"{type(error).__name__}: " if is_bug else ""
-    return PartialRunError(f"{kind}{reason}; {where}")
-
-
-def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
-    """Write what there is. Raises OSError where the disk is full, after which nothing half-written is left."""
-    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
-    try:
-        provenance.write(folder / RUN_FILE)
-        if bug is not None:
-            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
-        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
-            write_tum(written[0], steps.odometry)
-            steps.write(written[1], steps.best_known)
-    except OSError:
-        for path in written:
-            path.unlink(missing_ok=True)
-        raise

@@ -7,17 +7,17 @@ the log and tracks every scan.
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.logs import open_log
+from pipeline.memory import resident_mib
 from pipeline.odometry import Odometry
 from pipeline.settings import load_settings
 from pipeline.simulate import SENSORS, simulate
-
-_PAGE_MIB = 4096 / 2**20
 
 
 def main() -> None:
@@ -33,7 +33,7 @@ def main() -> None:
         for scan in log.scans():
             odometry.track(scan)
             if (scan.index + 1) % max(scans // 10, 1) == 0:
-                mebibytes.append(int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MIB)
+                mebibytes.append(resident_mib(os.getpid()))
                 print(f"{scan.index + 1:6} scans {mebibytes[-1]:7.1f} MiB", flush=True)
         spread = np.ptp(mebibytes) / mebibytes[0]
         print(f"{path.stat().st_size / 1e9:.2f} GB of log; memory varies by {100.0 * spread:.1f} %")

@@ -8,16 +8,16 @@ keyframes take.
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 from pathlib import Path
 from time import thread_time
 
 from pipeline import Slam
 from pipeline.logs import open_log
+from pipeline.memory import resident_mib
 from pipeline.settings import load_settings
 from pipeline.simulate import SENSORS, simulate
-
-_PAGE_MIB = 4096 / 2**20
 
 
 def main() -> None:
@@ -43,10 +43,10 @@ def _follow(path: Path, scans: int) -> None:
         if (scan.index + 1) % tenth == 0:
             spent_s.append(taken_s)
             taken_s = 0.0
-            resident_mib = int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MIB
             points_mib = sum(keyframe.points.nbytes for keyframe in slam.keyframes) / 2**20
             print(
-                f"{scan.index + 1:6} scans {1e3 * spent_s[-1] / tenth:6.2f} ms a scan, {resident_mib:6.1f} MiB, "
+                f"{scan.index + 1:6} scans {1e3 * spent_s[-1] / tenth:6.2f} ms a scan, "
+                f"{resident_mib(os.getpid()):6.1f} MiB, "
                 f"{points_mib:5.1f} of it points of {len(slam.keyframes)} keyframes; "
                 f"{len(slam.closures)} closures tried",
                 flush=True,

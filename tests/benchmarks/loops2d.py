@@ -23,7 +23,7 @@ from pipeline.runs.verdicts import final_verdicts
 from pipeline.settings import load_settings
 from pipeline.simulate import simulate
 from pipeline.slam import SlamResult
-from tests.drifting import drifting_slam
+from tests.drifting import drifting_slam, stretched
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 DRIFTS = ((0.01, 0.002), (0.01, -0.005), (-0.03, 0.01))  # share of the way, radians a metre
@@ -42,7 +42,7 @@ class Score:
 
 def result_of(log_path: Path, longer: float, turn_rad_m: float) -> SlamResult:
     log = open_log(log_path)
-    slam = drifting_slam(load_settings(2).config, log, longer, turn_rad_m)
+    slam = drifting_slam(load_settings(2).config, log.T_base_lidar, stretched(longer, turn_rad_m))
     for scan in log.scans():
         slam.process(scan)
     return slam.finish()

@@ -18,7 +18,7 @@ rejected.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -26,46 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.config import Config, LogConfig
-from pipeline.data import Keyframe, Matrix, Pose, Proposal, Scan, Trajectory, Verdict
+from pipeline.config import LogConfig
+from pipeline.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
 from pipeline.evaluate import absolute_error, pair
 from pipeline.logs import open_log
-from pipeline.odometry import Odometry, Tracked
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import load_settings
-from pipeline.slam import Slam
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
+from tests.drifting import drifting_slam, off_by
 from tests.false_loops import MADE_UP, false_closures
 
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
 TRUE_M, TRUE_RAD = 2.0, np.radians(3.0)
-
-
-class DriftingOdometry:
-    """The odometry of a run whose every motion is off by a share of its length."""
-
-    def __init__(self, odometry: Odometry, error_per_m: NDArray[np.float64]) -> None:
-        """error_per_m : (6,) twist a metre"""
-        self.odometry = odometry
-        self.error_per_m = error_per_m
-        self.T_odom_lidar = self.T_drifted = lie.identity(3)
-
-    @property
-    def local_map(self):
-        return self.odometry.local_map
-
-    @property
-    def first_points(self) -> Matrix:
-        return self.odometry.first_points
-
-    def track(self, scan: Scan) -> Tracked:
-        tracked = self.odometry.track(scan)
-        motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
-        length_m = float(np.linalg.norm(motion[:3, 3]))
-        self.T_odom_lidar = tracked.T_odom_lidar
-        self.T_drifted = lie.normalise(self.T_drifted @ motion @ lie.exp(length_m * self.error_per_m))
-        return replace(tracked, T_odom_lidar=self.T_drifted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,20 +60,13 @@ class Score:
     loops_s: float
 
 
-def drifting_slam(config: Config, T_base_lidar: Pose, error_per_m: NDArray[np.float64]) -> Slam:
-    """A chain whose odometry drifts."""
-    slam = Slam(config, T_base_lidar)
-    slam.odometry = DriftingOdometry(slam.odometry, error_per_m)  # pyright: ignore[reportAttributeAccessIssue]
-    return slam
-
-
 def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> Score:
     """One log through the chain."""
     log = open_log([path], LogConfig())
     truth = log.ground_truth()
     if truth is None:
         raise ValueError(f"{path} has no ground truth")
-    slam = drifting_slam(load_settings(3).config, log.T_base_lidar, error_per_m)
+    slam = drifting_slam(load_settings(3).config, log.T_base_lidar, off_by(error_per_m))
     started = perf_counter()
     loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
     seconds = perf_counter() - started

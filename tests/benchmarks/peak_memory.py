@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.logs import open_log
+from pipeline.memory import peak_mib
 from tests.benchmarks.contest import create
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,22 +37,14 @@ def measure(path: Path, method: str, scans: int) -> PeakMemory | None:
     return PeakMemory(*map(float, answer.stdout.split()[-2:]))
 
 
-def _peak_mib() -> float:
-    """VmHWM; getrusage would also count the parent before this program was started."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) / 1024.0
-    raise OSError("/proc/self/status has no VmHWM")
-
-
 def main() -> None:
     path, method, *count = sys.argv[1:]
     first_mib = 0.0
     odometry = create(method)
     for scan in islice(open_log([Path(path)], LogConfig()).scans(), int(count[0]) if count else None):
         odometry.track(scan.points, scan.times_s, scan.stamp_ns)
-        first_mib = first_mib or _peak_mib()
-    print(f"{_peak_mib():.1f} {_peak_mib() - first_mib:.1f}")
+        first_mib = first_mib or peak_mib()
+    print(f"{peak_mib():.1f} {peak_mib() - first_mib:.1f}")
 
 
 if __name__ == "__main__":

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.logs.records import Block, Channel, Contents, Entry, FileIndex
+from pipeline.logs.records import Block, Channel, Entry, FileIndex
 from pipeline.logs.ros2_definitions import schema_text
-
-Maker = Callable[[Block, AbstractSet[int] | None], Contents]
 
 
 def made_channel(index: FileIndex, topic: str, type_name: str) -> Channel:

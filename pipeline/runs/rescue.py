@@ -1,0 +1,60 @@
+"""What is kept of a run that failed, and what is said of it."""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+
+import msgspec
+
+from pipeline.errors import InputError, ScanchainError
+from pipeline.runs.directory import RUN_FILE, RunDirectory
+from pipeline.runs.journal import JOURNAL_FILE
+from pipeline.runs.provenance import Provenance
+from pipeline.runs.step_table import StepTable
+from pipeline.trajectory import write_tum
+
+
+class PartialRunError(ScanchainError):
+    """A run that failed after some scans; what there is lies in a directory marked partial."""
+
+
+def rescued(
+    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
+) -> BaseException:
+    """The error to raise; what there is of a run that got somewhere is written and said where it lies."""
+    is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+    if not len(steps) and not is_bug:
+        return error
+    directory.worth_keeping()
+    reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+    what = "traceback.txt and the " if is_bug else ""
+    where = f"{what}{len(steps):,} scans until then are in {directory.path}"
+    try:
+        _keep(
+            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
+        )
+    except OSError as failure:
+        where = (
+            f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone ({failure.strerror})"
+        )
+    if isinstance(error, InputError):
+        return InputError(f"{error}; {where}")
+    kind = f"{type(error).__name__}: " if is_bug else ""
+    return PartialRunError(f"{kind}{reason}; {where}")
+
+
+def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
+    """Write what there is. Raises OSError where the disk is full, after which nothing half-written is left."""
+    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
+    try:
+        provenance.write(folder / RUN_FILE)
+        if bug is not None:
+            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
+        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
+            write_tum(written[0], steps.odometry)
+            steps.write(written[1], steps.best_known)
+    except OSError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
