@@ -73,11 +73,6 @@ class Prior:
         """(k, k) inverse covariance."""
         return np.linalg.inv(self.covariance).astype(np.float64, copy=False)
 
-    def informed(self, information: Matrix) -> Matrix:
-        """Covariance (k, k) after information Λ (k, k) has come in: (P⁻¹ + Λ)⁻¹ = (1 + P Λ)⁻¹ P."""
-        P = self.covariance
-        return np.linalg.solve(np.eye(len(P)) + P @ information, P).astype(np.float64, copy=False)
-
 
 @dataclass(frozen=True, slots=True)
 class Match:

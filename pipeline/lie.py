@@ -35,6 +35,18 @@ def inverse(T: Pose) -> Pose:
     return result
 
 
+def between(T_a: Pose, T_b: Pose) -> Pose:
+    """The motion T_a⁻¹ T_b from one pose to another, in the former's frame."""
+    if T_a.ndim == T_b.ndim == 2:
+        return poses.between(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
+    return inverse(T_a) @ T_b
+
+
+def apart(T_a: Pose, T_b: Pose) -> tuple[float, float]:
+    """How far apart two poses are: metres, and the angle in [0, π] between their rotations."""
+    return poses.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
+
+
 def transform(T: Pose, points: NDArray[np.floating]) -> Matrix:
     """Points (N, d) moved by one pose: R p + t."""
     d = T.shape[-1] - 1

@@ -118,8 +118,7 @@ class Slam:
     def _keyframe(self, tracked: Tracked) -> int:
         """Make a keyframe of a scan that moved far enough; its index, or −1."""
         if self.odometry_poses:
-            step = lie.inverse(self.odometry_poses[-1]) @ tracked.T_odom_lidar
-            self.travelled_m += float(np.linalg.norm(step[:-1, -1]))
+            self.travelled_m += lie.apart(self.odometry_poses[-1], tracked.T_odom_lidar)[0]
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
@@ -154,10 +153,9 @@ class Slam:
         return keyframe.index
 
     def _moved_enough(self, T_odom_lidar: Pose) -> bool:
-        T = lie.inverse(self.keyframes[-1].T_odom_lidar) @ T_odom_lidar
         config = self.config.odometry
-        distance_m = float(np.linalg.norm(T[:-1, -1]))
-        return distance_m > config.keyframe_distance_m or float(lie.rotation_angle(T)) > config.keyframe_angle_rad
+        distance_m, angle_rad = lie.apart(self.keyframes[-1].T_odom_lidar, T_odom_lidar)
+        return distance_m > config.keyframe_distance_m or angle_rad > config.keyframe_angle_rad
 
     def _close_loops(self) -> tuple[Closure, ...]:
         return self._take(self.closer.close(self.keyframes, self.graph))

@@ -1,8 +1,11 @@
-"""Eigenvectors of small symmetric matrices, in closed form, without allocation."""
+"""Eigenvectors of small symmetric matrices, without allocation; of two and three rows in closed form."""
 
 import math
 
 from numba import njit
+
+_SWEEPS = 30  # of rotations; a handful does
+_BESIDE = 1e-16  # of the diagonal, what is left beside it
 
 
 @njit(cache=True)
@@ -55,3 +58,56 @@ def eigenvector_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: fl
         return 0.0, 0.0, 0.0
     scale = 1.0 / math.sqrt(best)
     return vx * scale, vy * scale, vz * scale
+
+
+@njit(cache=True, nogil=True)
+def eigensystem(A, values, vectors):
+    """Eigenvalues, ascending, of a small symmetric matrix A (k, k) and its unit eigenvectors, a column each.
+
+    Cyclic Jacobi rotations until nothing is left beside the diagonal (Golub & Van Loan, ch. 8.5). Overwrites A.
+    """
+    k = A.shape[0]
+    for i in range(k):
+        for j in range(k):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_SWEEPS):
+        beside = 0.0
+        for p in range(k - 1):
+            for q in range(p + 1, k):
+                if abs(A[p, q]) > _BESIDE * math.sqrt(abs(A[p, p] * A[q, q])):
+                    beside = 1.0
+                    _rotate_pair(A, vectors, p, q)
+        if beside == 0.0:
+            break
+    for i in range(k):
+        values[i] = A[i, i]
+    _sort_columns(values, vectors)
+
+
+@njit(cache=True, nogil=True)
+def _rotate_pair(A, vectors, p: int, q: int):
+    """Turn axes p and q so that A[p, q] becomes zero: t = tan of the angle, the smaller root of t² + 2τt = 1."""
+    tau = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
+    t = math.copysign(1.0, tau) / (abs(tau) + math.sqrt(1.0 + tau * tau))
+    c = 1.0 / math.sqrt(1.0 + t * t)
+    s = t * c
+    for i in range(A.shape[0]):
+        A[i, p], A[i, q] = c * A[i, p] - s * A[i, q], s * A[i, p] + c * A[i, q]
+        vectors[i, p], vectors[i, q] = (
+            c * vectors[i, p] - s * vectors[i, q],
+            s * vectors[i, p] + c * vectors[i, q],
+        )
+    for i in range(A.shape[0]):
+        A[p, i], A[q, i] = c * A[p, i] - s * A[q, i], s * A[p, i] + c * A[q, i]
+
+
+@njit(cache=True, nogil=True)
+def _sort_columns(values, vectors):
+    """Bring eigenvalues into ascending order, their vectors along."""
+    for i in range(1, values.shape[0]):
+        j = i
+        while j > 0 and values[j] < values[j - 1]:
+            values[j], values[j - 1] = values[j - 1], values[j]
+            for row in range(vectors.shape[0]):
+                vectors[row, j], vectors[row, j - 1] = vectors[row, j - 1], vectors[row, j]
+            j -= 1

@@ -1,4 +1,4 @@
-"""Inverse, logarithm and adjoint of one pose in the plane or in space, at the price of a call."""
+"""Inverse, motion, logarithm and adjoint of poses in the plane or in space, one at a time."""
 
 import math
 
@@ -17,6 +17,38 @@ def inverse(T):
             out[i, d] -= T[j, i] * T[j, d]
     out[d, d] = 1.0
     return out
+
+
+@njit(cache=True)
+def between(T_a, T_b):
+    """T_a⁻¹ T_b of two (d+1, d+1)."""
+    d = T_a.shape[0] - 1
+    out = np.zeros((d + 1, d + 1))
+    for i in range(d):
+        for m in range(d):
+            for j in range(d):
+                out[i, j] += T_a[m, i] * T_b[m, j]
+            out[i, d] += T_a[m, i] * (T_b[m, d] - T_a[m, d])
+    out[d, d] = 1.0
+    return out
+
+
+@njit(cache=True)
+def apart(T_a, T_b):
+    """How far two poses are from each other: metres, and the angle in [0, π] between their rotations.
+
+    8 sin²(θ/2) = |R_a − R_b|², 2 cos²(θ/2) = 1 + cos θ by the trace.
+    """
+    d = T_a.shape[0] - 1
+    square = squares = trace = 0.0
+    for i in range(d):
+        square += (T_b[i, d] - T_a[i, d]) ** 2
+        for j in range(d):
+            squares += (T_b[i, j] - T_a[i, j]) ** 2
+            trace += T_a[i, j] * T_b[i, j]
+    sine = math.sqrt(0.125 * squares)
+    cosine2 = 0.5 + (0.25 * trace if d == 2 else 0.25 * (trace - 1.0))
+    return math.sqrt(square), 2.0 * math.atan2(sine, math.sqrt(max(cosine2, 0.0)))
 
 
 @njit(cache=True)

@@ -23,20 +23,23 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 
 
 class Terms(NamedTuple):
-    """What an alignment runs under; the kernel's scale shrinks from first_scale_m to scale_m.
+    """What an alignment runs under.
 
-    range_m : root mean square of the points' ranges
+    first_scale_m, widest_scale_m, scale_m : of the kernel, at first unless the prediction is in doubt, at the
+        most, and at last
     variance : of a range, σ² in m²
+    min_information : per weight, below which a direction is not determined
     """
 
     optimiser: int
     max_iterations: int
     reach: int
-    range_m: float
     max_distance_m: float
     first_scale_m: float
+    widest_scale_m: float
     scale_m: float
     variance: float
+    min_information: float
     tolerance_m: float
     tolerance_rad: float
 
@@ -83,7 +86,7 @@ class Estimate(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def align(voxels, points, T, away, prior, terms):
+def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, where ξ is the twist away from the
@@ -91,6 +94,7 @@ def align(voxels, points, T, away, prior, terms):
     variance of a residual. Twists turn about the first value's position, along the map's axes.
     Points find new partners when they have moved by more than SLACK, until PATIENCE steps were taken with the
     kernel at its last scale: pairs that flip to and fro would go on for ever. From then on the pairs stay.
+    range_m : root mean square of the points' ranges; first_scale_m : that the kernel's scale shrinks from
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
@@ -102,7 +106,7 @@ def align(voxels, points, T, away, prior, terms):
     trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
     now.sums[DAMPING] = _FIRST_DAMPING
-    scale_m, last_scale_m, settled = terms.first_scale_m, 0.0, 0
+    scale_m, last_scale_m, settled = first_scale_m, 0.0, 0
     moved_m = np.inf
     pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
     while iterations < terms.max_iterations:
@@ -124,7 +128,7 @@ def align(voxels, points, T, away, prior, terms):
                 ending = CONVERGED
                 break
             settled += 1
-        moved_m += _largest_move(x, terms.range_m)
+        moved_m += _largest_move(x, range_m)
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
     cost = now.sums[COST] - 0.5 * now.away @ prior @ now.away + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)

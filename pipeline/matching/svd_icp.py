@@ -11,8 +11,9 @@ from pipeline.data import Match, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.association import associate
 from pipeline.kernels.cross_covariance import weighted_pairs
+from pipeline.kernels.matching import judge, root_mean_square_range
 from pipeline.kernels.registration import SHRINK, Outcome
-from pipeline.matching.matcher import judge, root_mean_square_range, spectrum_of, terms_of
+from pipeline.matching.matcher import match_of, terms_of
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.voxel_map import VoxelMap
 
@@ -31,8 +32,7 @@ class SvdMatcher:
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """
         del prior
-        range_m = root_mean_square_range(points)
-        terms = terms_of(self.config, target, wide, range_m)
+        terms = terms_of(self.config, target, wide=wide)
         T, scale_m = T_first.copy(), terms.first_scale_m
         partner = np.empty(len(points), np.int32)
         source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
@@ -54,7 +54,7 @@ class SvdMatcher:
         outcome = self._outcome(
             T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
         )
-        return judge(T, T, outcome, spectrum_of(outcome, range_m), len(points), self.config.sensor_noise_m)
+        return match_of(judge(T, outcome, root_mean_square_range(points), terms.variance), len(points))
 
     def _stands_still(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]

@@ -28,12 +28,12 @@ class Experience:
         """Take the error (k,) of a prediction."""
         self.count += 1
         gain = max(1.0 - _MEMORY, 1.0 / self.count)
-        self.squares += gain * (error**2 - self.squares)
-        self.squares = np.maximum(self.squares, _SUDDEN * error**2)
+        square = error * error
+        self.squares = np.maximum(self.squares + gain * (square - self.squares), _SUDDEN * square)
 
     @property
     def variances(self) -> NDArray[np.float64]:
         """(k,) of the next prediction, on the side of caution."""
         if self.count < _KNOWN:
             return self.first_sigma**2
-        return np.clip(_CAUTION**2 * self.squares, self.least, self.first_sigma**2)
+        return np.minimum(np.maximum(_CAUTION**2 * self.squares, self.least), self.first_sigma**2)

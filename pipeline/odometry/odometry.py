@@ -126,7 +126,7 @@ class Odometry:
         interval_s = self.predictor.interval_to(scan)
         if sweep.middle_s == 0.0 or interval_s <= 0.0:
             return None
-        motion = lie.inverse(self.predictor.T_odom_lidar) @ T_odom_middle
+        motion = lie.between(self.predictor.T_odom_lidar, T_odom_middle)
         return lie.exp(sweep.middle_s / interval_s * lie.log(motion))
 
     def _align(self, scan: Scan, points: Points, prediction: Prediction) -> Match:
@@ -145,7 +145,7 @@ class Odometry:
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """What speaks against a match, m²: its own cost, and how far from the expected pose it is."""
         prior = prediction.prior
-        away = lie.log(lie.inverse(prior.T_target_source) @ match.T_target_source) / prior.widest
+        away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
         return match.cost + 0.5 * self.config.matching.sensor_noise_m**2 * float(away @ away)
 
     def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
@@ -209,7 +209,6 @@ class Odometry:
             self.local_map.insert(points, T_odom_lidar)
 
     def _moved_enough(self, T_odom_lidar: Pose) -> bool:
-        T = lie.inverse(self.T_odom_inserted) @ T_odom_lidar
         config = self.config.local_map
-        distance_m = float(np.linalg.norm(T[:-1, -1]))
-        return distance_m >= config.insert_distance_m or float(lie.rotation_angle(T)) >= config.insert_angle_rad
+        distance_m, angle_rad = lie.apart(self.T_odom_inserted, T_odom_lidar)
+        return distance_m >= config.insert_distance_m or angle_rad >= config.insert_angle_rad

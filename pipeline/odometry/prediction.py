@@ -12,6 +12,7 @@ from pipeline import lie
 from pipeline.config import OdometryConfig
 from pipeline.data import Match, Matrix, Pose, Prior, Scan, State
 from pipeline.errors import InputError
+from pipeline.kernels.evidence import informed
 from pipeline.odometry.experience import Experience
 
 _EVEN = 2.0  # intervals whose ratio is below this tell an acceleration
@@ -115,12 +116,12 @@ class Predictor:
         self.lost_s = self.lost_s + self.interval_to(scan) if state is State.LOST else 0.0
         self.motion_covariance = self.any_motion
         if state is not State.LOST:
-            self.motion_covariance = prediction.prior.informed(match.information)
+            self.motion_covariance = informed(prediction.prior.covariance, match.information)
         if state is State.OK and not prediction.is_guess and not self.is_new:
-            prediction.experience.learn(lie.log(lie.inverse(prediction.T_odom_lidar) @ T_odom_lidar))
+            prediction.experience.learn(lie.log(lie.between(prediction.T_odom_lidar, T_odom_lidar)))
         if self.last_scan is not None:
             self.velocity = self.velocity_at(scan, T_odom_lidar)
-            self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
+            self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
             self.interval_s = self.interval_to(scan)
             if not self._has_gap_before(scan):
                 gain = 1.0 - _MEMORY if self.usual_s else 1.0
@@ -164,7 +165,7 @@ class Predictor:
 
     def _motion_to(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
         """Twist (k,) from the last pose."""
-        return lie.log(lie.inverse(self.T_odom_lidar) @ T_odom_lidar)
+        return lie.log(lie.between(self.T_odom_lidar, T_odom_lidar))
 
     def _velocity_before(self) -> NDArray[np.float64]:
         """Mean twist (k,) per second between the last two poses."""
@@ -210,7 +211,7 @@ class Predictor:
                     "set log.odometry_topic, or odometry.prior to 'auto'"
                 )
             return None
-        return lie.inverse(self.T_base_lidar) @ lie.inverse(last) @ now @ self.T_base_lidar
+        return lie.between(self.T_base_lidar, lie.between(last, now) @ self.T_base_lidar)
 
 
 def _are_alike(a: float, b: float) -> bool:

@@ -1,0 +1,146 @@
+"""A scan matched near a prediction: aligned, held where the data tell little, and what the answer is worth."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipeline.kernels.evidence import WEAK, congruent, definite_inverse, hold, seen_from_source, spectrum_of
+from pipeline.kernels.pose_log import twists
+from pipeline.kernels.poses import adjoint, inverse, twist_2d
+from pipeline.kernels.registration import align
+
+_DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
+
+
+class Expectation(NamedTuple):
+    """Where a scan should be: a ``Prior`` for kernels; ``is_known`` is 0 where there is none."""
+
+    T: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    widest: NDArray[np.float64]
+    is_known: int
+
+
+class Answer(NamedTuple):
+    """How a matching ended; fields as in ``Match``, the ending a code of ``registration``."""
+
+    T: NDArray[np.float64]
+    information: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    eigenvalue: float
+    residual_m: float
+    cost: float
+    pairs: int
+    iterations: int
+    ending: int
+
+
+@njit(cache=True, nogil=True)
+def match(voxels, points, T_first, expected, terms):
+    """The ``Answer`` of points (N, d) aligned to a map from T_first (d+1, d+1), near an ``Expectation``.
+
+    The prediction counts with what holds whatever happens; where the data determine a direction weakly, the scan
+    is aligned once more, and there it counts with its own information.
+    """
+    k = 3 if points.shape[1] == 2 else 6
+    range_m = root_mean_square_range(points)
+    information, away, doubt_m = np.zeros((k, k)), np.zeros(k), 0.0
+    if expected.is_known:
+        for i in range(k):
+            information[i, i] = terms.variance / expected.widest[i] ** 2
+        information = _turned(information, T_first)
+        away = _twist_between(expected.T, T_first)
+        doubt_m = _doubt_of(expected, range_m)
+    first_scale_m = min(max(terms.first_scale_m, _DOUBTS * doubt_m), terms.widest_scale_m)
+    T = T_first.copy()
+    outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
+    spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+    if spectrum.values[0] < WEAK * terms.min_information:
+        believed = information
+        if expected.is_known:
+            believed = terms.variance * _turned(definite_inverse(expected.covariance), T_first)
+        information = information + hold(spectrum, outcome.weights, believed, terms.min_information)
+        T[:, :] = T_first
+        outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
+        spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+    return answer_of(T, T_first, outcome, spectrum, terms.variance)
+
+
+@njit(cache=True, nogil=True)
+def judge(T, outcome, range_m: float, variance: float):
+    """The ``Answer`` of an outcome whose information is about T itself."""
+    return answer_of(T, T, outcome, spectrum_of(outcome.H, outcome.weights, range_m), variance)
+
+
+@njit(cache=True, nogil=True)
+def answer_of(T, T_first, outcome, spectrum, variance: float):
+    """The ``Answer`` that an outcome amounts to, turned into the source's own frame.
+
+    The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
+    """
+    residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
+    information, direction = seen_from_source(T, T_first, outcome.H, spectrum, max(variance, residual_m**2))
+    return Answer(
+        T,
+        information,
+        direction,
+        max(spectrum.values[0], 0.0),
+        residual_m,
+        outcome.cost,
+        outcome.pairs,
+        outcome.iterations,
+        outcome.ending,
+    )
+
+
+@njit(cache=True, nogil=True)
+def root_mean_square_range(points) -> float:
+    """Of points (N, d) as the lidar sees them; metres."""
+    total = 0.0
+    for i in range(points.shape[0]):
+        for axis in range(points.shape[1]):
+            total += points[i, axis] * points[i, axis]
+    return math.sqrt(total / max(points.shape[0], 1))
+
+
+@njit(cache=True, nogil=True)
+def _turned(information, T):
+    """Information (k, k) about twists in the source's frame as that about twists along the target's axes."""
+    centred = inverse(T)
+    centred[:-1, -1] = 0.0
+    return congruent(adjoint(centred), information)
+
+
+@njit(cache=True, nogil=True)
+def _twist_between(T_from, T_to):
+    """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
+    d = T_to.shape[0] - 1
+    a, b = T_from.copy(), T_to.copy()
+    a[:-1, -1] -= T_to[:-1, -1]
+    b[:-1, -1] = 0.0
+    inverted = inverse(a)
+    motion = np.zeros((1, d + 1, d + 1))
+    for i in range(d + 1):
+        for j in range(d + 1):
+            for m in range(d + 1):
+                motion[0, i, j] += b[i, m] * inverted[m, j]
+    if d == 2:
+        return twist_2d(motion[0])
+    out = np.empty((1, 6))
+    twists(motion, out)
+    return out[0]
+
+
+@njit(cache=True, nogil=True)
+def _doubt_of(expected, range_m: float) -> float:
+    """How far a point at that range may be from where it is expected: one standard deviation, metres."""
+    k = expected.widest.shape[0]
+    d = 2 if k == 3 else 3
+    variance = 0.0
+    for i in range(k):
+        share = 1.0 / d if i < d else range_m * range_m / (k - d)
+        variance += share * expected.covariance[i, i]
+    return math.sqrt(variance)
