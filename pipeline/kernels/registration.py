@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.kernels.association import associate
 from pipeline.kernels.descent import LEVENBERG_MARQUARDT, NEWTON, predicted_decrease, relax, step
-from pipeline.kernels.residuals import normal_equations
+from pipeline.kernels.residuals import normal_equations, robust_sums
 from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
 from pipeline.kernels.voxels import POINT, SHAPE, Voxels
@@ -120,7 +120,10 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
             weigh(voxels, points, T, partner, terms.variance, trust)
         if moved_m == 0.0 or scale_m != last_scale_m:
             _linearise(problem, scale_m, now)
-        if not _descend(problem, scale_m, now, trial, x, factor):
+        slack_m = -1.0  # a scale that shrinks changes all weights
+        if scale_m <= terms.scale_m:
+            slack_m = SLACK * voxels.size_m - moved_m if settled + 1 < PATIENCE else np.inf
+        if not _descend(problem, scale_m, range_m, slack_m, now, trial, x, factor):
             ending = SINGULAR
             break
         if scale_m <= terms.scale_m:
@@ -173,11 +176,22 @@ def _linearise(problem, scale_m: float, estimate):
 
 
 @njit(cache=True, nogil=True)
-def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
+def _weigh_up(problem, scale_m: float, estimate):
+    """Fill the estimate's sums at its pose, and leave its normal equations alone."""
+    cost, weights, squares = robust_sums(
+        problem.voxels, problem.points, estimate.T, problem.partner, problem.trust, scale_m
+    )
+    cost += 0.5 * estimate.away @ problem.prior @ estimate.away
+    estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
+
+
+@njit(cache=True, nogil=True)
+def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial, x, factor) -> bool:
     """Take one step x (k,) with the present pairs; False where the equations determine none.
 
     Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
-    that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more.
+    that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more. After a step by which
+    a point moves further than slack_m the normal equations are due to be made anew: none are made here.
     """
     terms = problem.terms
     growth = 2.0
@@ -185,7 +199,10 @@ def _descend(problem, scale_m: float, now, trial, x, factor) -> bool:
         perturb(x, now.T, problem.origin, trial.T)
         for i in range(x.shape[0]):
             trial.away[i] = now.away[i] + x[i]
-        _linearise(problem, scale_m, trial)
+        if _largest_move(x, range_m) > slack_m:
+            _weigh_up(problem, scale_m, trial)
+        else:
+            _linearise(problem, scale_m, trial)
         lowered = now.sums[COST] - trial.sums[COST]
         if terms.optimiser != LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)

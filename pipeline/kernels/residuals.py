@@ -35,19 +35,10 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
             continue
         cell = voxels.cells[voxel]
         px, py, pz = move(T, points, i)
-        ex, ey, ez = px - cell[0], py - cell[1], pz - cell[2]
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
         px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
         nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-        along = nx * ex + ny * ey + nz * ez
         shape = cell[SHAPE]
-        if shape == PLANE:
-            r2 = along * along
-            ex, ey, ez = along * nx, along * ny, along * nz
-        elif shape == LINE:
-            ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
-            r2 = ex * ex + ey * ey + ez * ez
-        else:
-            r2 = ex * ex + ey * ey + ez * ez
         r2 *= trust[i]
         ratio = s2 / (s2 + r2)
         w = trust[i] * ratio * ratio
@@ -64,6 +55,37 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
             _add_curvature(H, w, px, py, pz, ex, ey, ez, planar)
     _mirror(H)
     return cost, weights, squares
+
+
+@njit(cache=True, nogil=True)
+def robust_sums(voxels, points, T, partner, trust, scale_m: float):
+    """What ``normal_equations`` returns: the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m²."""
+    cost = weights = squares = 0.0
+    s2 = scale_m * scale_m
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        x, y, z = move(T, points, i)
+        r2 = trust[i] * _residual(voxels.cells[voxel], x, y, z)[4]
+        ratio = s2 / (s2 + r2)
+        cost += 0.5 * r2 * ratio
+        weights += trust[i] * ratio * ratio
+        squares += ratio * ratio * r2
+    return cost, weights, squares
+
+
+@njit(cache=True, inline="always")
+def _residual(cell, x, y, z):
+    """What of (x, y, z) − mean counts (3), its component along the voxel's direction, and its squared length."""
+    ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
+    nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+    along = nx * ex + ny * ey + nz * ez
+    if cell[SHAPE] == PLANE:
+        return along * nx, along * ny, along * nz, along, along * along
+    if cell[SHAPE] == LINE:
+        ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
+    return ex, ey, ez, along, ex * ex + ey * ey + ez * ez
 
 
 @njit(cache=True, inline="always")
