@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.kernels.descent import solve
 from pipeline.kernels.eigen import eigensystem
-from pipeline.kernels.poses import adjoint
+from pipeline.kernels.poses import adjoint, centred
 
 WEAK = 10.0  # times the least information, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction
@@ -33,7 +33,8 @@ def spectrum_of(H, weights: float, range_m: float):
     """The spectrum of the information H (k, k) that residuals of these weights amount to."""
     k = H.shape[0]
     scale = np.ones(k)
-    scale[2 if k == 3 else 3 :] = 1.0 / max(range_m, 1e-9)
+    for i in range(2 if k == 3 else 3, k):
+        scale[i] = 1.0 / max(range_m, 1e-9)
     evened, values, vectors = np.empty((k, k)), np.empty(k), np.empty((k, k))
     for i in range(k):
         for j in range(k):
@@ -76,17 +77,30 @@ def seen_from_source(T, T_first, H, spectrum, variance: float):
 
     H (k, k), of residuals with this variance, and the spectrum are about the position of T_first, in map axes.
     """
-    centred = T.copy()
-    centred[:-1, -1] -= T_first[:-1, -1]
-    Ad = adjoint(centred)
-    centred[:-1, -1] = 0.0
-    return congruent(Ad, H) / variance, _transposed_times(adjoint(centred), spectrum.vectors[:, 0])
+    k = H.shape[0]
+    information, direction = congruent(adjoint(centred(T, T_first)), H), np.zeros(k)
+    Ad = adjoint(centred(T, T))
+    for i in range(k):
+        for j in range(k):
+            information[i, j] /= variance
+            direction[j] += Ad[i, j] * spectrum.vectors[i, 0]
+    return information, direction
 
 
 @njit(cache=True, nogil=True)
 def informed(covariance, information):
     """Covariance (k, k) after information Λ (k, k) has come in: (P⁻¹ + Λ)⁻¹."""
-    return definite_inverse(definite_inverse(covariance) + information)
+    total = definite_inverse(covariance)
+    add(total, information)
+    return definite_inverse(total)
+
+
+@njit(cache=True, nogil=True)
+def add(total, information):
+    """Add information (k, k) to ``total``, in place."""
+    for i in range(total.shape[0]):
+        for j in range(total.shape[0]):
+            total[i, j] += information[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -98,8 +112,9 @@ def definite_inverse(matrix):
         b[j] = -1.0
         if not solve(matrix, b, 0.0, factor, column):
             return np.zeros((k, k))
-        out[:, j] = column
         b[j] = 0.0
+        for i in range(k):
+            out[i, j] = column[i]
     return out
 
 
@@ -116,14 +131,4 @@ def congruent(A, H):
         for i in range(k):
             for j in range(k):
                 out[i, j] += A[m, i] * HA[m, j]
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _transposed_times(A, v):
-    """Aᵀv of (k, k) and (k,)."""
-    out = np.zeros(A.shape[1])
-    for i in range(A.shape[0]):
-        for j in range(A.shape[1]):
-            out[j] += A[i, j] * v[i]
     return out

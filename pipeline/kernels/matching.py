@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.evidence import WEAK, congruent, definite_inverse, hold, seen_from_source, spectrum_of
-from pipeline.kernels.pose_log import twists
-from pipeline.kernels.poses import adjoint, inverse, twist_2d
+from pipeline.kernels.evidence import WEAK, add, congruent, definite_inverse, hold, seen_from_source, spectrum_of
+from pipeline.kernels.pose_log import twist_3d
+from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
 from pipeline.kernels.registration import align
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
@@ -50,8 +50,8 @@ def match(voxels, points, T_first, expected, terms):
     information, away, doubt_m = np.zeros((k, k)), np.zeros(k), 0.0
     if expected.is_known:
         for i in range(k):
-            information[i, i] = terms.variance / expected.widest[i] ** 2
-        information = _turned(information, T_first)
+            information[i, i] = expected.widest[i] ** -2.0
+        information = _turned(information, T_first, terms.variance)
         away = _twist_between(expected.T, T_first)
         doubt_m = _doubt_of(expected, range_m)
     first_scale_m = min(max(terms.first_scale_m, _DOUBTS * doubt_m), terms.widest_scale_m)
@@ -61,9 +61,9 @@ def match(voxels, points, T_first, expected, terms):
     if spectrum.values[0] < WEAK * terms.min_information:
         believed = information
         if expected.is_known:
-            believed = terms.variance * _turned(definite_inverse(expected.covariance), T_first)
-        information = information + hold(spectrum, outcome.weights, believed, terms.min_information)
-        T[:, :] = T_first
+            believed = _turned(definite_inverse(expected.covariance), T_first, terms.variance)
+        add(information, hold(spectrum, outcome.weights, believed, terms.min_information))
+        T = T_first.copy()
         outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
         spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
     return answer_of(T, T_first, outcome, spectrum, terms.variance)
@@ -107,31 +107,24 @@ def root_mean_square_range(points) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _turned(information, T):
-    """Information (k, k) about twists in the source's frame as that about twists along the target's axes."""
-    centred = inverse(T)
-    centred[:-1, -1] = 0.0
-    return congruent(adjoint(centred), information)
+def _turned(information, T, variance: float):
+    """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
+    out = congruent(adjoint(inverse(centred(T, T))), information)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[0]):
+            out[i, j] *= variance
+    return out
 
 
 @njit(cache=True, nogil=True)
 def _twist_between(T_from, T_to):
     """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
-    d = T_to.shape[0] - 1
-    a, b = T_from.copy(), T_to.copy()
-    a[:-1, -1] -= T_to[:-1, -1]
-    b[:-1, -1] = 0.0
-    inverted = inverse(a)
-    motion = np.zeros((1, d + 1, d + 1))
-    for i in range(d + 1):
-        for j in range(d + 1):
-            for m in range(d + 1):
-                motion[0, i, j] += b[i, m] * inverted[m, j]
-    if d == 2:
-        return twist_2d(motion[0])
-    out = np.empty((1, 6))
-    twists(motion, out)
-    return out[0]
+    motion = between(inverse(centred(T_to, T_to)), inverse(centred(T_from, T_to)))
+    if T_to.shape[0] == 3:
+        return twist_2d(motion)
+    out = np.empty(6)
+    twist_3d(motion, out)
+    return out
 
 
 @njit(cache=True, nogil=True)

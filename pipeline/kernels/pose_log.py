@@ -22,40 +22,52 @@ def quaternions(R, out):
 @njit(cache=True)
 def rotation_vectors(R, out):
     """Write the rotation vectors, angles in [0, π], of rotations (N, 3, 3) to ``out`` (N, 3)."""
-    quat = np.empty(4)
     for n in range(R.shape[0]):
-        _quaternion(R[n], quat)
-        norm = math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2])
-        scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, quat[3]) / norm
-        for axis in range(3):
-            out[n, axis] = scale * quat[axis]
+        _rotation_vector(R[n], out[n])
 
 
 @njit(cache=True)
 def twists(T, out):
-    """Write the twists (ρ, φ) of poses (N, 4, 4) to ``out`` (N, 6): φ = log R, ρ = V(φ)⁻¹ t.
+    """Write the twists (ρ, φ) of poses (N, 4, 4) to ``out`` (N, 6)."""
+    for n in range(T.shape[0]):
+        twist_3d(T[n], out[n])
+
+
+@njit(cache=True)
+def twist_3d(T, out):
+    """Write the twist (ρ, φ) of a pose (4, 4) to ``out`` (6,): φ = log R, ρ = V(φ)⁻¹ t.
 
     V(φ)⁻¹ t = t − ½ φ × t + e φ × (φ × t), e = (1 − θ/2 cot θ/2) / θ²    (Barfoot 2017, eq. 7.86)
     """
-    rotation_vectors(T[:, :3, :3], out[:, 3:])
-    for n in range(T.shape[0]):
-        x, y, z = out[n, 3], out[n, 4], out[n, 5]
-        u, v, w = T[n, 0, 3], T[n, 1, 3], T[n, 2, 3]
-        theta2 = x * x + y * y + z * z
-        if theta2 < 1e-6:
-            e = 1.0 / 12.0 + theta2 / 720.0
-        else:
-            half = 0.5 * math.sqrt(theta2)
-            e = (1.0 - half / math.tan(half)) / theta2
-        cu, cv, cw = y * w - z * v, z * u - x * w, x * v - y * u
-        out[n, 0] = u - 0.5 * cu + e * (y * cw - z * cv)
-        out[n, 1] = v - 0.5 * cv + e * (z * cu - x * cw)
-        out[n, 2] = w - 0.5 * cw + e * (x * cv - y * cu)
+    _rotation_vector(T, out[3:])
+    x, y, z = out[3], out[4], out[5]
+    u, v, w = T[0, 3], T[1, 3], T[2, 3]
+    theta2 = x * x + y * y + z * z
+    if theta2 < 1e-6:
+        e = 1.0 / 12.0 + theta2 / 720.0
+    else:
+        half = 0.5 * math.sqrt(theta2)
+        e = (1.0 - half / math.tan(half)) / theta2
+    cu, cv, cw = y * w - z * v, z * u - x * w, x * v - y * u
+    out[0] = u - 0.5 * cu + e * (y * cw - z * cv)
+    out[1] = v - 0.5 * cv + e * (z * cu - x * cw)
+    out[2] = w - 0.5 * cw + e * (x * cv - y * cu)
+
+
+@njit(cache=True)
+def _rotation_vector(R, out):
+    """Write the rotation vector of R, whose first three rows and columns are a rotation, to ``out`` (3,)."""
+    quat = np.empty(4)
+    _quaternion(R, quat)
+    norm = math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2])
+    scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, quat[3]) / norm
+    for axis in range(3):
+        out[axis] = scale * quat[axis]
 
 
 @njit(cache=True)
 def _quaternion(R, out):
-    """Write the quaternion xyzw of R (3, 3) to ``out`` (4,), normalised, w ≥ 0."""
+    """Write the quaternion xyzw of the rotation in R to ``out`` (4,), normalised, w ≥ 0."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
         out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]

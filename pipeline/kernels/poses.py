@@ -34,6 +34,16 @@ def between(T_a, T_b):
 
 
 @njit(cache=True)
+def centred(T, T_origin):
+    """The pose T (d+1, d+1) with its position counted from that of T_origin."""
+    d = T.shape[0] - 1
+    out = T.copy()
+    for i in range(d):
+        out[i, d] -= T_origin[i, d]
+    return out
+
+
+@njit(cache=True)
 def apart(T_a, T_b):
     """How far two poses are from each other: metres, and the angle in [0, π] between their rotations.
 

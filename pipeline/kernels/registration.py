@@ -99,7 +99,8 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
     """
     k = 3 if points.shape[1] == 2 else 6
     origin = np.zeros(3)
-    origin[: points.shape[1]] = T[:-1, -1]
+    for axis in range(points.shape[1]):
+        origin[axis] = T[axis, points.shape[1]]
     partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
     problem = Problem(voxels, points, origin, prior, partner, trust, terms)
     now = Estimate(T, away.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
@@ -134,9 +135,9 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
         moved_m += _largest_move(x, range_m)
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
-    cost = now.sums[COST] - 0.5 * now.away @ prior @ now.away + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
+    cost = now.sums[COST] - _pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
     _leave_out_points(problem)
-    normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, False, now.H, now.b)
+    normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, 0.0, now.H, now.b)
     return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
 
 
@@ -161,7 +162,7 @@ def _linearise(problem, scale_m: float, estimate):
         problem.partner,
         problem.trust,
         scale_m,
-        terms.optimiser == NEWTON,
+        1.0 if terms.optimiser == NEWTON else 0.0,
         estimate.H,
         estimate.b,
     )
@@ -181,7 +182,7 @@ def _weigh_up(problem, scale_m: float, estimate):
     cost, weights, squares = robust_sums(
         problem.voxels, problem.points, estimate.T, problem.partner, problem.trust, scale_m
     )
-    cost += 0.5 * estimate.away @ problem.prior @ estimate.away
+    cost += _pull(problem.prior, estimate.away)
     estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
 
 
@@ -207,15 +208,38 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
         if terms.optimiser != LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
             trial.sums[DAMPING] = max(relax(now.sums[DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
-            now.T[:, :], now.away[:] = trial.T, trial.away
-            now.H[:, :], now.b[:], now.sums[:] = trial.H, trial.b, trial.sums
+            _take(now, trial)
             return True
         if _is_small(x, terms) or now.sums[DAMPING] > _MOST_DAMPING:
-            x[:] = 0.0
+            x.fill(0.0)
             return True
         now.sums[DAMPING] *= growth
         growth *= 2.0
     return False
+
+
+@njit(cache=True, nogil=True)
+def _take(now, trial):
+    """Make the trial the present estimate."""
+    for i in range(now.T.shape[0]):
+        for j in range(now.T.shape[0]):
+            now.T[i, j] = trial.T[i, j]
+    for i in range(now.b.shape[0]):
+        now.away[i], now.b[i] = trial.away[i], trial.b[i]
+        for j in range(now.b.shape[0]):
+            now.H[i, j] = trial.H[i, j]
+    for i in range(now.sums.shape[0]):
+        now.sums[i] = trial.sums[i]
+
+
+@njit(cache=True, nogil=True)
+def _pull(prior, away) -> float:
+    """½ ξᵀ prior ξ."""
+    total = 0.0
+    for i in range(away.shape[0]):
+        for j in range(away.shape[0]):
+            total += away[i] * prior[i, j] * away[j]
+    return 0.5 * total
 
 
 @njit(cache=True, inline="always")

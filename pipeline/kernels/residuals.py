@@ -6,7 +6,7 @@ from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, second_order: bool, H, b):
+def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, curvature: float, H, b):
     """Linearise every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
 
     With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
@@ -20,12 +20,12 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
     points : (N, d) metres, source frame; origin : (3,), map frame
     partner : (N,) rows of the map's voxels, −1 for none; trust : (N,) in [0, 1], what each pair counts
     scale_m : s; residuals far above it are all but ignored
-    second_order : adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
-        held fixed)
+    curvature : 1 adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
+        held fixed); 0 leaves it out
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
     """
-    H[:, :] = 0.0
-    b[:] = 0.0
+    H.fill(0.0)
+    b.fill(0.0)
     cost = weights = squares = 0.0
     s2 = scale_m * scale_m
     planar = points.shape[1] == 2
@@ -51,8 +51,8 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
             _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
         else:
             _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
-        if second_order:
-            _add_curvature(H, w, px, py, pz, ex, ey, ez, planar)
+        if curvature > 0.0:
+            _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
     _mirror(H)
     return cost, weights, squares
 

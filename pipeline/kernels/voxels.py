@@ -93,8 +93,10 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
         kept.keys[slot] = key
         kept.row[slot] = new
         kept.voxel_keys[new] = key
-        kept.moments[new] = voxels.moments[voxel]
-        kept.cells[new] = cell
+        for k in range(voxels.moments.shape[1]):
+            kept.moments[new, k] = voxels.moments[voxel, k]
+        for k in range(CELL):
+            kept.cells[new, k] = cell[k]
 
 
 @njit(cache=True, inline="always")
@@ -110,8 +112,8 @@ def _voxel_at(voxels, x: float, y: float, z: float) -> int:
     voxels.keys[~slot] = key
     voxels.row[~slot] = voxel
     voxels.voxel_keys[voxel] = key
-    voxels.moments[voxel, :] = 0.0
-    voxels.cells[voxel, :] = 0.0
+    voxels.moments[voxel].fill(0.0)
+    voxels.cells[voxel].fill(0.0)
     voxels.cells[voxel, TICK] = -1.0
     return voxel
 
@@ -164,7 +166,7 @@ def _fit_shape(m, dimension: int, cell) -> float:
 @njit(cache=True, nogil=True)
 def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
     """Moments of the 3ᵈ voxels around one, relative to its centre, written to ``sums`` (10,)."""
-    sums[:] = 0.0
+    sums.fill(0.0)
     size = voxels.size_m
     for dx in range(-1, 2):
         for dy in range(-1, 2):
