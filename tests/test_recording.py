@@ -356,7 +356,9 @@ recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset(
 recording.__enter__()
 for step in drive(600, 2):
     recording.log(step)
-time.sleep(0.5)
+while not recording.sinks[0].waiting.empty():
+    time.sleep(0.05)
+time.sleep(1.0)  # for the batch that was taken last
 os.kill(os.getpid(), signal.SIGKILL)
 """
     answer = run_script(script, tmp_path / "a.rrd")

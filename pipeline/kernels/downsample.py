@@ -6,7 +6,6 @@ from numba import njit
 from pipeline.kernels.hashing import EMPTY, find, pack
 from pipeline.kernels.twist import perturb
 
-
 _BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
 
 
@@ -30,9 +29,11 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
         _keys(part, 1.0 / voxel_m, min_range_m * min_range_m, max_range_m * max_range_m, block)
         for i in range(part.shape[0]):
             key = block[i]
-            if key == last or key == EMPTY:
+            if key == last:
                 continue
             last = key
+            if key == EMPTY:
+                continue
             slot = find(keys, key)
             if slot < 0:
                 keys[~slot] = key
@@ -49,7 +50,8 @@ def _keys(points, scale: float, low: float, high: float, keys):
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
         z = 0.0 if planar else np.float64(points[i, 2])
         square = x * x + y * y + z * z
-        key = pack(np.int32(np.floor(x * scale)), np.int32(np.floor(y * scale)), np.int32(np.floor(z * scale)))
+        ix, iy, iz = np.int32(np.floor(x * scale)), np.int32(np.floor(y * scale)), np.int32(np.floor(z * scale))
+        key = pack(int(ix), int(iy), int(iz))
         keys[i] = key if (low <= square) & (square <= high) else EMPTY
 
 

@@ -7,41 +7,30 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeline.kernels.association import associate
-from pipeline.kernels.descent import LEVENBERG_MARQUARDT, NEWTON, predicted_decrease, relax, step
-from pipeline.kernels.residuals import normal_equations, robust_sums
+from pipeline.kernels.descent import LEVENBERG_MARQUARDT, predicted_decrease, relax, step
+from pipeline.kernels.estimate import (
+    COST,
+    DAMPING,
+    SQUARES,
+    WEIGHTS,
+    Estimate,
+    Problem,
+    leave_out_points,
+    linearise,
+    pull,
+    take,
+    weigh_up,
+)
+from pipeline.kernels.residuals import normal_equations
 from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
-from pipeline.kernels.voxels import POINT, SHAPE, Voxels
 
 CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # of the kernel's scale from one association to the next
 SLACK = 0.02  # voxels that points may move before they look for new partners
 PATIENCE = 20  # steps at the last scale
-COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
-
-
-class Terms(NamedTuple):
-    """What an alignment runs under.
-
-    first_scale_m, widest_scale_m, scale_m : of the kernel, at first unless the prediction is in doubt, at the
-        most, and at last
-    variance : of a range, σ² in m²
-    min_information : per weight, below which a direction is not determined
-    """
-
-    optimiser: int
-    max_iterations: int
-    reach: int
-    max_distance_m: float
-    first_scale_m: float
-    widest_scale_m: float
-    scale_m: float
-    variance: float
-    min_information: float
-    tolerance_m: float
-    tolerance_rad: float
 
 
 class Outcome(NamedTuple):
@@ -63,28 +52,6 @@ class Outcome(NamedTuple):
     ending: int
 
 
-class Problem(NamedTuple):
-    """What stays through an alignment, but for ``partner`` and ``trust`` (N,), the pairs of the moment."""
-
-    voxels: Voxels
-    points: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    prior: NDArray[np.float64]
-    partner: NDArray[np.int32]
-    trust: NDArray[np.float64]
-    terms: Terms
-
-
-class Estimate(NamedTuple):
-    """A pose, the twist ``away`` from the predicted one, and the normal equations there; ``sums`` (4,) above."""
-
-    T: NDArray[np.float64]
-    away: NDArray[np.float64]
-    H: NDArray[np.float64]
-    b: NDArray[np.float64]
-    sums: NDArray[np.float64]
-
-
 @njit(cache=True, nogil=True)
 def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, terms):
     """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
@@ -98,9 +65,7 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
-    origin = np.zeros(3)
-    for axis in range(points.shape[1]):
-        origin[axis] = T[axis, points.shape[1]]
+    origin = _position(T)
     partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
     problem = Problem(voxels, points, origin, prior, partner, trust, terms)
     now = Estimate(T, away.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
@@ -120,7 +85,7 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
                 break
             weigh(voxels, points, T, partner, terms.variance, trust)
         if moved_m == 0.0 or scale_m != last_scale_m:
-            _linearise(problem, scale_m, now)
+            linearise(problem, scale_m, now)
         slack_m = -1.0  # a scale that shrinks changes all weights
         if scale_m <= terms.scale_m:
             slack_m = SLACK * voxels.size_m - moved_m if settled + 1 < PATIENCE else np.inf
@@ -135,55 +100,19 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
         moved_m += _largest_move(x, range_m)
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
-    cost = now.sums[COST] - _pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
-    _leave_out_points(problem)
+    cost = now.sums[COST] - pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
+    leave_out_points(problem)
     normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, 0.0, now.H, now.b)
     return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
 
 
 @njit(cache=True, nogil=True)
-def _leave_out_points(problem):
-    """Take the trust from pairs with a voxel that has no shape."""
-    for i in range(problem.partner.shape[0]):
-        voxel = problem.partner[i]
-        if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
-            problem.trust[i] = 0.0
-
-
-@njit(cache=True, nogil=True)
-def _linearise(problem, scale_m: float, estimate):
-    """Fill the estimate's normal equations and sums at its pose, the prediction's pull included."""
-    terms = problem.terms
-    cost, weights, squares = normal_equations(
-        problem.voxels,
-        problem.points,
-        estimate.T,
-        problem.origin,
-        problem.partner,
-        problem.trust,
-        scale_m,
-        1.0 if terms.optimiser == NEWTON else 0.0,
-        estimate.H,
-        estimate.b,
-    )
-    for i in range(estimate.b.shape[0]):
-        pull = 0.0
-        for j in range(estimate.b.shape[0]):
-            pull += problem.prior[i, j] * estimate.away[j]
-            estimate.H[i, j] += problem.prior[i, j]
-        estimate.b[i] += pull
-        cost += 0.5 * pull * estimate.away[i]
-    estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
-
-
-@njit(cache=True, nogil=True)
-def _weigh_up(problem, scale_m: float, estimate):
-    """Fill the estimate's sums at its pose, and leave its normal equations alone."""
-    cost, weights, squares = robust_sums(
-        problem.voxels, problem.points, estimate.T, problem.partner, problem.trust, scale_m
-    )
-    cost += _pull(problem.prior, estimate.away)
-    estimate.sums[COST], estimate.sums[WEIGHTS], estimate.sums[SQUARES] = cost, weights, squares
+def _position(T):
+    """Of a pose (d+1, d+1), as (3,); z is 0 in the plane."""
+    out, d = np.zeros(3), T.shape[0] - 1
+    for axis in range(d):
+        out[axis] = T[axis, d]
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -201,14 +130,14 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
         for i in range(x.shape[0]):
             trial.away[i] = now.away[i] + x[i]
         if _largest_move(x, range_m) > slack_m:
-            _weigh_up(problem, scale_m, trial)
+            weigh_up(problem, scale_m, trial)
         else:
-            _linearise(problem, scale_m, trial)
+            linearise(problem, scale_m, trial)
         lowered = now.sums[COST] - trial.sums[COST]
         if terms.optimiser != LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
             trial.sums[DAMPING] = max(relax(now.sums[DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
-            _take(now, trial)
+            take(now, trial)
             return True
         if _is_small(x, terms) or now.sums[DAMPING] > _MOST_DAMPING:
             x.fill(0.0)
@@ -216,30 +145,6 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
         now.sums[DAMPING] *= growth
         growth *= 2.0
     return False
-
-
-@njit(cache=True, nogil=True)
-def _take(now, trial):
-    """Make the trial the present estimate."""
-    for i in range(now.T.shape[0]):
-        for j in range(now.T.shape[0]):
-            now.T[i, j] = trial.T[i, j]
-    for i in range(now.b.shape[0]):
-        now.away[i], now.b[i] = trial.away[i], trial.b[i]
-        for j in range(now.b.shape[0]):
-            now.H[i, j] = trial.H[i, j]
-    for i in range(now.sums.shape[0]):
-        now.sums[i] = trial.sums[i]
-
-
-@njit(cache=True, nogil=True)
-def _pull(prior, away) -> float:
-    """½ ξᵀ prior ξ."""
-    total = 0.0
-    for i in range(away.shape[0]):
-        for j in range(away.shape[0]):
-            total += away[i] * prior[i, j] * away[j]
-    return 0.5 * total
 
 
 @njit(cache=True, inline="always")

@@ -9,8 +9,8 @@ from pipeline.config import MatchingConfig
 from pipeline.data import Match, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
+from pipeline.kernels.estimate import Terms
 from pipeline.kernels.matching import Answer, Expectation, match
-from pipeline.kernels.registration import Terms
 from pipeline.matching.voxel_map import VoxelMap
 
 OPTIMISERS = {
