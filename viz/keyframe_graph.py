@@ -28,7 +28,7 @@ class KeyframeGraph:
         self.times = Times.at(0, 0)
 
     def add(self, step: Step) -> list[Message]:
-        """Take in one step."""
+        """Take in a step; those without a keyframe may be left out."""
         if step.keyframe >= 0:
             self.positions.append(shapes.positions(step.T_world_lidar[None])[0])
             self.is_current = False

@@ -88,7 +88,10 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        if self.sinks:
+        if not self.sinks:
+            return
+        self.batcher.add(step)
+        if step.keyframe >= 0 or step.graph is not None or self.batcher.is_due:
             self._send(lambda: self._step(step))
 
     def log_trajectory(
@@ -154,7 +157,6 @@ class Recording:
         return viewer.grpc_address(self.port)
 
     def _step(self, step: Step) -> list[Message]:
-        self.batcher.add(step)
         messages = self.graph.add(step)
         if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
