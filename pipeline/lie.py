@@ -169,10 +169,9 @@ def to_quaternion(R: Matrix) -> NDArray[np.float64]:
 
 def from_quaternion(quat_xyzw: NDArray[np.float64]) -> Matrix:
     """Rotation matrices (..., 3, 3) of quaternions xyzw (..., 4); normalised first."""
-    from scipy.spatial.transform import Rotation
-
-    flat = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix()
-    return flat.reshape(*quat_xyzw.shape[:-1], 3, 3)
+    q = quat_xyzw / np.linalg.norm(quat_xyzw, axis=-1, keepdims=True)
+    K = hat(q[..., :3])
+    return np.eye(3) + 2.0 * (q[..., 3, None, None] * K + K @ K)
 
 
 def _exp_se2(twist: NDArray[np.float64]) -> Pose:
