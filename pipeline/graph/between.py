@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class BetweenProblem:
         is_point: NDArray[np.bool_] | None = None,
     ) -> None:
         """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,)."""
-        self.edges, self.measurements, self.information = edges, measurements, information
+        self.edges, self.measurements, self.information = _kept(edges), _kept(measurements), _kept(information)
         self.freedom = information.shape[-1]
         self.free = np.flatnonzero(~fixed)
         variable = np.full(len(fixed), -1, np.int64)
@@ -110,7 +111,7 @@ class BetweenProblem:
     def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
         errors = np.empty((len(edges), self.freedom))
         kernel = graph_between_se2 if self.freedom == 3 else graph_between_se3
-        kernel.residuals(poses, edges, self.measurements, errors)
+        kernel.residuals(_kept(poses), _kept(edges), self.measurements, errors)
         if len(self.sightings):
             T_i, T_j = poses[edges[self.sightings].T]
             seen = (T_j[:, None, :2, 2] - T_i[:, None, :2, 2]) @ T_i[:, :2, :2]
@@ -121,9 +122,9 @@ class BetweenProblem:
     def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
         jacobian = np.empty((len(edges), self.freedom, self.freedom))
         if self.freedom == 3:
-            graph_between_se2.jacobians(poses, edges, self.measurements, jacobian)
+            graph_between_se2.jacobians(_kept(poses), _kept(edges), self.measurements, jacobian)
         else:
-            graph_between_se3.jacobians(poses, edges, errors, jacobian)
+            graph_between_se3.jacobians(_kept(poses), _kept(edges), errors, jacobian)
         if len(self.sightings):
             T_i, T_j = poses[edges[self.sightings].T]
             R_t, (x, y) = np.swapaxes(T_i[:, :2, :2], 1, 2), T_j[:, :2, 2].T
@@ -131,6 +132,13 @@ class BetweenProblem:
             jacobian[self.sightings, :2, :2] = R_t
             jacobian[self.sightings, :2, 2] = (R_t @ np.stack([-y, x], axis=1)[..., None])[..., 0]
         return jacobian
+
+
+def _kept(array: NDArray[Any]) -> NDArray[Any]:
+    """A view that nobody writes into: for one kind of array a kernel is compiled once."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def right_information(T_ij: Matrix, left_information: Matrix) -> Matrix:

@@ -9,8 +9,9 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
+from pipeline.kernels.graph_soundness import judge_matrices
 
-_ROUNDING = 1e-6  # share of the largest eigenvalue that a negative one may have, from printed digits
+_ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
 
 
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
@@ -34,11 +35,9 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     """Which of the matrices (E, k, k) are finite, symmetric and without negative eigenvalues, (E,)."""
-    finite = np.isfinite(np.sum(information, axis=(1, 2)))
-    matrices = np.where(finite[:, None, None], information, 0.0)
-    scale = np.abs(matrices).max(axis=(1, 2), initial=0.0)
-    symmetric = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0) <= _ROUNDING * scale
-    return finite & symmetric & (np.linalg.eigvalsh(matrices)[:, 0] >= -_ROUNDING * scale)
+    result = np.empty(len(information), np.bool_)
+    judge_matrices(np.ascontiguousarray(information), _ROUNDING, result)
+    return result
 
 
 def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:

@@ -1,0 +1,59 @@
+"""Which information matrices are ones, compiled: finite, symmetric, positive semidefinite."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True)
+def judge_matrices(matrices: NDArray[np.float64], rounding: float, is_sound: NDArray[np.bool_]) -> None:
+    """Fill ``is_sound`` (E,): which matrices (E, k, k) have no eigenvalue below −rounding times their largest entry.
+
+    Such a matrix has a Cholesky factor once that much is added to its diagonal.
+    """
+    factor = np.empty(matrices.shape[1:])
+    for e in range(matrices.shape[0]):
+        scale = _largest_entry(matrices[e])
+        is_sound[e] = math.isfinite(scale) and _is_symmetric(matrices[e], rounding * scale)
+        is_sound[e] = is_sound[e] and (scale == 0.0 or _has_factor(matrices[e], rounding * scale, factor))
+
+
+@njit(cache=True)
+def _largest_entry(A) -> float:
+    """The largest absolute value, NaN where one is."""
+    largest = 0.0
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            if not abs(A[i, j]) <= largest:
+                largest = abs(A[i, j])
+                if math.isnan(largest):
+                    return largest
+    return largest
+
+
+@njit(cache=True)
+def _is_symmetric(A, margin: float) -> bool:
+    for i in range(A.shape[0]):
+        for j in range(i):
+            if abs(A[i, j] - A[j, i]) > margin:
+                return False
+    return True
+
+
+@njit(cache=True)
+def _has_factor(A, shift: float, factor) -> bool:
+    """Whether A + shift · I has a Cholesky factor; ``factor`` (k, k) is room for it."""
+    for i in range(A.shape[0]):
+        for j in range(i + 1):
+            total = A[i, j]
+            for m in range(j):
+                total -= factor[i, m] * factor[j, m]
+            if i != j:
+                factor[i, j] = total / factor[j, j]
+            elif total + shift <= 0.0:
+                return False
+            else:
+                factor[i, i] = math.sqrt(total + shift)
+    return True
