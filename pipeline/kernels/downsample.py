@@ -74,12 +74,13 @@ def deskew(points, shares, twist):
     d = points.shape[1]
     origin = np.zeros(3)
     start, moved = np.eye(d + 1), np.eye(d + 1)
-    part = np.empty_like(twist)
+    part = np.empty(twist.shape[0])
     last = np.nan
     for i in range(points.shape[0]):
         if shares[i] != last:
             last = shares[i]
-            part[:] = twist * last
+            for k in range(twist.shape[0]):
+                part[k] = twist[k] * last
             perturb(part, start, origin, moved)
         x, y = points[i, 0], points[i, 1]
         z = points[i, 2] if d == 3 else 0.0

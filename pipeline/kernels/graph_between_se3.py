@@ -37,7 +37,7 @@ def jacobians(poses: _Array, edges: NDArray[np.int64], errors: _Array, jacobian:
         _coupling(error, Q)
         _multiply(Q, C, work)
         _multiply(C, work, Q)  # C Q C
-        J[:] = 0.0
+        J.fill(0.0)
         for a in range(3):
             for b in range(3):
                 for c in range(3):

@@ -34,7 +34,7 @@ def factorise(
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         front = work[: height * height].reshape(height, height)
         for a in range(height):
-            front[a, a:] = 0.0
+            front[a].fill(0.0)
         for b in range(blocks.start[f], blocks.start[f + 1]):
             _place_block(front, blocks, b, values)
         for _ in range(fronts.children[f]):
@@ -49,9 +49,11 @@ def factorise(
         rest = height - pivots
         start = fronts.factor_start[f]
         for a in range(pivots):
-            factor[start + a * height + a : start + (a + 1) * height] = front[a, a:]
+            for c in range(a, height):
+                factor[start + a * height + c] = front[a, c]
         for a in range(rest):
-            stack[depth + a * rest + a : depth + (a + 1) * rest] = front[pivots + a, pivots + a :]
+            for c in range(a, rest):
+                stack[depth + a * rest + c] = front[pivots + a, pivots + c]
         depth += rest * rest
         waiting[top] = f
         top += 1
@@ -66,7 +68,7 @@ def solve(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
-        local[:height] = 0.0
+        local[:height].fill(0.0)
         for a in range(pivots):
             row = factor[start + a * height : start + (a + 1) * height]
             value = (x[rows[a]] + local[a]) / row[a]

@@ -31,7 +31,8 @@ def selected_inverse(
         Z = work[: height * height].reshape(height, height)
         depth -= rest * rest
         for a in range(rest):
-            Z[pivots + a, pivots:] = stack[depth + a * rest : depth + (a + 1) * rest]
+            for c in range(rest):
+                Z[pivots + a, pivots + c] = stack[depth + a * rest + c]
         start = fronts.factor_start[f]
         for a in range(pivots - 1, -1, -1):
             _fill_row(Z, a, factor[start + a * height : start + (a + 1) * height])
@@ -71,7 +72,7 @@ def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
     """Fill row and column a of Z from those beyond it; upper is row a of U in the columns of the front."""
     height = upper.size
     row = Z[a]
-    row[a + 1 :] = 0.0
+    row[a + 1 :].fill(0.0)
     for m in range(a + 1, height):
         weight, below = upper[m] / upper[a], Z[m]
         for c in range(a + 1, height):

@@ -73,10 +73,10 @@ def scatter_between(
         i, j, pair = slots[f, 0], slots[f, 1], slots[f, 2]
         if i >= 0:
             _add(blocks[i], M, 1.0)
-            gradient[i] -= g
+            _add_row(gradient[i], g, -1.0)
         if j >= 0:
             _add(blocks[j], M, 1.0)
-            gradient[j] += g
+            _add_row(gradient[j], g, 1.0)
         if pair >= 0:
             _add(blocks[pair], M, -1.0)
 
@@ -90,12 +90,19 @@ def _add(block: _Array, M: _Array, sign: float) -> None:
 
 
 @njit(cache=True)
+def _add_row(row: _Array, g: _Array, sign: float) -> None:
+    """Add ±g to a row of the gradient."""
+    for a in range(g.size):
+        row[a] += sign * g[a]
+
+
+@njit(cache=True)
 def _weigh(J: _Array, e: _Array, omega: _Array, weight: float, whitened: _Array, M: _Array, g: _Array) -> None:
     """Fill whitened = w Ω J, M = Jᵀ w Ω J and g = (w Ω J)ᵀ e of one factor."""
     k = e.size
-    whitened[:] = 0.0
-    M[:] = 0.0
-    g[:] = 0.0
+    whitened.fill(0.0)
+    M.fill(0.0)
+    g.fill(0.0)
     for a in range(k):
         for c in range(k):
             scale = weight * omega[a, c]

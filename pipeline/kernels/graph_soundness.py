@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @njit(cache=True)
 def judge_matrices(matrices: NDArray[np.float64], rounding: float, is_sound: NDArray[np.bool_]) -> None:
-    """Fill ``is_sound`` (E,): which matrices (E, k, k) have no eigenvalue below −rounding times their largest entry.
+    """Fill ``is_sound`` (E,): which matrices (E, k, k) have no eigenvalue below −rounding · largest entry.
 
     Such a matrix has a Cholesky factor once that much is added to its diagonal.
     """
