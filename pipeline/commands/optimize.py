@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from pipeline.commands.outputs import check_output
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError
 from pipeline.settings import Override, load_settings
@@ -108,16 +109,9 @@ class Outputs:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        for path, ending in ((self.picture, ".png"), (self.recording, ".rrd")):
-            if path is not None and path.suffix != ending:
-                raise InputError(f"{path}: name a file that ends in {ending}")
+        endings = {self.picture: ".png", self.recording: ".rrd"}
         for path in self.paths:
-            if not path.parent.is_dir():
-                raise InputError(f"{path}: there is no folder {path.parent}; make it first")
-            if path.is_dir():
-                raise InputError(f"{path}: is a folder; name a file")
-            if path.exists() and not force:
-                raise InputError(f"{path}: exists; choose another name, or --force to replace it")
+            check_output(path, force=force, ending=endings.get(path, ""))
 
     def write(self, answer: Answer, viewing: Viewing) -> None:
         """Write them all."""
