@@ -84,13 +84,18 @@ class LogFit:
 
 
 def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) -> LogFit:
-    """Estimate state and noise; that of the odometry stays what it is unless it is None."""
+    """Estimate state and noise; that of the odometry stays what it is unless it is None.
+
+    Raises InputError where the observations tell nothing of the sensor's.
+    """
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
     reckoning = model.reckoned(np.zeros(len(OWN)))
     problem = BearingRangeProblem(model.measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
     variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
     now = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
+    if not np.all(now.consistency.redundancy > _LEAST_FREEDOM):
+        raise InputError("the landmarks were seen too seldom to tell the sensor's noise; give a longer log")
     iterations = now.minimum.iterations
     for turn in range(_TURNS):
         growth = now.consistency.growth(stated / variances)
@@ -131,13 +136,11 @@ def _settled(
     solver: LinearSolver,
     tolerance: float,
 ) -> _Settled:
-    """The minimum with noise as it is; raises InputError where the observations tell nothing of the sensor's."""
+    """The minimum with noise as it is."""
     minimum = minimise(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )
     covariance = Covariance(problem.system(minimum.at, minimum.weights))
     sources = variances[:4, None, None] * reckoning.sources
     found = consistency(problem, minimum, covariance, sources, loss.share)
-    if not np.all(found.sensor_freedom > _LEAST_FREEDOM):
-        raise InputError("the landmarks were seen too seldom to tell the sensor's noise; give a longer log")
     return _Settled(minimum, covariance, found)

@@ -12,7 +12,8 @@ from pipeline.landmarks.bearing_range import BearingRangeProblem
 from pipeline.landmarks.covariance import Covariance
 from pipeline.landmarks.minimise import Minimum
 
-_STATED = 10.0  # degrees of freedom that the noise stated beforehand counts as
+_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that what was stated counts as
+_LEAST_REDUNDANCY = 0.05  # of what the sightings count as
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +23,8 @@ class Consistency:
     Attributes
     ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
-    motion_freedom, sensor_freedom : degrees of freedom of those, observations less what the state takes up
+    motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
+    sightings : what all of them count as
     sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
     """
 
@@ -31,7 +33,13 @@ class Consistency:
     sources: NDArray[np.float64]
     sources_freedom: NDArray[np.float64]
     sensor: NDArray[np.float64]
-    sensor_freedom: NDArray[np.float64]
+    redundancy: NDArray[np.float64]
+    sightings: float
+
+    @property
+    def sensor_freedom(self) -> NDArray[np.float64]:
+        """The redundancy, but a small share of the sightings where shares are too rough for it, (2,)."""
+        return np.maximum(self.redundancy, _LEAST_REDUNDANCY * self.sightings)
 
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
         """By what the variances, those of odometry first, should grow, (6,); one where they are right.
@@ -71,5 +79,6 @@ def consistency(
         sources=((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2)),
         sources_freedom=(parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3)),
         sensor=(weights * at.observations**2).sum(axis=0),
-        sensor_freedom=(share[:, None] - weights * h).sum(axis=0),
+        redundancy=(share[:, None] - weights * h).sum(axis=0),
+        sightings=float(share.sum()),
     )
