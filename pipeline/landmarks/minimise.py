@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -46,7 +45,7 @@ class Minimum:
     state : the estimate; at : residuals and A there
     weights : (N,) robust weight of every observation
     cost : Σ r² of priors and odometry plus Σ ρ(χ²) of the observations
-    iterations : linear solves; converged, reason : whether and why it stopped
+    iterations : steps; converged, reason : whether and why it stopped
     """
 
     state: State
@@ -74,12 +73,14 @@ def minimise(
     It ends where ``descend`` says. The first damping is for a guess that may be poor; near the minimum 1e-10
     serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
-    landscape, start = _Landscape(problem, solver, loss), problem.linearise(guess)
+    start = problem.linearise(guess)
     here = Evaluation(guess, start, _cost(start, loss))
-    descent = descend(landscape, here, step_rule(optimiser, first_damping), max_iterations, tolerance)
+    descent = descend(
+        _Landscape(problem, solver, loss), here, step_rule(optimiser, first_damping), max_iterations, tolerance
+    )
     end = descent.end
     weights = loss.weight(end.at.observation_chi2)
-    return Minimum(end.state, end.at, weights, end.cost, landscape.solves, descent.converged, descent.reason)
+    return Minimum(end.state, end.at, weights, end.cost, descent.iterations, descent.converged, descent.reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,37 +93,28 @@ class Evaluation:
 
 
 class _Landscape:
-    """The cost of a problem with one loss; counts the linear solves."""
+    """The cost of a problem with one loss."""
 
     def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, loss: Loss) -> None:
         self._problem, self._solver, self._loss = problem, solver, loss
-        self.solves = 0
 
     def model(self, now: Evaluation) -> _Model:
         weights = self._loss.weight(now.at.observation_chi2)
-        return _Model(self._problem.system(now.at, weights), self._solve)
+        return _Model(self._problem, self._solver, self._problem.system(now.at, weights))
 
     def moved(self, now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
         state = now.state.moved(step)
         at = self._problem.linearise(state)
         return Evaluation(state, at, _cost(at, self._loss))
 
-    def _solve(self, system: LinearSystem, damping: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        self.solves += 1
-        return self._solver.solve(system if damping is None else self._problem.damped(system, damping)).x
-
 
 class _Model:
     """H = AᵀA and g = −Aᵀb."""
 
-    def __init__(
-        self,
-        system: LinearSystem,
-        solve: Callable[[LinearSystem, NDArray[np.float64] | None], NDArray[np.float64]],
-    ) -> None:
-        self._system, self._solve = system, solve
-        downhill, self.diagonal = np.empty(system.pattern.shape[1]), np.empty(system.pattern.shape[1])
+    def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> None:
+        self._problem, self._solver, self._system = problem, solver, system
         pattern = system.pattern
+        downhill, self.diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
         normal_equations.gradient(
             pattern.row_start, pattern.columns, system.values, system.b, downhill, self.diagonal
         )
@@ -130,9 +122,9 @@ class _Model:
 
     def solve(self, damping: float) -> NDArray[np.float64]:
         if not damping:
-            return self._solve(self._system, None)
+            return self._solver.solve(self._system).x
         try:
-            return self._solve(self._system, damping * self.diagonal)
+            return self._solver.solve(self._problem.damped(self._system, damping * self.diagonal)).x
         except UndeterminedError as error:
             raise SingularMatrixError(int(error.columns[0])) from error
 

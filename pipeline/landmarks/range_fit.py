@@ -69,7 +69,7 @@ class LogFit:
     variances : (6,) of the odometry's sources as ``OdometryNoise`` has them, of bearing and range
     loss : of the observations
     covariance, consistency : at the minimum
-    iterations : linear solves after the guess
+    iterations : steps after the guess
     """
 
     reckoned: State

@@ -76,7 +76,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     )
     own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
-    after = f"{ended} after {solution.iterations} linear solves: {solution.reason}"
+    after = f"{ended} after {solution.iterations} steps: {solution.reason}"
     doubted = int(np.count_nonzero(solution.weights < _DOUBTED * solution.loss.share))
     return (
         Fact("observations", seen),
