@@ -57,8 +57,9 @@ for _command in _COMMANDS:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
     viewing = Viewing(
-        _record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph, _present_landmarks
-    )
+        _record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph, _present_landmarks,
+        _record_landmarks,
+    )  # fmt: skip
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
@@ -140,6 +141,12 @@ def _present_landmarks(directory: Path, studies: Sequence[Study]) -> None:
     from viz.landmark_report import write_report
 
     write_report(directory, studies)
+
+
+def _record_landmarks(studies: Sequence[Study], path: Path) -> None:
+    from viz.landmark_recording import record_landmarks
+
+    record_landmarks(studies, path)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from scenes import shared_data
 from pipeline.graph.robust import RobustLoss
 from pipeline.kernels import dead_reckoning, landmark_factors
 from pipeline.landmarks import guess as guesses
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements, world_referenced
+from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
 from pipeline.landmarks.minimise import QUADRATIC, minimise
 from pipeline.landmarks.npz import read_landmark_data
 from pipeline.landmarks.problem import State
@@ -59,7 +59,7 @@ def test_dead_reckoning_equals_many_short_steps_and_stands_still_before_the_firs
     times = np.array([1.0, 1.7, 2.2, 4.0])
     velocities = np.array([[0.5, 0.3], [0.2, -1.0], [0.0, 0.8], [1.0, 0.0]])
     nodes = np.array([0.2, 1.5, 2.1, 4.5])
-    motion, spread = np.empty((3, 3)), np.empty((3, 3, 3, 3))
+    motion, spread = np.empty((3, 3)), np.empty((3, 4, 3, 3))
     dead_reckoning.integrate(times, velocities, nodes, motion, spread)
     for k in range(3):
         expected = naive_landmarks.dead_reckoned(times, velocities, nodes[k], nodes[k + 1])
@@ -67,17 +67,18 @@ def test_dead_reckoning_equals_many_short_steps_and_stands_still_before_the_firs
 
 
 def test_the_spread_of_dead_reckoning_is_what_noisy_velocities_do():
-    """White noise of density q on a velocity held for τ is a velocity error of variance q / τ."""
+    """Noise of density q a metre, at v held for τ, is a velocity error of variance q v / τ; turning likewise."""
     rng = np.random.default_rng(0)
     times, nodes = np.arange(0.0, 2.0, 0.1), np.array([0.0, 2.0])
     clean = np.tile([0.8, 0.5], (len(times), 1))
-    motion, spread = np.empty((1, 3)), np.empty((1, 3, 3, 3))
+    motion, spread = np.empty((1, 3)), np.empty((1, 4, 3, 3))
     dead_reckoning.integrate(times, clean, nodes, motion, spread)
-    densities = np.array([4e-4, 0.0, 9e-4])
+    densities = np.array([4e-4, 0.0, 5e-4, 8e-4])
+    variances = np.array([0.8 * densities[0], 0.8 * densities[2] + 0.5 * densities[3]]) / 0.1
     sampled = np.empty((4000, 3))
     for k in range(len(sampled)):
-        noisy = clean + rng.normal(size=clean.shape) * np.sqrt(densities[[0, 2]] / 0.1)
-        dead_reckoning.integrate(times, noisy, nodes, motion, np.empty((1, 3, 3, 3)))
+        noisy = clean + rng.normal(size=clean.shape) * np.sqrt(variances)
+        dead_reckoning.integrate(times, noisy, nodes, motion, np.empty((1, 0, 3, 3)))
         sampled[k] = motion[0]
     expected = np.einsum("c,cab->ab", densities, spread[0])
     assert np.allclose(np.cov(sampled.T), expected, atol=0.1 * np.abs(expected).max())
@@ -140,9 +141,10 @@ def measurements(seed=0, unit=1.0, outliers=0):
             first_covariance=1e-6 * np.diag(scale**2),
             motion=motion * scale,
             motion_covariance=np.tile(np.diag((np.array([0.01, 0.005, 0.01]) * scale) ** 2), (39, 1, 1)),
+            calibration=no_calibration(motion),
             observed=observed,
             measured=np.stack([naive_landmarks.wrapped(bearing), reach / unit], axis=1),
-            measured_covariance=np.tile(np.diag([0.02**2, (0.05 / unit) ** 2]), (len(observed), 1, 1)),
+            measured_covariance=np.diag([0.02**2, (0.05 / unit) ** 2]),
             landmarks=np.arange(6),
         ),
     )

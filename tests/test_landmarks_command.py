@@ -77,8 +77,8 @@ def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, smal
     ("words", "said"),
     [
         (["--method", "chol"], "there is no method 'chol'"),
-        (["--odometry-noise", "1,2"], "give three positive numbers"),
-        (["--odometry-noise", "0.1,0.1,-1"], "give three positive numbers"),
+        (["--odometry-noise", "1,2"], "give four positive numbers"),
+        (["--odometry-noise", "0.1,0.1,-1,1"], "give four positive numbers"),
         (["--robot", "0"], "--robot"),
     ],
 )

@@ -14,6 +14,7 @@ from pipeline.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.landmarks.dead_reckoning import OdometryNoise
+    from pipeline.landmarks.minimise import Optimiser
     from pipeline.landmarks.study import Guess, Study
     from pipeline.runs.recorder import Viewing
 
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
 @click.option(
     "--odometry-noise",
     "noise",
-    metavar="FORWARD,SIDEWAYS,TURN",
-    help="Of an MRCLAM robot after one second: m, m, rad. [default: 0.01,0.003,0.03]",
+    metavar="FORWARD,SIDEWAYS,DRIFT,TURN",
+    help="Of an MRCLAM robot after a metre: m, m, rad; after a radian: rad. [default: estimated]",
 )
 @click.option(
     "--guess",
@@ -48,6 +49,16 @@ if TYPE_CHECKING:
     default="odometry",
     show_default=True,
     help="Where a nonlinear file begins: disturbed by 1 m and 0.5 rad, or with all landmarks at the origin.",
+)
+@click.option(
+    "--optimiser",
+    type=click.Choice(["levenberg-marquardt", "gauss-newton", "dogleg", "gradient-descent"]),
+    default="levenberg-marquardt",
+    show_default=True,
+    help="Of a nonlinear file.",
+)
+@click.option(
+    "--recording", metavar="FILE.rrd", type=click.Path(path_type=Path), help="Record before and after for rerun."
 )
 @click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run.")
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
@@ -61,6 +72,8 @@ def landmarks(
     robot: int,
     noise: str | None,
     guess: Guess,
+    optimiser: Optimiser,
+    recording: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -76,8 +89,10 @@ def landmarks(
     Examples:
       scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --out runs/linear
       scanchain landmarks 2d_nonlinear.npz --guess origin --method cholesky,schur --out runs/nonlinear
+      scanchain landmarks 2d_nonlinear.npz --optimiser dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
+    from pipeline.commands.outputs import check_output
     from pipeline.commands.terminal import Terminal
     from pipeline.landmarks.solvers import parse_methods
     from pipeline.landmarks.study import Options
@@ -87,8 +102,10 @@ def landmarks(
     from pipeline.runs.compiling import telling_of_compilation
     from pipeline.runs.directory import RunDirectory
 
-    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess)
+    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
     viewing: Viewing = ctx.obj
+    if recording is not None:
+        check_output(recording, force=force, ending=".rrd")
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with telling_of_compilation(terminal):
             studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]
@@ -96,24 +113,26 @@ def landmarks(
         tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
         _write(directory.path, data, studies, tree)
         viewing.present_landmarks(directory.path, studies)
+        if recording is not None:
+            viewing.record_landmarks(studies, recording)
         directory.complete()
     click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
     if not as_json:
-        click.echo(f"\nwritten        {out}")
+        click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
 
 
-def _noise(text: str | None) -> OdometryNoise:
-    """Three positive numbers with commas."""
+def _noise(text: str | None) -> OdometryNoise | None:
+    """Four positive numbers with commas; None is to be estimated."""
     from pipeline.landmarks.dead_reckoning import OdometryNoise
 
     if text is None:
-        return OdometryNoise()
+        return None
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != 3 or not all(0.0 < value < 1e3 for value in values):
-        raise InputError(f"--odometry-noise is {text!r}; give three positive numbers, as 0.01,0.003,0.03")
+    if len(values) != 4 or not all(0.0 < value < 1e3 for value in values):
+        raise InputError(f"--odometry-noise is {text!r}; give four positive numbers, as 0.03,0.01,0.05,0.1")
     return OdometryNoise(*values)
 
 

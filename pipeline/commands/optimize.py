@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
+from pipeline.commands.graph_answer import Answer
+from pipeline.commands.outputs import check_output
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError
 from pipeline.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from pipeline.config import GraphConfig
-    from pipeline.graph.certificate import Certificate
-    from pipeline.graph.g2o import G2oFile
     from pipeline.graph.initialise import Initialisation
-    from pipeline.graph.optimisation import GraphChange, Optimisation
     from pipeline.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
@@ -108,16 +106,9 @@ class Outputs:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        for path, ending in ((self.picture, ".png"), (self.recording, ".rrd")):
-            if path is not None and path.suffix != ending:
-                raise InputError(f"{path}: name a file that ends in {ending}")
+        endings = {self.picture: ".png", self.recording: ".rrd"}
         for path in self.paths:
-            if not path.parent.is_dir():
-                raise InputError(f"{path}: there is no folder {path.parent}; make it first")
-            if path.is_dir():
-                raise InputError(f"{path}: is a folder; name a file")
-            if path.exists() and not force:
-                raise InputError(f"{path}: exists; choose another name, or --force to replace it")
+            check_output(path, force=force, ending=endings.get(path, ""))
 
     def write(self, answer: Answer, viewing: Viewing) -> None:
         """Write them all."""
@@ -134,63 +125,6 @@ class Outputs:
             viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
             viewing.record_graph(answer.change, self.recording)
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What there is to print."""
-
-    file: G2oFile
-    change: GraphChange
-    optimisation: Optimisation
-    certificate: Certificate
-
-    def text(self, written: list[Path]) -> str:
-        """A line for each fact."""
-        graph, done = self.file.graph, self.optimisation
-        guess = done.initialisation
-        if guess == "given":
-            guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
-        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
-        lines = [
-            f"graph          {self.change.name}: {size}",
-            *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
-            f"first guess    {guess}",
-            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
-            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
-        ]
-        if graph.is_loop.any():
-            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
-            lines.append(
-                f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
-            )
-        held = ", the robust weights held" if graph.is_loop.any() else ""
-        lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
-        return "\n".join([*lines, *(f"written        {path}" for path in written)])
-
-    def json(self, written: list[Path]) -> str:
-        """The same, and every rejected edge, by vertex ids."""
-        graph, done = self.file.graph, self.optimisation
-        tree = {
-            "graph": self.change.name,
-            "dimension": graph.dimension,
-            "poses": len(graph),
-            "edges": len(graph.edges),
-            "suspected": int(graph.is_loop.sum()),
-            "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
-            "kept_lines": dict(self.file.other_tags),
-            "chi2_before": done.chi2_before,
-            "chi2_after": done.chi2_after,
-            "cost_after": done.cost_after,
-            "iterations": done.iterations,
-            "converged": done.converged,
-            "reason": done.reason,
-            "initialisation": done.initialisation,
-            "time_s": done.time_s,
-            "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
-            "written": [str(path) for path in written],
-        }
-        return json.dumps(tree, indent=2)
 
 
 def _shortcuts(flags: dict[str, str | None]) -> list[Override]:

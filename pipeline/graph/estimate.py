@@ -29,11 +29,3 @@ class Minimum:
     iterations: int
     converged: bool
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Move:
-    """A step (n k,) of left twists, and where it leads."""
-
-    step: NDArray[np.float64]
-    to: Estimate

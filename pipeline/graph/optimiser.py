@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem, NormalEquations
+from pipeline.graph.curvature import full_curvature
+from pipeline.graph.descent import descend
 from pipeline.graph.estimate import Estimate, Minimum
 from pipeline.graph.robust import RobustLoss
-from pipeline.graph.steps import Optimiser, step_rule
+from pipeline.graph.steps import Optimiser, Vector, step_rule
 from pipeline.graph.verdicts import Verdicts
 
 Loss = RobustLoss | Verdicts
@@ -23,7 +25,7 @@ class Minimiser:
         self.problem = problem
         self.optimiser: Optimiser = optimiser
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
-        self._rule = step_rule(optimiser, problem)
+        self._rule = step_rule(optimiser)
 
     def evaluate(self, poses: Matrix, loss: Loss) -> Estimate:
         """Residuals, χ² and cost at these poses."""
@@ -47,34 +49,48 @@ class Minimiser:
 
     def descend(self, now: Estimate, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
         """Step after step until nothing more is to be gained."""
-        for iteration in range(max_iterations):
-            weights = self.weights(now.chi2, loss)
-            equations = self.problem.linearise(now.poses, now.errors, weights)
-            if self._flat(equations, tolerance):
-                return Minimum(now, weights, iteration, True, "gradient below the tolerance")
-            move = self._rule.move(now, equations, lambda poses: self.evaluate(poses, loss))
-            if move is None:
-                return Minimum(now, weights, iteration, False, "no step lowers χ²")
-            gained, now = now.cost - move.to.cost, move.to
-            if gained < 0.0:
-                continue
-            if gained <= tolerance * now.cost:
-                return self._ended(now, loss, iteration + 1, "χ² change below the tolerance")
-            if np.abs(move.step).max(initial=0.0) <= tolerance:
-                return self._ended(now, loss, iteration + 1, "step below the tolerance")
-        reason = f"{max_iterations} iterations reached"
-        return Minimum(now, self.weights(now.chi2, loss), max_iterations, False, reason)
-
-    def _ended(self, now: Estimate, loss: Loss, iterations: int, reason: str) -> Minimum:
-        return Minimum(now, self.weights(now.chi2, loss), iterations, True, reason)
-
-    def _flat(self, equations: NormalEquations, tolerance: float) -> bool:
-        """Whether the gradient, each entry in units of its own curvature, is below the tolerance."""
-        diagonal = np.maximum(equations.values[self.problem.pattern.diagonal], 1e-300)
-        return bool(np.all(np.abs(equations.gradient) <= tolerance * np.sqrt(diagonal)))
+        descent = descend(_Landscape(self, loss), now, self._rule, max_iterations, tolerance)
+        weights = self.weights(descent.end.chi2, loss)
+        return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
 
     def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
         if loss.kernel == "none" or not len(self.loops):
             return float(chi2.sum())
         loops = chi2[self.loops]
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
+
+
+class _Landscape:
+    """The cost of a graph with one loss."""
+
+    def __init__(self, minimiser: Minimiser, loss: Loss) -> None:
+        self._minimiser, self._loss = minimiser, loss
+
+    def model(self, now: Estimate) -> _Model:
+        minimiser = self._minimiser
+        weights = minimiser.weights(now.chi2, self._loss)
+        equations = minimiser.problem.linearise(now.poses, now.errors, weights)
+        is_full = minimiser.optimiser == "newton"
+        curvature = full_curvature(minimiser.problem, now, equations) if is_full else equations.values
+        return _Model(minimiser.problem, equations, curvature)
+
+    def moved(self, now: Estimate, step: Vector) -> Estimate:
+        return self._minimiser.evaluate(self._minimiser.problem.moved(now.poses, step), self._loss)
+
+
+class _Model:
+    """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
+
+    def __init__(self, problem: BetweenProblem, equations: NormalEquations, curvature: Vector) -> None:
+        self._problem, self._values, self._curvature = problem, equations.values, curvature
+        self.gradient = equations.gradient
+        self.diagonal = equations.values[problem.pattern.diagonal]
+
+    def solve(self, damping: float) -> Vector:
+        damped = self._curvature.copy()
+        damped[self._problem.pattern.diagonal] += damping * self.diagonal
+        self._problem.cholesky.factorise(damped)
+        return self._problem.cholesky.solve(-self.gradient)
+
+    def bend(self, step: Vector) -> Vector:
+        return self._problem.pattern.multiply(self._values, step)

@@ -15,13 +15,11 @@ from pipeline.graph.between import BetweenProblem
 from pipeline.graph.certificate import Certificate, certify
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.covariance import own_covariances, relative_covariance
-from pipeline.graph.estimate import Minimum
-from pipeline.graph.graduation import Judgement, minimise
+from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.initialise import Initialisation, first_guess
+from pipeline.graph.initialise import Initialisation
 from pipeline.graph.optimisation import Optimisation
-from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import rejection_limit, robust_loss
+from pipeline.graph.solve import solve
 from pipeline.graph.soundness import check_connected, check_edges, undetermined
 
 
@@ -152,29 +150,21 @@ class PoseGraph:
         begin = time.perf_counter()
         problem = self._prepared()
         chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
-        trusted = config.robust == "none" or not self.is_loop.any()
-        guess, source = first_guess(problem, self.poses, initialise, trusted=trusted)
-        shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
-        guess[:, :-1, -1] -= shift
-        loss = robust_loss(config.robust, config.robust_scale, self.freedom)
-        minimiser = Minimiser(problem, self.is_loop, config.optimiser)
-        try:
-            minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance, judgement)
-        except SingularMatrixError as error:
-            raise undetermined(int(problem.free[error.variable])) from error
-        self._take(minimum, shift)
-        chi2 = minimum.estimate.chi2
-        limit = np.inf if config.robust == "none" else rejection_limit(config.robust_scale, self.freedom)
+        solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+        minimum = solved.minimum
+        self._poses.replace(solved.poses)
+        self._weight.replace(minimum.weights)
+        self._factor_is_now = False
         return Optimisation(
             state=self.state(),
             chi2_before=chi2_before,
-            chi2_after=float(chi2.sum()),
+            chi2_after=float(minimum.estimate.chi2.sum()),
             cost_after=minimum.estimate.cost,
-            rejected=(self.is_loop & ((minimum.weights == 0.0) | (chi2 > limit)))[self._order()],
+            rejected=solved.rejected[self._order()],
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
-            initialisation=source,
+            initialisation=solved.initialisation,
             time_s=time.perf_counter() - begin,
         )
 
@@ -235,27 +225,9 @@ class PoseGraph:
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
 
-    def _take(self, minimum: Minimum, shift: NDArray[np.float64]) -> None:
-        """Keep the answer; fixed poses stay to the bit."""
-        poses = orthonormal(minimum.estimate.poses)
-        poses[:, :-1, -1] += shift
-        fixed = self.fixed
-        poses[fixed] = self.poses[fixed]
-        self._poses.replace(poses)
-        self._weight.replace(minimum.weights)
-        self._factor_is_now = False
-
     def _order(self) -> NDArray[np.int64]:
         """Edges with odometry first, otherwise as they were added."""
         return np.argsort(self.is_loop, kind="stable")
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
-
-
-def orthonormal(poses: Matrix) -> Matrix:
-    """Poses whose nearly orthonormal rotations are made so again, R (3 I − RᵀR) / 2, one Newton step."""
-    result, d = poses.copy(), poses.shape[-1] - 1
-    R = poses[:, :d, :d]
-    result[:, :d, :d] = R @ (1.5 * np.eye(d) - 0.5 * np.swapaxes(R, 1, 2) @ R)
-    return result

@@ -32,7 +32,8 @@ def products(
         H = [P, Bᵀ; B, C],  band[w + i − j, j] = P_ij for i ≤ j  (LAPACK's upper band of width w)
 
     row_start (m + 1,), columns, values : A by rows; b (m,); split : columns of the poses
-    band (w + 1, split), border (split, n − split) Bᵀ, corner (n − split, n − split) C, g (n,) : zero before
+    band (w + 1, split), border (split, n − split) Bᵀ, corner (n − split, n − split) upper triangle of C, g (n,) :
+        zero before
     """
     w = band.shape[0] - 1
     for r in range(row_start.size - 1):
@@ -41,12 +42,13 @@ def products(
             g[i] += values[p] * b[r]
             for q in range(row_start[r], row_start[r + 1]):
                 j, product = columns[q], values[p] * values[q]
-                if i < split:
-                    if i <= j < split:
-                        band[w + i - j, j] += product
-                    elif j >= split:
-                        border[i, j - split] += product
-                elif j >= split:
+                if j < i:
+                    continue
+                if j < split:
+                    band[w + i - j, j] += product
+                elif i < split:
+                    border[i, j - split] += product
+                else:
                     corner[i - split, j - split] += product
 
 

@@ -13,12 +13,14 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
 
     A velocity holds until the next one comes. An arc of duration τ at (v, ω) moves by
         θ ← θ + ω τ,  t ← t + v τ sinc(ω τ / 2) (cos, sin)(θ + ω τ / 2)
-    White noise of unit density on the forward, the sideways and the turning velocity (m²/s, m²/s, rad²/s) spreads
-    the motion by P ← F P Fᵀ + G τ Gᵀ each, F and G of the arc at its middle (Thrun, Burgard & Fox 2005, ch. 5).
+    Noise that grows with what is driven spreads the motion by P ← F P Fᵀ + G d Gᵀ, F and G of the arc at its
+    middle (Thrun, Burgard & Fox 2005, ch. 5), from four sources: forward, sideways and turning with d = |v| τ,
+    turning with d = |ω| τ.
 
     times_s (M,) ascending, velocities (M, 2) v in m/s and ω in rad/s, nodes_s (K,) ascending
     motion (K − 1, 3) x, y, θ in the frame of the earlier node : filled
-    spread (K − 1, 3, 3, 3) covariance of the motion for each of the three unit densities : filled
+    spread (K − 1, 4, 3, 3) covariance of the motion from each source of unit density : filled; given as
+        (K − 1, 0, 3, 3) the motion alone is worked out
     """
     at = 0
     F = np.eye(3)
@@ -43,14 +45,15 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
             c, s = np.cos(heading + half), np.sin(heading + half)
             x, y, heading = x + chord * c, y + chord * s, heading + 2.0 * half
             F[0, 2], F[1, 2] = -chord * s, chord * c
-            for noise in range(3):
-                _spread(P[noise], F, noise, c, s, chord, lasting)
+            for noise in range(P.shape[0]):
+                driven = abs(v if noise < 3 else turn_rate) * lasting
+                _spread(P[noise], F, noise, c, s, chord, driven)
             now = until
         motion[k, 0], motion[k, 1], motion[k, 2] = x, y, heading
 
 
 @njit(cache=True)
-def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, lasting: float) -> None:
+def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, driven: float) -> None:
     """Carry a covariance along one arc and add what its own noise adds."""
     for a in range(2):  # F P Fᵀ, F the identity but for its last column
         for b in range(3):
@@ -61,14 +64,14 @@ def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, 
     g0, g1, g2 = c, s, 0.0
     if noise == 1:
         g0, g1 = -s, c
-    elif noise == 2:
+    elif noise >= 2:
         g0, g1, g2 = -0.5 * chord * s, 0.5 * chord * c, 1.0
-    P[0, 0] += lasting * g0 * g0
-    P[0, 1] += lasting * g0 * g1
-    P[1, 0] += lasting * g0 * g1
-    P[1, 1] += lasting * g1 * g1
-    P[0, 2] += lasting * g0 * g2
-    P[2, 0] += lasting * g0 * g2
-    P[1, 2] += lasting * g1 * g2
-    P[2, 1] += lasting * g1 * g2
-    P[2, 2] += lasting * g2 * g2
+    P[0, 0] += driven * g0 * g0
+    P[0, 1] += driven * g0 * g1
+    P[1, 0] += driven * g0 * g1
+    P[1, 1] += driven * g1 * g1
+    P[0, 2] += driven * g0 * g2
+    P[2, 0] += driven * g0 * g2
+    P[1, 2] += driven * g1 * g2
+    P[2, 1] += driven * g1 * g2
+    P[2, 2] += driven * g2 * g2

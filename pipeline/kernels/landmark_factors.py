@@ -52,7 +52,7 @@ def bearing_range(
     """Fill W r and W J of every observation, W whitening: WᵀW = Σ⁻¹.
 
     poses (K, 2 or 3), landmarks (L, 2), observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m
-    whitening (N, 2, 2); residuals (N, 2), jacobians (N, 2, pose + 2) filled
+    whitening (2, 2); residuals (N, 2), jacobians (N, 2, pose + 2) filled
     """
     width = poses.shape[1] + 2
     r, J = np.empty(2), np.empty((2, width))
@@ -60,9 +60,9 @@ def bearing_range(
         i, j = observed[k]
         bearing_range_block(poses[i], landmarks[j], measured[k, 0], measured[k, 1], r, J)
         for a in range(2):
-            residuals[k, a] = whitening[k, a, 0] * r[0] + whitening[k, a, 1] * r[1]
+            residuals[k, a] = whitening[a, 0] * r[0] + whitening[a, 1] * r[1]
             for c in range(width):
-                jacobians[k, a, c] = whitening[k, a, 0] * J[0, c] + whitening[k, a, 1] * J[1, c]
+                jacobians[k, a, c] = whitening[a, 0] * J[0, c] + whitening[a, 1] * J[1, c]
 
 
 @njit(cache=True)

@@ -38,7 +38,7 @@ def pose_columns(layout: Layout, poses: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def landmark_columns(layout: Layout, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Columns of each landmark, (N, 2)."""
-    return layout.split + 2 * landmarks[:, None] + np.arange(2)
+    return layout.landmark_start + 2 * landmarks[:, None] + np.arange(2)
 
 
 def difference_rows(W: Matrix, first: NDArray[np.int64], second: NDArray[np.int64]) -> Rows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,12 @@ class Linearisation:
 
     Attributes
     ----------
-    prior, odometry, observations : residuals (p,), (K − 1, p), (N, 2); pure numbers
-    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p), (N, 2, p + 2)
+    prior, calibration, odometry, observations : residuals (p,), (C,), (K − 1, p), (N, 2); pure numbers
+    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p + C), (N, 2, p + 2)
     """
 
     prior: NDArray[np.float64]
+    calibration: NDArray[np.float64]
     odometry: Matrix
     observations: Matrix
     prior_rows: Matrix
@@ -41,6 +42,29 @@ class Linearisation:
 
 
 @dataclass(frozen=True, slots=True)
+class Calibration:
+    """Unknowns of the robot that its motions depend on, all of them alike.
+
+    Attributes
+    ----------
+    names : (C,) what they are called
+    value : (C,) at which the motions were worked out; slope (K − 1, p, C) by how much they change with them
+    mean, sigma : (C,) prior
+    """
+
+    names: tuple[str, ...]
+    value: NDArray[np.float64]
+    slope: Matrix
+    mean: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+def no_calibration(motion: Matrix) -> Calibration:
+    """Of motions (K − 1, p) that are what they are."""
+    return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
 class Measurements:
     """What a bearing-range problem is made of.
 
@@ -49,8 +73,9 @@ class Measurements:
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's
+    calibration : what the motions may all be off by
     observed : (N, 2) pose, landmark
-    measured, measured_covariance : (N, 2), (N, 2, 2) bearing in rad, range in m
+    measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; of every one alike
     landmarks : (L,) their names, as numbers
     """
 
@@ -58,51 +83,70 @@ class Measurements:
     first_covariance: Matrix
     motion: Matrix
     motion_covariance: Matrix
+    calibration: Calibration
     observed: NDArray[np.int64]
     measured: Matrix
     measured_covariance: Matrix
     landmarks: NDArray[np.int64]
 
+    def motion_at(self, calibration: NDArray[np.float64]) -> Matrix:
+        """The motions with another calibration, to first order."""
+        return self.motion + self.calibration.slope @ (calibration - self.calibration.value)
+
 
 class BearingRangeProblem:
     """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
 
-    ``motion_columns`` (K − 1, 2 p) and ``observation_columns`` (N, p + 2) are the unknowns of each of them.
+    ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the unknowns of each of them,
+    ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
     """
 
     def __init__(self, measurements: Measurements) -> None:
         given = measurements
         self.measurements = given
         size = given.motion.shape[1]
-        layout = Layout(len(given.motion) + 1, size, given.landmarks)
-        self._first, self._motion = whitening(given.first_covariance), whitening(given.motion_covariance)
-        self._observation = whitening(given.measured_covariance)
+        layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
+        self._first = whitening(given.first_covariance)
+        self._whiten()
         poses = pose_columns(layout, np.arange(layout.poses))
+        own = np.arange(layout.split, layout.landmark_start)
         seen_from, seen = given.observed.T
         pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen)], axis=1)
-        moves = np.concatenate([poses[:-1], poses[1:]], axis=1)
-        groups = [np.repeat(poses[:1], size, axis=0), np.repeat(moves, size, axis=0), np.repeat(pairs, 2, axis=0)]
+        moves = np.concatenate([poses[:-1], poses[1:], np.tile(own, (len(given.motion), 1))], axis=1)
+        groups = [
+            np.repeat(poses[:1], size, axis=0), own[:, None], np.repeat(moves, size, axis=0),
+            np.repeat(pairs, 2, axis=0),
+        ]  # fmt: skip
         damping = np.arange(layout.columns)[:, None]
         self.motion_columns, self.observation_columns = moves, pairs
         self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
 
-    def with_noise(self, measured_covariance: Matrix) -> BearingRangeProblem:
-        """The same problem, with the same pattern, and another covariance (N, 2, 2) of what was measured."""
+    def of(self, measurements: Measurements) -> BearingRangeProblem:
+        """The same pattern with other numbers."""
         result = copy(self)
-        result.measurements = replace(self.measurements, measured_covariance=measured_covariance)
-        result._observation = whitening(measured_covariance)
+        result.measurements = measurements
+        result._whiten()
         return result
+
+    def _whiten(self) -> None:
+        given = self.measurements
+        self.motion_whitening = whitening(given.motion_covariance)
+        self._slope = -self.motion_whitening @ given.calibration.slope
+        self._observation = whitening(given.measured_covariance)
 
     def linearise(self, state: State) -> Linearisation:
         """Residuals and Jacobians at a state."""
         given, p = self.measurements, state.poses.shape[1]
+        calibration = given.calibration
         motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
         if p == 3:
-            landmark_factors.odometry(state.poses, given.motion, self._motion, motion, J_motion)
+            landmark_factors.odometry(state.poses, given.motion, self.motion_whitening, motion, J_motion)
         else:
-            W = self._motion
+            W = self.motion_whitening
             motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
             J_motion = np.concatenate([-W, W], axis=-1)
+        motion += self._slope @ (state.calibration - calibration.value)
+        J_motion = np.concatenate([J_motion, self._slope], axis=-1)
         seen = np.empty(given.measured.shape)
         J_seen = np.empty((len(seen), 2, p + 2))
         landmark_factors.bearing_range(
@@ -110,14 +154,16 @@ class BearingRangeProblem:
         )
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
-        return Linearisation(self._first @ off, motion, seen, self._first, J_motion, J_seen)
+        own = (state.calibration - calibration.mean) / calibration.sigma
+        return Linearisation(self._first @ off, own, motion, seen, self._first, J_motion, J_seen)
 
     def system(self, at: Linearisation, weights: NDArray[np.float64]) -> LinearSystem:
         """The step's system A x = −r, observations weighed by √w (N,)."""
         root = np.sqrt(weights)[:, None]
         seen = at.observation_rows * root[..., None]
-        values = np.concatenate([at.prior_rows.ravel(), at.odometry_rows.ravel(), seen.ravel()])
-        b = -np.concatenate([at.prior, at.odometry.ravel(), (at.observations * root).ravel()])
+        own = 1.0 / self.measurements.calibration.sigma
+        values = np.concatenate([at.prior_rows.ravel(), own, at.odometry_rows.ravel(), seen.ravel()])
+        b = -np.concatenate([at.prior, at.calibration, at.odometry.ravel(), (at.observations * root).ravel()])
         return LinearSystem(self.pattern, values, b)
 
     def damped(self, system: LinearSystem, damping: NDArray[np.float64]) -> LinearSystem:
@@ -128,14 +174,14 @@ class BearingRangeProblem:
 
 def world_referenced(data: LandmarkData) -> Measurements:
     """The problem of a course file: headings are known, so that bearings are those of the world's axes."""
-    count, steps = len(data.observed), len(data.odometry)
     return Measurements(
         first_pose=np.zeros(2),
         first_covariance=_ANCHOR**2 * data.odometry_covariance,
         motion=data.odometry,
-        motion_covariance=np.broadcast_to(data.odometry_covariance, (steps, 2, 2)),
+        motion_covariance=np.broadcast_to(data.odometry_covariance, (len(data.odometry), 2, 2)),
+        calibration=no_calibration(data.odometry),
         observed=data.observed,
         measured=data.measured,
-        measured_covariance=np.broadcast_to(data.observation_covariance, (count, 2, 2)),
+        measured_covariance=data.observation_covariance,
         landmarks=np.arange(len(data.true_landmarks)),
     )

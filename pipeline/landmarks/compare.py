@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.graph.robust import RobustLoss
 from pipeline.landmarks.bearing_range import BearingRangeProblem
-from pipeline.landmarks.minimise import minimise
+from pipeline.landmarks.minimise import Optimiser, minimise
 from pipeline.landmarks.problem import State
 from pipeline.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
 from pipeline.landmarks.system import Layout, LinearSystem, Pattern
@@ -59,12 +58,12 @@ def compare_linear(system: LinearSystem, methods: Sequence[str], repeats: int) -
 
 
 def compare_nonlinear(
-    problem: BearingRangeProblem, guess: State, loss: RobustLoss, methods: Sequence[str], repeats: int
+    problem: BearingRangeProblem, guess: State, optimiser: Optimiser, methods: Sequence[str], repeats: int
 ) -> tuple[MethodResult, ...]:
     """Minimise from the guess with every method, interleaved; slow ones once only."""
 
     def solve(solver: _Tally) -> NDArray[np.float64]:
-        return minimise(problem, guess, solver, loss=loss).state.unknowns
+        return minimise(problem, guess, solver, optimiser=optimiser).state.unknowns
 
     return _compare(solve, methods, repeats)
 

@@ -15,8 +15,8 @@ from pipeline.landmarks.minimise import minimise
 from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.solvers import LinearSolver
 
-_FIRST, _GROWTH = 16, 1.5  # poses to begin with, and how much further each part reaches
-_STEPS = 3
+_FIRST, _GROWTH = 16, 2  # poses to begin with, and how much further each part reaches
+_STEPS = 2
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
 
@@ -26,7 +26,7 @@ def from_odometry(measurements: Measurements) -> State:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
         poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
-    return State(poses, _first_seen(measurements, poses)[0])
+    return State(poses, _first_seen(measurements, poses)[0], measurements.calibration.value)
 
 
 def of_relative_positions(data: LandmarkData) -> State:
@@ -44,32 +44,33 @@ def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
     poses = state.poses.copy()
     poses[1:, :2] = poses[1:, :2] @ np.array([[c, s], [-s, c]]) + shift_m
     poses[1:, 2:] += turn_rad
-    return State(poses, state.landmarks)
+    return replace(state, poses=poses)
 
 
 def growing(measurements: Measurements, solver: LinearSolver) -> State:
     """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
 
     Dead reckoning over the whole log may be metres off, where a robust loss finds but a local minimum; over a
-    third of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
+    half of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
     """
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
-    reach = _FIRST
+    own, reach = measurements.calibration.mean, _FIRST
     while True:
-        reach = min(int(reach), count)
-        poses = np.vstack([poses, chain(poses[-1], measurements.motion[len(poses) - 1 : reach - 1])[1:]])
+        reach = min(reach, count)
+        motion = measurements.motion_at(own)
+        poses = np.vstack([poses, chain(poses[-1], motion[len(poses) - 1 : reach - 1])[1:]])
         part, known = _beginning(measurements, reach)
         guess, _ = _first_seen(part, poses)
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
         state = minimise(
-            BearingRangeProblem(part), State(poses, guess), solver, loss=_CONVEX, max_iterations=_STEPS
+            BearingRangeProblem(part), State(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
         ).state
-        poses, landmarks[known] = state.poses, state.landmarks
+        poses, landmarks[known], own = state.poses, state.landmarks, state.calibration
         if reach == count:
-            return State(poses, landmarks)
-        reach = reach * _GROWTH
+            return State(poses, landmarks, own)
+        reach *= _GROWTH
 
 
 def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
@@ -80,9 +81,9 @@ def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, ND
         measurements,
         motion=measurements.motion[: poses - 1],
         motion_covariance=measurements.motion_covariance[: poses - 1],
+        calibration=replace(measurements.calibration, slope=measurements.calibration.slope[: poses - 1]),
         observed=np.stack([measurements.observed[kept, 0], landmark], axis=1),
         measured=measurements.measured[kept],
-        measured_covariance=measurements.measured_covariance[kept],
         landmarks=measurements.landmarks[known],
     )
     return part, known

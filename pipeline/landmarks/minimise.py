@@ -1,25 +1,39 @@
-"""Gauss-Newton and Levenberg-Marquardt for bearing-range problems, with any of the linear solvers."""
+"""Bearing-range problems minimised by the step rules of pose graphs, with any of the linear solvers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.graph.cholesky import SingularMatrixError
+from pipeline.graph.descent import descend
 from pipeline.graph.robust import RobustLoss
+from pipeline.graph.steps import step_rule
 from pipeline.kernels import normal_equations
 from pipeline.landmarks.bearing_range import BearingRangeProblem, Linearisation
 from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import LinearSolver
+from pipeline.landmarks.solvers import LinearSolver, UndeterminedError
 from pipeline.landmarks.system import LinearSystem
 
-Optimiser = Literal["gauss-newton", "levenberg-marquardt"]
+Optimiser = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
+
+
+class Loss(Protocol):
+    """What an observation costs."""
+
+    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """dρ/dχ², (N,)."""
+        ...
+
+    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ρ(χ²), (N,)."""
+        ...
+
 
 QUADRATIC = RobustLoss("none", 1.0, 1.0)
-_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e12
-_GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +44,8 @@ class Minimum:
     ----------
     state : the estimate; at : residuals and A there
     weights : (N,) robust weight of every observation
-    cost : Σ r² of prior and odometry plus Σ ρ(χ²) of the observations
-    iterations : linear solves; converged, reason : whether and why it stopped
+    cost : Σ r² of priors and odometry plus Σ ρ(χ²) of the observations
+    iterations : steps; converged, reason : whether and why it stopped
     """
 
     state: State
@@ -48,7 +62,7 @@ def minimise(
     guess: State,
     solver: LinearSolver,
     *,
-    loss: RobustLoss = QUADRATIC,
+    loss: Loss = QUADRATIC,
     optimiser: Optimiser = "levenberg-marquardt",
     max_iterations: int = 100,
     tolerance: float = 1e-10,
@@ -56,57 +70,68 @@ def minimise(
 ) -> Minimum:
     """Follow the residuals downhill from the guess; a linearised step at a time, each solved by ``solver``.
 
-    It ends where the relative change of χ², every entry of the gradient (in units of its own curvature) or of the
-    step is below the tolerance.
-
-    Levenberg-Marquardt scales its damping by diag(AᵀA) and sets it by the gain ratio (Nielsen 1999). The first
-    damping is for a guess that may be poor; near the minimum 1e-10 serves better, since a long chain's weakest
-    modes have 1e-9 of diag(AᵀA).
+    It ends where ``descend`` says. The first damping is for a guess that may be poor; near the minimum 1e-10
+    serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
-    damping, growth = (first_damping if optimiser == "levenberg-marquardt" else 0.0), _GROWTH
-    state, at = guess, problem.linearise(guess)
-    cost = _cost(at, loss)
-    for iteration in range(max_iterations):
-        weights = loss.weight(at.observation_chi2)
-        system = problem.system(at, weights)
-        slope, curvature = _slope(system)
-        if np.all(np.abs(slope) <= tolerance * np.sqrt(curvature)):
-            return Minimum(state, at, weights, cost, iteration, True, "gradient below the tolerance")
-        step = solver.solve(problem.damped(system, damping * curvature) if damping else system).x
-        there = state.moved(step)
-        at_there = problem.linearise(there)
-        gained = cost - _cost(at_there, loss)
-        if damping > 0.0 and not gained >= 0.0:
-            if gained > -tolerance * cost:
-                return Minimum(state, at, weights, cost, iteration + 1, True, "χ² change below the tolerance")
-            damping, growth = damping * growth, growth * 4.0
-            if damping > _MOST_DAMPING:
-                return Minimum(state, at, weights, cost, iteration + 1, False, "no step lowers χ²")
-            continue
-        if damping > 0.0:
-            gain = min(gained / max(step @ (slope + damping * curvature * step), 1e-300), 1.0)
-            damping, growth = max(damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3), _LEAST_DAMPING), _GROWTH
-        state, at, cost = there, at_there, cost - gained
-        weights = loss.weight(at.observation_chi2)
-        if not np.isfinite(cost):
-            return Minimum(state, at, weights, cost, iteration + 1, False, "diverged")
-        if abs(gained) <= tolerance * cost:
-            return Minimum(state, at, weights, cost, iteration + 1, True, "χ² change below the tolerance")
-        if np.abs(step).max() <= tolerance:
-            return Minimum(state, at, weights, cost, iteration + 1, True, "step below the tolerance")
-    weights = loss.weight(at.observation_chi2)
-    return Minimum(state, at, weights, cost, max_iterations, False, f"{max_iterations} iterations reached")
-
-
-def _cost(at: Linearisation, loss: RobustLoss) -> float:
-    trusted = float(np.square(at.prior).sum() + np.square(at.odometry).sum())
-    return trusted + float(loss.loss(at.observation_chi2).sum())
-
-
-def _slope(system: LinearSystem) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Aᵀb, downhill, and the diagonal of AᵀA, (n,) both."""
-    g, diagonal = np.empty(system.pattern.shape[1]), np.empty(system.pattern.shape[1])
-    normal_equations.gradient(
-        system.pattern.row_start, system.pattern.columns, system.values, system.b, g, diagonal
+    start = problem.linearise(guess)
+    here = Evaluation(guess, start, _cost(start, loss))
+    descent = descend(
+        _Landscape(problem, solver, loss), here, step_rule(optimiser, first_damping), max_iterations, tolerance
     )
-    return g, diagonal
+    end = descent.end
+    weights = loss.weight(end.at.observation_chi2)
+    return Minimum(end.state, end.at, weights, end.cost, descent.iterations, descent.converged, descent.reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A state with its residuals and the cost of them."""
+
+    state: State
+    at: Linearisation
+    cost: float
+
+
+class _Landscape:
+    """The cost of a problem with one loss."""
+
+    def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, loss: Loss) -> None:
+        self._problem, self._solver, self._loss = problem, solver, loss
+
+    def model(self, now: Evaluation) -> _Model:
+        weights = self._loss.weight(now.at.observation_chi2)
+        return _Model(self._problem, self._solver, self._problem.system(now.at, weights))
+
+    def moved(self, now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
+        state = now.state.moved(step)
+        at = self._problem.linearise(state)
+        return Evaluation(state, at, _cost(at, self._loss))
+
+
+class _Model:
+    """H = AᵀA and g = −Aᵀb."""
+
+    def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> None:
+        self._problem, self._solver, self._system = problem, solver, system
+        pattern = system.pattern
+        downhill, self.diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
+        normal_equations.gradient(
+            pattern.row_start, pattern.columns, system.values, system.b, downhill, self.diagonal
+        )
+        self.gradient = -downhill
+
+    def solve(self, damping: float) -> NDArray[np.float64]:
+        if not damping:
+            return self._solver.solve(self._system).x
+        try:
+            return self._solver.solve(self._problem.damped(self._system, damping * self.diagonal)).x
+        except UndeterminedError as error:
+            raise SingularMatrixError(int(error.columns[0])) from error
+
+    def bend(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._system.A.T @ (self._system.A @ step)
+
+
+def _cost(at: Linearisation, loss: Loss) -> float:
+    trusted = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
+    return trusted + float(loss.loss(at.observation_chi2).sum())

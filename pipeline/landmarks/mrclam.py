@@ -22,7 +22,7 @@ class RangeLog:
     Attributes
     ----------
     name : of the folder and the robot
-    times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s
+    times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s, whenever either changes
     seen_s, subjects, measured : (N,), (N,) landmark subjects, (N, 2) bearing in rad and range in m
     of_robots, unknown : observations left out: of other robots, and of barcodes that no subject has
     outside : observations left out since no odometry was logged at their time
@@ -67,14 +67,15 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
         raise InputError(
             f"{folder}: robot {robot} saw no landmark while its odometry was logged; choose another robot"
         )
+    changes = odometry[np.append(True, (np.diff(odometry[:, 1:], axis=0) != 0.0).any(axis=1))]
     truth = folder / f"Robot{robot}_Groundtruth.dat"
     true = _by_time(_table(truth, 4)) if truth.is_file() else np.empty((0, 4))
     survey = folder / "Landmark_Groundtruth.dat"
     landmarks = _table(survey, 5) if survey.is_file() else np.empty((0, 5))
     return RangeLog(
         name=f"{folder.resolve().name} robot {robot}",
-        times_s=odometry[:, 0],
-        velocities=np.ascontiguousarray(odometry[:, 1:]),
+        times_s=changes[:, 0],
+        velocities=np.ascontiguousarray(changes[:, 1:]),
         seen_s=seen[used, 0],
         subjects=subject[used],
         measured=np.ascontiguousarray(seen[used][:, [3, 2]]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -42,18 +42,25 @@ class LandmarkData:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """An estimate: poses (K, 2) x, y or (K, 3) x, y, heading, landmarks (L, 2); m, rad."""
+    """An estimate: poses (K, 2) x, y or (K, 3) x, y, heading, landmarks (L, 2); m, rad.
+
+    ``calibration`` (C,) are unknowns of the robot itself, none for a file.
+    """
 
     poses: Matrix
     landmarks: Matrix
+    calibration: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def unknowns(self) -> NDArray[np.float64]:
-        """All in one, poses first, (n,)."""
-        return np.concatenate([self.poses.ravel(), self.landmarks.ravel()])
+        """All in one, poses first, landmarks last, (n,)."""
+        return np.concatenate([self.poses.ravel(), self.calibration, self.landmarks.ravel()])
 
     def moved(self, step: NDArray[np.float64]) -> State:
-        """The state a step (n,) away, poses first."""
-        split = self.poses.size
-        poses = self.poses + step[:split].reshape(self.poses.shape)
-        return State(poses, self.landmarks + step[split:].reshape(self.landmarks.shape))
+        """The state a step (n,) away, poses first, landmarks last."""
+        poses, calibration, landmarks = np.split(step, np.cumsum([self.poses.size, self.calibration.size]))
+        return State(
+            self.poses + poses.reshape(self.poses.shape),
+            self.landmarks + landmarks.reshape(self.landmarks.shape),
+            self.calibration + calibration,
+        )

@@ -12,6 +12,7 @@ from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.landmarks.accuracy import Accuracy
 from pipeline.landmarks.compare import MethodResult
 from pipeline.landmarks.dead_reckoning import OdometryNoise
+from pipeline.landmarks.minimise import Optimiser
 from pipeline.landmarks.problem import State
 
 Guess = Literal["odometry", "disturbed", "origin"]
@@ -19,13 +20,18 @@ Guess = Literal["odometry", "disturbed", "origin"]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to study a problem; ``robot`` and ``noise`` are for MRCLAM folders, ``guess`` for nonlinear files."""
+    """How to study a problem.
+
+    ``robot`` and ``noise`` are for MRCLAM folders, where a noise of None is to be estimated; ``guess`` and
+    ``optimiser`` for nonlinear files.
+    """
 
     methods: tuple[str, ...]
     repeats: int
     robot: int
-    noise: OdometryNoise
+    noise: OdometryNoise | None
     guess: Guess
+    optimiser: Optimiser
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from pipeline.landmarks.assembly import landmark_columns, pose_columns
 from pipeline.landmarks.bearing_range import BearingRangeProblem, world_referenced
 from pipeline.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from pipeline.landmarks.covariance import Covariance
-from pipeline.landmarks.minimise import QUADRATIC, minimise
+from pipeline.landmarks.minimise import minimise
 from pipeline.landmarks.npz import read_landmark_data
 from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.relative_position import linear_system, state_of
@@ -60,16 +60,19 @@ def _linear(data: LandmarkData, options: Options) -> _Solved:
 def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     problem = BearingRangeProblem(world_referenced(data))
     guess = _guess(problem, options.guess)
-    methods = compare_nonlinear(problem, guess, QUADRATIC, options.methods, options.repeats)
-    minimum = minimise(problem, guess, create_solver(options.methods[0]))
+    minimum = minimise(problem, guess, create_solver(options.methods[0]), optimiser=options.optimiser)
     begin = perf_counter()
     system = problem.system(problem.linearise(minimum.state), minimum.weights)
     build_s = perf_counter() - begin
+    if options.optimiser == "gradient-descent":  # solves no linear system: compare them on the one at its end
+        methods = compare_linear(system, options.methods, options.repeats)
+    else:
+        methods = compare_nonlinear(problem, guess, options.optimiser, options.methods, options.repeats)
     ended = "converged" if minimum.converged else "DID NOT CONVERGE"
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
         Fact("guess", options.guess),
-        Fact("iteration", f"{ended} after {minimum.iterations} linear solves: {minimum.reason}"),
+        Fact("iteration", f"{options.optimiser} {ended} after {minimum.iterations} steps: {minimum.reason}"),
         chi2_fact(minimum.cost, len(system.b), system.pattern.shape[1]),
     )
     return _Solved(guess, minimum.state, minimum.converged, system, build_s, methods, facts)

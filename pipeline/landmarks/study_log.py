@@ -12,14 +12,13 @@ from pipeline import lie
 from pipeline.data import Trajectory
 from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
 from pipeline.landmarks.compare import compare_linear
-from pipeline.landmarks.dead_reckoning import OdometryNoise
-from pipeline.landmarks.guess import from_odometry
+from pipeline.landmarks.dead_reckoning import OWN, OWN_UNITS
 from pipeline.landmarks.mrclam import RangeLog, read_mrclam
 from pipeline.landmarks.problem import State
-from pipeline.landmarks.range_slam import STUDENT, RangeSolution, solve_range_log
+from pipeline.landmarks.range_slam import RangeSolution, solve_range_log
 from pipeline.landmarks.study import Estimate, Fact, Options, Study
 
-_DOUBTED = 0.25  # weight
+_DOUBTED = 0.25  # of the weight of an observation as expected
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
 
 
@@ -33,14 +32,13 @@ def study_log(folder: Path, options: Options) -> Study:
     solution = solve_range_log(log, options.noise)
     begin = perf_counter()
     at = solution.problem.linearise(solution.guess)
-    system = solution.problem.system(at, STUDENT.weight(at.observation_chi2))
+    system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
     build_s = perf_counter() - begin
     truth = truth_at(log, solution.nodes_s, solution.landmarks)
-    reckoned = from_odometry(solution.problem.measurements)
     return Study(
         name=log.name,
-        facts=_facts(log, options.noise, solution),
-        before=_estimate(reckoned, solution.nodes_s, truth),
+        facts=_facts(log, solution, is_stated=options.noise is not None),
+        before=_estimate(solution.reckoned, solution.nodes_s, truth),
         after=_estimate(solution.state, solution.nodes_s, truth),
         converged=solution.converged,
         pose_covariance=solution.pose_covariance,
@@ -65,23 +63,32 @@ def _estimate(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> Estim
     return Estimate(state, accuracy, T_truth_estimate)
 
 
-def _facts(log: RangeLog, noise: OdometryNoise, solution: RangeSolution) -> tuple[Fact, ...]:
+def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[Fact, ...]:
     ended = "converged" if solution.converged else "DID NOT CONVERGE"
-    doubted = int(np.count_nonzero(solution.weights < _DOUBTED))
-    seen = f"{len(log.seen_s)} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s)} poses"
+    count = len(log.seen_s)
+    worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
+    seen = f"{count:,} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s):,} poses; they {worth}"
     left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
-    stated = (
-        f"{noise.forward_m:g} m forward, {noise.sideways_m:g} m sideways, {noise.turn_rad:g} rad after a second"
+    noise = solution.odometry_noise
+    wheels = (
+        f"{noise.forward_m:.3g} m forward, {noise.sideways_m:.3g} m sideways, {noise.drift_rad:.3g} rad"
+        f" after a metre, {noise.turn_rad:.3g} rad after a radian"
     )
+    own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
-    after = f"{ended} after {solution.iterations} linear solves: {solution.reason}"
+    after = f"{ended} after {solution.iterations} steps: {solution.reason}"
+    doubted = int(np.count_nonzero(solution.weights < _DOUBTED * solution.loss.share))
     return (
         Fact("observations", seen),
         Fact("left out", left),
         Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {after}"),
-        Fact("odometry noise", f"stated: {stated}; {_verdict(solution.motion_chi2)}"),
+        Fact("robot", "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own)),
+        Fact(
+            "odometry noise",
+            f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(solution.motion_chi2)}",
+        ),
         Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
-        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g}"),
+        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g} of what others do"),
     )
 
 

@@ -13,35 +13,44 @@ _COMPONENTS = ("x", "y", "heading")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What the columns of A stand for: pose after pose, then landmark after landmark (x, y each).
+    """What the columns of A stand for: pose after pose, the robot's calibration, landmark after landmark.
 
     Attributes
     ----------
     poses : how many
     pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
     landmarks : (L,) their names, as numbers
+    calibration : names of the unknowns that are the robot's own
     """
 
     poses: int
     pose_size: int
     landmarks: NDArray[np.int64]
+    calibration: tuple[str, ...] = ()
 
     @property
     def split(self) -> int:
-        """Columns of the poses; those of the landmarks come after."""
+        """Columns of the poses; all others come after."""
         return self.poses * self.pose_size
+
+    @property
+    def landmark_start(self) -> int:
+        """First column of the landmarks."""
+        return self.split + len(self.calibration)
 
     @property
     def columns(self) -> int:
         """Unknowns in all."""
-        return self.split + 2 * len(self.landmarks)
+        return self.landmark_start + 2 * len(self.landmarks)
 
     def name(self, column: int) -> str:
         """The unknown of a column, as "pose 3 heading" or "landmark 12 x"."""
         if column < self.split:
             pose, component = divmod(column, self.pose_size)
             return f"pose {pose} {_COMPONENTS[component]}"
-        landmark, component = divmod(column - self.split, 2)
+        if column < self.landmark_start:
+            return self.calibration[column - self.split]
+        landmark, component = divmod(column - self.landmark_start, 2)
         return f"landmark {self.landmarks[landmark]} {_COMPONENTS[component]}"
 
 

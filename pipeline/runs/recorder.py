@@ -90,7 +90,8 @@ class Viewing:
     ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
     ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
     ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording;
-    ``present_landmarks`` studies of landmark problems, as pictures and a page, in a directory.
+    ``present_landmarks`` studies of landmark problems, as pictures and a page, in a directory;
+    ``record_landmarks`` before and after to a recording.
     """
 
     record: OpenRecorder
@@ -101,3 +102,4 @@ class Viewing:
     draw_graph: Callable[[GraphChange, Path], None]
     record_graph: Callable[[GraphChange, Path], None]
     present_landmarks: Callable[[Path, Sequence[Study]], None]
+    record_landmarks: Callable[[Sequence[Study], Path], None]

@@ -1,13 +1,14 @@
 """An MRCLAM log against a batch in GTSAM, interleaved: python -m tests.benchmarks.landmark_log [FOLDER].
 
 GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and 0.12 m, and the
-odometry's noise as stated. Its time is that of building the graph and of its optimiser, with the covariance of
-every pose and landmark where it says so. "ours" is the whole estimate: dead reckoning, guess, the sensor's noise,
-all covariances; "ours as given" has GTSAM's noise, weights and guess, and no covariances.
+odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of its optimiser,
+with the covariance of every pose and landmark where it says so. "ours as given" does just the same, "ours" the
+whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -15,12 +16,13 @@ import numpy as np
 
 from pipeline.graph.robust import RobustLoss
 from pipeline.landmarks.accuracy import against_truth, truth_at
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
-from pipeline.landmarks.dead_reckoning import OdometryNoise, reckon
+from pipeline.landmarks.bearing_range import BearingRangeProblem, no_calibration
+from pipeline.landmarks.dead_reckoning import OWN, OdometryNoise
 from pipeline.landmarks.guess import from_odometry
 from pipeline.landmarks.minimise import minimise
 from pipeline.landmarks.mrclam import read_mrclam
 from pipeline.landmarks.problem import State
+from pipeline.landmarks.range_fit import LogModel
 from pipeline.landmarks.range_slam import solve_range_log
 from pipeline.landmarks.solvers import create_solver
 
@@ -31,11 +33,10 @@ LANDMARK = 10_000_000  # first key of a landmark
 
 
 def measurements_of(log):
-    reckoning = reckon(log, OdometryNoise())
-    return Measurements(
-        np.zeros(3), 1e-8 * np.eye(3), reckoning.motion, reckoning.covariance, reckoning.observed, log.measured,
-        np.broadcast_to(np.diag(SIGMAS**2), (len(log.measured), 2, 2)), reckoning.landmarks,
-    )  # fmt: skip
+    model = LogModel(log)
+    variances = np.concatenate([OdometryNoise().densities, SIGMAS**2])
+    given = model.measurements(model.reckoned(np.zeros(len(OWN))), variances)
+    return replace(given, calibration=no_calibration(given.motion))
 
 
 def as_given(log):
@@ -50,7 +51,7 @@ def as_given(log):
 
 def ours(log):
     begin = time.perf_counter()
-    solution = solve_range_log(log, OdometryNoise())
+    solution = solve_range_log(log, None)
     return time.perf_counter() - begin, solution.state
 
 
@@ -105,8 +106,8 @@ def main():
     parser.add_argument("--repeats", type=int, default=9)
     options = parser.parse_args()
     log = read_mrclam(options.folder, options.robot)
-    reckoning = reckon(log, OdometryNoise())
-    truth = truth_at(log, reckoning.nodes_s, reckoning.landmarks)
+    model = LogModel(log)
+    truth = truth_at(log, model.nodes_s, model.landmarks)
     seconds = {name: [] for name in METHODS}
     for method in METHODS.values():
         method(log)  # compiles
@@ -116,7 +117,7 @@ def main():
             seconds[name].append((spent, state))
     print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
     for name, runs in seconds.items():
-        accuracy, _ = against_truth(runs[-1][1], reckoning.nodes_s, truth)
+        accuracy, _ = against_truth(runs[-1][1], model.nodes_s, truth)
         spent = 1e3 * np.array([run[0] for run in runs])
         print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
               f" {accuracy.landmarks_m:12.4f}")  # fmt: skip

@@ -32,7 +32,7 @@ class LandmarkElimination:
     def solve(self, system: LinearSystem) -> Solution:
         """Solve in the least-squares sense; the factor is U with AᵀA = UᵀU, the landmarks first."""
         watch = Stopwatch()
-        split = system.pattern.layout.split
+        split = system.pattern.layout.landmark_start
         A = csc_matrix(system.A)
         of_poses, of_landmarks = A[:, :split], A[:, split:]
         P, B = csc_matrix(of_poses.T @ of_poses), csc_matrix(of_landmarks.T @ of_poses)

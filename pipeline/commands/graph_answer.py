@@ -1,0 +1,70 @@
+"""What ``scanchain optimize`` has found out about a graph, as text and as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.graph.certificate import Certificate
+    from pipeline.graph.g2o import G2oFile
+    from pipeline.graph.optimisation import GraphChange, Optimisation
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What there is to print."""
+
+    file: G2oFile
+    change: GraphChange
+    optimisation: Optimisation
+    certificate: Certificate
+
+    def text(self, written: list[Path]) -> str:
+        """A line for each fact."""
+        graph, done = self.file.graph, self.optimisation
+        guess = done.initialisation
+        if guess == "given":
+            guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
+        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
+        lines = [
+            f"graph          {self.change.name}: {size}",
+            *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            f"first guess    {guess}",
+            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
+            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
+        ]
+        if graph.is_loop.any():
+            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
+            lines.append(
+                f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
+            )
+        held = ", the robust weights held" if graph.is_loop.any() else ""
+        lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
+        return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    def json(self, written: list[Path]) -> str:
+        """The same, and every rejected edge, by vertex ids."""
+        graph, done = self.file.graph, self.optimisation
+        tree = {
+            "graph": self.change.name,
+            "dimension": graph.dimension,
+            "poses": len(graph),
+            "edges": len(graph.edges),
+            "suspected": int(graph.is_loop.sum()),
+            "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
+            "kept_lines": dict(self.file.other_tags),
+            "chi2_before": done.chi2_before,
+            "chi2_after": done.chi2_after,
+            "cost_after": done.cost_after,
+            "iterations": done.iterations,
+            "converged": done.converged,
+            "reason": done.reason,
+            "initialisation": done.initialisation,
+            "time_s": done.time_s,
+            "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
+            "written": [str(path) for path in written],
+        }
+        return json.dumps(tree, indent=2)
