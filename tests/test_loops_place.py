@@ -5,7 +5,7 @@ from functools import cache
 import naive_loops
 import numpy as np
 import pytest
-from scenes import configured
+from scenes import configured, stored
 
 from pipeline import lie
 from pipeline.data import Keyframe, Proposal, Verdict
@@ -60,7 +60,7 @@ def passage(places, first_index=0, travelled_m=0.0):
         if keyframes:
             travelled_m += float(np.linalg.norm((T - keyframes[-1].T_odom_lidar)[:3, 3]))
         index = first_index + k
-        keyframes.append(Keyframe(index, index, index, points, T, travelled_m))
+        keyframes.append(Keyframe(index, index, index, stored(points), T, travelled_m))
     return keyframes
 
 
@@ -152,7 +152,7 @@ def test_up_is_where_the_ground_says_whatever_the_lidars_tilt(pitch, roll):
     points, _ = scan_from(50.0, -2.0, 0.3)
     T_level_tilted = lie.exp(np.array([0, 0, 0, roll, pitch, 0.0]))
     tilted = lie.transform(lie.inverse(T_level_tilted), points)
-    T = level_frame(Keyframe(0, 0, 0, tilted, lie.identity(3), 0.0), configured(3).local_map)
+    T = level_frame(Keyframe(0, 0, 0, stored(tilted), lie.identity(3), 0.0), configured(3).local_map)
     up = (T_level_tilted @ T)[:3, 2]
     assert np.arccos(up[2]) < 0.05
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -197,7 +197,7 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
 def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     points, T = scan_from(50.0, -2.0, 0.0)
     submaps = Submaps(3, 5, configured(3).local_map)
-    submap = submaps.around(0, [Keyframe(0, 0, 0, points, T, 0.0, scale)], 0)
+    submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
 
@@ -208,7 +208,7 @@ def there_and_back(lost_m=0.0):
     back = passage(street(4.0, True), len(there), there[-1].travelled_m + 120.0)
     shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)
     moved = [
-        Keyframe(k.index, k.scan_index, k.stamp_ns, k.points, shift @ k.T_odom_lidar, k.travelled_m) for k in back
+        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.travelled_m) for k in back
     ]
     return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
 
