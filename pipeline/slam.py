@@ -113,7 +113,7 @@ class Slam:
     def finish(self) -> SlamResult:
         """Close what is left, optimise once more, spread the corrections over all scans and refine these."""
         if self.config.loops.enabled:
-            self._take(self.closer.finish(self.keyframes, self.graph.poses))
+            self._take(self.closer.finish(self.keyframes, self.graph))
         state = self._optimise("mended")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
@@ -140,8 +140,11 @@ class Slam:
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
             self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(self.odometry.first_points))
         self.lost_scans += tracked.state is State.LOST
-        is_keyframe = not self.keyframes or (
-            tracked.state is not State.LOST and self._moved_enough(tracked.T_odom_lidar)
+        is_elsewhere = tracked.elsewhere_m > 0.0
+        is_keyframe = (
+            not self.keyframes
+            or is_elsewhere
+            or (tracked.state is not State.LOST and self._moved_enough(tracked.T_odom_lidar))
         )
         if not is_keyframe and not self.keeps_scans:
             return -1
@@ -165,6 +168,9 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
+            if is_elsewhere:
+                sigmas = (tracked.elsewhere_m, np.pi)
+                self.closer.begin_piece(keyframe.index)
             self.graph.add_edge(
                 last.index,
                 keyframe.index,

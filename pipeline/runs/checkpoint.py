@@ -11,10 +11,12 @@ from pipeline import config, data
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.kernels.voxels import Voxels
+from pipeline.loops.anywhere_closer import AnywhereCloser
 from pipeline.loops.closer import LoopCloser
 from pipeline.loops.doubt import Doubt
 from pipeline.loops.gallery import Gallery
 from pipeline.loops.near_closer import NearCloser
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place import Place
 from pipeline.loops.place_closer import PlaceCloser
 from pipeline.loops.planar_search import PlanarSearch
@@ -51,7 +53,7 @@ _CLASSES = Classes(
         Checkpoint, Slam, Odometry, Predictor, Experience, Resolution, Sweep, VoxelMap, Voxels,
         PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
         Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
-        PointStore, StoredPoints,
+        PointStore, StoredPoints, Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
