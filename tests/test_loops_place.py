@@ -14,6 +14,7 @@ from pipeline.kernels.place import count_heights, mark_heights
 from pipeline.loops.agreement import free_space_agreement
 from pipeline.loops.gallery import Gallery
 from pipeline.loops.local_map import local_map
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place import compare, describe
 from pipeline.loops.place_closer import PlaceCloser
 from pipeline.loops.submaps import Submaps
@@ -77,7 +78,7 @@ def street(offset_m=0.0, backwards=False):
 def place_in_the_middle(offset_m=0.0, backwards=False):
     """Local map and place around the middle of that drive."""
     keyframes = passage(street(offset_m, backwards))
-    surroundings = local_map(keyframes, len(keyframes) // 2, RADIUS_M)
+    surroundings = local_map(keyframes, len(keyframes) // 2, RADIUS_M, Pieces())
     return surroundings, describe(surroundings, lie.identity(3))
 
 
@@ -196,7 +197,7 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     points, T = scan_from(50.0, -2.0, 0.0)
-    submaps = Submaps(3, 5, configured(3).local_map)
+    submaps = Submaps(3, 5, configured(3).local_map, Pieces())
     submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
@@ -216,12 +217,12 @@ def there_and_back(lost_m=0.0):
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])
 def test_a_street_driven_the_other_way_is_recognised_wherever_odometry_has_it(lost_m):
     keyframes, truth = there_and_back(lost_m)
-    closer = PlaceCloser(configured(3))
+    closer = PlaceCloser(configured(3), Pieces())
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     accepted = [
         closure
         for k in range(1, len(keyframes) + 1)
-        for closure in closer.close(keyframes[:k], poses[:k], finish=k == len(keyframes))
+        for closure in closer.close(keyframes[:k], poses[:k], np.ones(k, bool), finish=k == len(keyframes))
         if closure.verdict is Verdict.ACCEPTED
     ]
     assert any(closure.proposed_by is Proposal.PLACE for closure in accepted) and len(accepted) >= 3
@@ -233,6 +234,8 @@ def test_a_street_driven_the_other_way_is_recognised_wherever_odometry_has_it(lo
 def test_a_place_that_odometry_cannot_have_missed_by_so_much_is_refused():
     keyframes, _ = there_and_back(8.0)
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    closures = PlaceCloser(configured(3, {"loops.place_drift": 0.001})).close(keyframes, poses, finish=True)
+    closures = PlaceCloser(configured(3, {"loops.place_drift": 0.001}), Pieces()).close(
+        keyframes, poses, np.ones(len(keyframes), bool), finish=True
+    )
     assert closures and all(closure.verdict is Verdict.REJECTED for closure in closures)
     assert any("loops.place_drift" in closure.reason for closure in closures)
