@@ -119,6 +119,8 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
     ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
     direction by ``min_place_information``.
+
+    In the plane ``refine`` aligns every scan once more, at the end, to the map of all keyframes.
     """
 
     enabled: bool = True
@@ -139,6 +141,7 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_place_overlap: Share = 0.4
     min_place_information: NonNegative = 0.005
     min_agreement: Share = 0.87
+    refine: bool = True
 
 
 class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):

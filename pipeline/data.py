@@ -13,6 +13,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.point_store import StoredPoints
+
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
@@ -122,7 +124,7 @@ class Keyframe:
     ----------
     index : its number in the graph
     scan_index, stamp_ns : the scan it was made of
-    points : (M, d) deskewed points, lidar frame
+    stored : its points, which ``points`` reads
     T_odom_lidar : pose in the odometry frame
     travelled_m : length of the way up to it, by odometry
     scale : of the voxels that odometry used there, 1 for those of the configuration
@@ -131,10 +133,15 @@ class Keyframe:
     index: int
     scan_index: int
     stamp_ns: int
-    points: Points
+    stored: StoredPoints
     T_odom_lidar: Pose
     travelled_m: float
     scale: float = 1.0
+
+    @property
+    def points(self) -> Points:
+        """(M, d) deskewed points, lidar frame; read anew each time."""
+        return self.stored.read()
 
 
 class Verdict(StrEnum):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -25,9 +26,11 @@ from pipeline.data import (
     Verdict,
 )
 from pipeline.graph.graduation import Judgement
+from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
-from pipeline.loops import LoopCloser
+from pipeline.loops import LoopCloser, refined, spread
 from pipeline.odometry import Odometry, Tracked
+from pipeline.point_store import PointStore
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
 _GROWTH = 0.05  # of the graph, between two optimisations that change little
@@ -49,13 +52,22 @@ class SlamResult:
     graph: PoseGraph
     state: GraphState
 
+    @property
+    def T_world_keyframes(self) -> Matrix:
+        """(K, d+1, d+1) final poses of the keyframes; in the plane finer than those of the graph."""
+        return self.trajectory.poses[[keyframe.scan_index for keyframe in self.keyframes]]
+
 
 class Slam:
     """Feeds on scans; every scan gives a step, the end gives the result."""
 
-    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
+    def __init__(self, config: Config, T_base_lidar: Pose, points_file: Path | None = None) -> None:
+        """points_file : where points go, which stay out of memory; without one, into a temporary file."""
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
+        self.points = PointStore(self.dimension, points_file)
+        self.spans = GrowingArray((2,), np.int64)
+        self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
         self.odometry = Odometry(config, T_base_lidar)
         self.closer = LoopCloser(config, self.dimension)
         self.graph = PoseGraph(self.dimension)
@@ -99,13 +111,16 @@ class Slam:
         )
 
     def finish(self) -> SlamResult:
-        """Close what is left, optimise once more and spread the corrections over all scans."""
+        """Close what is left, optimise once more, spread the corrections over all scans and refine these."""
         if self.config.loops.enabled:
-            self._take(self.closer.finish(self.keyframes, self.graph.poses))
+            self._take(self.closer.finish(self.keyframes, self.graph))
         state = self._optimise("mended")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
-        corrected = self._spread(state.poses, odometry)
+        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
+        corrected = spread(state.poses, numbers, odometry)
+        if self.keeps_scans:
+            corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),
             odometry=Trajectory(stamps_ns, odometry),
@@ -122,15 +137,25 @@ class Slam:
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
-            self.keyframes[0] = replace(self.keyframes[0], points=self.odometry.first_points)
+            self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(self.odometry.first_points))
         self.lost_scans += tracked.state is State.LOST
-        if self.keyframes and (tracked.state is State.LOST or not self._moved_enough(tracked.T_odom_lidar)):
+        is_elsewhere = tracked.elsewhere_m > 0.0
+        is_keyframe = (
+            not self.keyframes
+            or is_elsewhere
+            or (tracked.state is not State.LOST and self._moved_enough(tracked.T_odom_lidar))
+        )
+        if not is_keyframe and not self.keeps_scans:
+            return -1
+        stored = self.points.add(tracked.points)
+        self.spans.append((stored.first, stored.count))
+        if not is_keyframe:
             return -1
         keyframe = Keyframe(
             index=len(self.keyframes),
             scan_index=len(self.odometry_poses) - 1,
             stamp_ns=tracked.scan.stamp_ns,
-            points=tracked.points,
+            stored=stored,
             T_odom_lidar=tracked.T_odom_lidar,
             travelled_m=self.travelled_m,
             scale=self.odometry.local_map.scale,
@@ -142,6 +167,9 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
+            if is_elsewhere:
+                sigmas = (tracked.elsewhere_m, np.pi)
+                self.closer.begin_piece(keyframe.index)
             self.graph.add_edge(
                 last.index,
                 keyframe.index,
@@ -207,18 +235,6 @@ class Slam:
         self.waiting_closures, self.surprising, self.optimised_at = 0, False, len(self.keyframes)
         self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
-
-    def _spread(self, keyframe_poses: Matrix, odometry: Matrix) -> Matrix:
-        """World poses of all scans: each keyframe's correction, blended between it and the next."""
-        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
-        relative = lie.inverse(odometry[numbers]) @ odometry[np.append(numbers[1:], numbers[-1])]
-        target = lie.inverse(keyframe_poses) @ keyframe_poses[np.append(np.arange(1, len(numbers)), -1)]
-        correction = lie.log(target @ lie.inverse(relative))
-        before = np.searchsorted(numbers, np.arange(len(odometry)), side="right") - 1
-        span = np.append(np.diff(numbers), 1)[before]
-        share = np.clip((np.arange(len(odometry)) - numbers[before]) / span, 0.0, 1.0)
-        within = lie.inverse(odometry[numbers[before]]) @ odometry
-        return keyframe_poses[before] @ lie.exp(share[:, None] * correction[before]) @ within
 
     def _local_map(self, keyframe: int) -> Points:
         return self.odometry.local_map.points() if keyframe >= 0 else np.empty((0, self.dimension))

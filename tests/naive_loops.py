@@ -1,8 +1,11 @@
 """Slow, clear twins of the loop-closure kernels; every kernel test says fast == naive."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from pipeline import lie
+from pipeline.kernels.registration import CONVERGED, align
 
 
 def heights(points, T, cell_m, size):
@@ -39,3 +42,12 @@ def agreement(seen, points, T, shape, margin_m, margin_share):
             yes += abs(range_m - nearest[place]) <= margin
             no += range_m < nearest[place] - margin
     return yes, no
+
+
+def refine(voxels, points, starts, poses, prior, least_share, terms):
+    """Each scan aligned by itself."""
+    for k, (first, last) in enumerate(pairwise(starts)):
+        T = poses[k].copy()
+        outcome = align(voxels, points[first:last], T, np.zeros(len(prior)), prior, terms)
+        if outcome.ending == CONVERGED and outcome.pairs >= least_share * (last - first):
+            poses[k] = T

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.config import Config
 from pipeline.logs import open_log
+from pipeline.point_store import PointStore, StoredPoints
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,3 +39,8 @@ def configured(dimension, changes=None):
         section, name = key.split(".")
         tree[section][name] = value
     return msgspec.convert(tree, Config)
+
+
+def stored(points) -> StoredPoints:
+    """Points of a keyframe, in a store of their own."""
+    return PointStore(points.shape[1]).add(points)

@@ -14,7 +14,7 @@ from scenes import ROOT, configured, shared_data
 
 from pipeline.errors import InputError
 from pipeline.logs import open_log
-from pipeline.runs.checkpoint import _CLASSES, CHECKPOINT_FILE, Checkpoints, read_checkpoint
+from pipeline.runs.checkpoint import _CLASSES, CHECKPOINT_FILE, POINTS_FILE, Checkpoints, read_checkpoint
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
 from pipeline.simulate import simulate
@@ -105,7 +105,8 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
     log = open_log(office if name == "office" else shared_data(name))
     scans = list(islice(log.scans(), count))
     config = configured(log.dimension, changes)
-    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar)
+    points_file = tmp_path / POINTS_FILE
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, points_file)
     breaks = set(random.Random(2).sample(range(count), 8)) | {0}
     for scan in scans:
         a, b = straight.process(scan), broken.process(scan)
@@ -114,6 +115,7 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
         if scan.index in breaks:
             Checkpoints(tmp_path, 10.0, 0.0).write(broken, scan.index + 1)
             broken = read_checkpoint(tmp_path).slam
+            broken.points.reopen(points_file)
     a, b = straight.finish(), broken.finish()
     assert len(a.closures) == len(b.closures)
     assert len(a.closures) > 0 or not config.loops.enabled

@@ -5,7 +5,7 @@ from functools import cache
 import naive_loops
 import numpy as np
 import pytest
-from scenes import configured
+from scenes import configured, stored
 
 from pipeline import lie
 from pipeline.data import Keyframe, Proposal, Verdict
@@ -14,6 +14,7 @@ from pipeline.kernels.place import count_heights, mark_heights
 from pipeline.loops.agreement import free_space_agreement
 from pipeline.loops.gallery import Gallery
 from pipeline.loops.local_map import local_map
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place import compare, describe
 from pipeline.loops.place_closer import PlaceCloser
 from pipeline.loops.submaps import Submaps
@@ -60,7 +61,7 @@ def passage(places, first_index=0, travelled_m=0.0):
         if keyframes:
             travelled_m += float(np.linalg.norm((T - keyframes[-1].T_odom_lidar)[:3, 3]))
         index = first_index + k
-        keyframes.append(Keyframe(index, index, index, points, T, travelled_m))
+        keyframes.append(Keyframe(index, index, index, stored(points), T, travelled_m))
     return keyframes
 
 
@@ -77,7 +78,7 @@ def street(offset_m=0.0, backwards=False):
 def place_in_the_middle(offset_m=0.0, backwards=False):
     """Local map and place around the middle of that drive."""
     keyframes = passage(street(offset_m, backwards))
-    surroundings = local_map(keyframes, len(keyframes) // 2, RADIUS_M)
+    surroundings = local_map(keyframes, len(keyframes) // 2, RADIUS_M, Pieces())
     return surroundings, describe(surroundings, lie.identity(3))
 
 
@@ -152,7 +153,7 @@ def test_up_is_where_the_ground_says_whatever_the_lidars_tilt(pitch, roll):
     points, _ = scan_from(50.0, -2.0, 0.3)
     T_level_tilted = lie.exp(np.array([0, 0, 0, roll, pitch, 0.0]))
     tilted = lie.transform(lie.inverse(T_level_tilted), points)
-    T = level_frame(Keyframe(0, 0, 0, tilted, lie.identity(3), 0.0), configured(3).local_map)
+    T = level_frame(Keyframe(0, 0, 0, stored(tilted), lie.identity(3), 0.0), configured(3).local_map)
     up = (T_level_tilted @ T)[:3, 2]
     assert np.arccos(up[2]) < 0.05
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -196,8 +197,8 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     points, T = scan_from(50.0, -2.0, 0.0)
-    submaps = Submaps(3, 5, configured(3).local_map)
-    submap = submaps.around(0, [Keyframe(0, 0, 0, points, T, 0.0, scale)], 0)
+    submaps = Submaps(3, 5, configured(3).local_map, Pieces())
+    submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
 
@@ -208,7 +209,7 @@ def there_and_back(lost_m=0.0):
     back = passage(street(4.0, True), len(there), there[-1].travelled_m + 120.0)
     shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)
     moved = [
-        Keyframe(k.index, k.scan_index, k.stamp_ns, k.points, shift @ k.T_odom_lidar, k.travelled_m) for k in back
+        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.travelled_m) for k in back
     ]
     return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
 
@@ -216,12 +217,12 @@ def there_and_back(lost_m=0.0):
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])
 def test_a_street_driven_the_other_way_is_recognised_wherever_odometry_has_it(lost_m):
     keyframes, truth = there_and_back(lost_m)
-    closer = PlaceCloser(configured(3))
+    closer = PlaceCloser(configured(3), Pieces())
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     accepted = [
         closure
         for k in range(1, len(keyframes) + 1)
-        for closure in closer.close(keyframes[:k], poses[:k], finish=k == len(keyframes))
+        for closure in closer.close(keyframes[:k], poses[:k], np.ones(k, bool), finish=k == len(keyframes))
         if closure.verdict is Verdict.ACCEPTED
     ]
     assert any(closure.proposed_by is Proposal.PLACE for closure in accepted) and len(accepted) >= 3
@@ -233,6 +234,8 @@ def test_a_street_driven_the_other_way_is_recognised_wherever_odometry_has_it(lo
 def test_a_place_that_odometry_cannot_have_missed_by_so_much_is_refused():
     keyframes, _ = there_and_back(8.0)
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    closures = PlaceCloser(configured(3, {"loops.place_drift": 0.001})).close(keyframes, poses, finish=True)
+    closures = PlaceCloser(configured(3, {"loops.place_drift": 0.001}), Pieces()).close(
+        keyframes, poses, np.ones(len(keyframes), bool), finish=True
+    )
     assert closures and all(closure.verdict is Verdict.REJECTED for closure in closures)
     assert any("loops.place_drift" in closure.reason for closure in closures)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Matrix
+from pipeline.data import Closure, Keyframe
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.loops.anywhere_closer import AnywhereCloser
 from pipeline.loops.near_closer import NearCloser
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place_closer import PlaceCloser
 
 
@@ -15,17 +17,30 @@ class LoopCloser:
     """Looks from each new keyframe for an older place and measures where it lies."""
 
     def __init__(self, config: Config, dimension: int) -> None:
-        self.near = NearCloser(config, dimension)
-        self.places = PlaceCloser(config) if dimension == 3 and config.loops.recognise_places else None
+        self.pieces = Pieces()
+        self.near = NearCloser(config, dimension, self.pieces)
+        self.anywhere = AnywhereCloser(self.near, self.pieces) if dimension == 2 else None
+        self.places = (
+            PlaceCloser(config, self.pieces) if dimension == 3 and config.loops.recognise_places else None
+        )
+
+    def begin_piece(self, keyframe: int) -> None:
+        """Say that nobody knows how the lidar came to this keyframe from the one before."""
+        self.pieces.begin(keyframe)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe to an older place near it, and of places recognised; accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are joined
         """
-        places = () if self.places is None else self.places.close(keyframes, graph.poses)
-        return self.near.close(keyframes, graph) + places
+        joined = self.pieces.joined_to_newest(graph)
+        near = self.near.close(keyframes, graph, joined)
+        if self.anywhere is not None:
+            return near + self.anywhere.close(keyframes, graph, joined)
+        return near if self.places is None else near + self.places.close(keyframes, graph.poses, joined)
 
-    def finish(self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix) -> tuple[Closure, ...]:
+    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the places that waited for more of their surroundings to be seen."""
-        return () if self.places is None else self.places.close(keyframes, T_world_keyframes, finish=True)
+        if self.places is None:
+            return ()
+        return self.places.close(keyframes, graph.poses, self.pieces.joined_to_newest(graph), finish=True)

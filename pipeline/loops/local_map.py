@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline import lie
 from pipeline.data import Keyframe, Points, Pose
+from pipeline.loops.pieces import Pieces
 
 FUTURE = 1.0  # radii of the way after the anchor
 PAST = 2.0  # and before it: a lidar that looks ahead sees a place from far off
@@ -41,11 +42,12 @@ class LocalMap:
         return moved[np.einsum("ij,ij->i", moved, moved) < self.radius_m**2]
 
 
-def local_map(keyframes: Sequence[Keyframe], anchor: int, radius_m: float) -> LocalMap:
+def local_map(keyframes: Sequence[Keyframe], anchor: int, radius_m: float, pieces: Pieces) -> LocalMap:
     """The surroundings of a keyframe, as far as they are known."""
     here_m = keyframes[anchor].travelled_m
-    first = bisect_left(keyframes, here_m - PAST * radius_m, key=_travelled_m)
-    last = bisect_left(keyframes, here_m + FUTURE * radius_m, key=_travelled_m)
+    begin, end = pieces.span(anchor, len(keyframes))
+    first = bisect_left(keyframes, here_m - PAST * radius_m, begin, end, key=_travelled_m)
+    last = bisect_left(keyframes, here_m + FUTURE * radius_m, begin, end, key=_travelled_m)
     return LocalMap(keyframes[anchor], keyframes[first:last], radius_m)
 
 

@@ -6,34 +6,41 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config
 from pipeline.data import Closure, Keyframe, Match, Pose, Proposal, Verdict
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops.doubt import Doubt
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.planar_search import PlanarSearch
 from pipeline.loops.submaps import Submaps
 from pipeline.loops.verification import overlap as overlap_of
 from pipeline.matching import PointToShapeMatcher
 from pipeline.preprocess import downsample
 
+_SURE_OVERLAP = 0.8  # asked of a match for which nothing else speaks
+
 
 class NearCloser:
     """Looks from each new keyframe for an older place and measures where it lies."""
 
-    def __init__(self, config: Config, dimension: int) -> None:
+    def __init__(self, config: Config, dimension: int, pieces: Pieces) -> None:
         self.config = config.loops
         self.match_voxel_m = config.preprocess.match_voxel_m
         self.matcher = PointToShapeMatcher(config.matching)
-        self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map)
+        self.submaps = Submaps(dimension, config.loops.submap_keyframes, config.local_map, pieces)
         self.doubt = Doubt(config.loops.drift)
         self.search = PlanarSearch(self.submaps) if dimension == 2 else None
 
-    def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+    def close(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, joined: NDArray[np.bool_]
+    ) -> tuple[Closure, ...]:
         """Closures of the newest keyframe to older places, accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are joined
+        joined : (K,) those whose place is known from here
         """
         old = self._old(keyframes)
         if not old:
@@ -41,17 +48,17 @@ class NearCloser:
         T_world, config = graph.poses, self.config
         doubts_m = self.doubt.between(graph, len(keyframes) - 1, config.max_radius_m)[:old]
         away_m = np.linalg.norm(T_world[:old, :-1, -1] - T_world[-1, :-1, -1], axis=1)
-        near = np.flatnonzero(away_m <= np.maximum(doubts_m, config.min_radius_m))
+        near = np.flatnonzero(joined[:old] & (away_m <= np.maximum(doubts_m, config.min_radius_m)))
         if not len(near):
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(away_m[near])]))
-        closure = self._measured(keyframes, old, target, lie.inverse(T_world[target]) @ T_world[-1])
+        closure = self.measured(keyframes, old - 1, target, lie.inverse(T_world[target]) @ T_world[-1])
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)
         found = self.search.find(keyframes, T_world, near, doubts_m)
         if found is None:
             return (closure,)
-        searched = self._measured(keyframes, old, found.anchor, found.T_anchor_source)
+        searched = self.measured(keyframes, old - 1, found.anchor, found.T_anchor_source)
         return closure, replace(searched, proposed_by=Proposal.PLACE)
 
     def _old(self, keyframes: Sequence[Keyframe]) -> int:
@@ -62,24 +69,30 @@ class NearCloser:
             old -= 1
         return old
 
-    def _measured(self, keyframes: Sequence[Keyframe], old: int, target: int, T_first: Pose) -> Closure:
-        """The closure of the newest keyframe to the submap of an anchor, from a first guess of where it lies."""
-        submap = self.submaps.around(target, keyframes, old - 1)
+    def measured(
+        self, keyframes: Sequence[Keyframe], newest: int, target: int, T_first: Pose, *, surely: bool = False
+    ) -> Closure:
+        """The closure of the newest keyframe to the submap of an anchor, from a first guess of where it lies.
+
+        newest : keyframe that may be in the submap
+        surely : whether nothing but the match speaks for it, of which more is asked then
+        """
+        submap = self.submaps.around(target, keyframes, newest)
         points = downsample(keyframes[-1].points, submap.scale * self.match_voxel_m)
         match = self.matcher.align(points, submap, T_first, wide=True)
         overlap = overlap_of(points, match.T_target_source, submap)
         moved_m = float(np.linalg.norm((lie.inverse(T_first) @ match.T_target_source)[:-1, -1]))
-        problem = self._problem(match, overlap, moved_m)
+        problem = self._problem(match, overlap, moved_m, _SURE_OVERLAP if surely else self.config.min_overlap)
         verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
         return Closure(target, keyframes[-1].index, match, overlap, verdict, problem or "verified by matching")
 
-    def _problem(self, match: Match, overlap: float, moved_m: float) -> str:
+    def _problem(self, match: Match, overlap: float, moved_m: float, min_overlap: float) -> str:
         """Why the match is no closure, empty if it is one."""
         limits, information = self.config, match.degeneracy_eigenvalue
         if not match.converged:
             return match.reason
-        if overlap < limits.min_overlap:
-            return f"overlap {overlap:.2f} < loops.min_overlap ({limits.min_overlap:g})"
+        if overlap < min_overlap:
+            return f"overlap {overlap:.2f} < loops.min_overlap ({min_overlap:g})"
         if information < limits.min_information:
             return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
         if moved_m > limits.max_radius_m:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Matrix, Pose, Verdict
+from pipeline.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
 from pipeline.loops.local_map import FUTURE, PAST, LocalMap, local_map
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place import describe
 from pipeline.loops.recognition import Candidate, Recognition
 from pipeline.loops.upright import level_frame
@@ -24,8 +26,9 @@ class PlaceCloser:
     The surroundings are complete once the lidar has gone on by the radius of a view.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, pieces: Pieces) -> None:
         self.config = config.loops
+        self.pieces = pieces
         self.map_config = config.local_map
         self.recognition = Recognition(config.loops)
         self.verifier = Verifier(config)
@@ -34,15 +37,21 @@ class PlaceCloser:
         self.last: Closure | None = None
 
     def close(
-        self, keyframes: Sequence[Keyframe], T_world_keyframes: Matrix, *, finish: bool = False
+        self,
+        keyframes: Sequence[Keyframe],
+        T_world_keyframes: Matrix,
+        joined: NDArray[np.bool_],
+        *,
+        finish: bool = False,
     ) -> tuple[Closure, ...]:
         """Closures of the places that are complete by now, accepted or not; with ``finish``, of all that are left.
 
         keyframes : all so far; T_world_keyframes : (K, 4, 4) their best known poses
+        joined : (K,) those that lie as the graph says as seen from the newest, and among themselves
         """
         closures: list[Closure] = []
         for anchor in self._anchors(keyframes, finish):
-            closures += self._closures(anchor, keyframes, T_world_keyframes)
+            closures += self._closures(anchor, keyframes, T_world_keyframes, joined)
         return tuple(closures)
 
     def _anchors(self, keyframes: Sequence[Keyframe], finish: bool) -> Iterator[Keyframe]:
@@ -57,10 +66,12 @@ class PlaceCloser:
                 self.next_m = keyframe.travelled_m + _SPACING * radius_m
                 yield keyframe
 
-    def _closures(self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix) -> Iterator[Closure]:
+    def _closures(
+        self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix, joined: NDArray[np.bool_]
+    ) -> Iterator[Closure]:
         """The first that is accepted, after those that are not."""
         radius_m = self._radius_m(anchor)
-        surroundings = local_map(keyframes, anchor.index, radius_m)
+        surroundings = local_map(keyframes, anchor.index, radius_m, self.pieces)
         place = describe(surroundings, level_frame(anchor, self.map_config))
         apart_m = max((PAST + FUTURE) * radius_m, self.config.min_travel_m)  # no scan belongs to both
         candidates = self.recognition.candidates(
@@ -72,9 +83,12 @@ class PlaceCloser:
             T_world=T_world,
         )
         for candidate in candidates:
-            target = local_map(keyframes, candidate.target, radius_m)
+            is_known = bool(joined[candidate.target] == joined[anchor.index])
+            if not is_known and candidate.proposed_by is Proposal.POSITION:
+                continue
+            target = local_map(keyframes, candidate.target, radius_m, self.pieces)
             measured = self.verifier.measure(surroundings, target, candidate.likeness.T_target_source)
-            closure = self._judge(candidate, surroundings, target, measured, T_world)
+            closure = self._judge(candidate, surroundings, target, measured, T_world if is_known else None)
             yield closure
             if closure.verdict is Verdict.ACCEPTED:
                 self.last = closure
@@ -91,12 +105,21 @@ class PlaceCloser:
         return self.config.place_radius_m * anchor.scale
 
     def _judge(
-        self, candidate: Candidate, source: LocalMap, target: LocalMap, measured: Measurement, T_world: Matrix
+        self,
+        candidate: Candidate,
+        source: LocalMap,
+        target: LocalMap,
+        measured: Measurement,
+        T_world: Matrix | None,
     ) -> Closure:
+        """A closure and its verdict; without poses of the world the way between the two says nothing."""
         i, j = target.anchor.index, source.anchor.index
-        moved = lie.inverse(T_world[j]) @ T_world[i] @ measured.match.T_target_source
+        moved_m = 0.0
+        if T_world is not None:
+            moved = lie.inverse(T_world[j]) @ T_world[i] @ measured.match.T_target_source
+            moved_m = float(np.linalg.norm(moved[:3, 3]))
         travelled_m = source.anchor.travelled_m - target.anchor.travelled_m
-        problem = self._problem(candidate, measured, float(np.linalg.norm(moved[:3, 3])), travelled_m)
+        problem = self._problem(candidate, measured, moved_m, travelled_m)
         return Closure(
             target=i,
             source=j,

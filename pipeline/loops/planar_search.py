@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline import lie
 from pipeline.data import Keyframe, Matrix, Points, Pose
 from pipeline.loops.submaps import Submaps
-from pipeline.matching import CorrelativeMap, Seed
+from pipeline.matching import CorrelativeMap, Seed, VoxelMap
 
 _BASIN_M = 0.5  # of doubt, up to which matching needs no search
 _SHARE_OF_DOUBT = 0.2  # that is travelled between two searches: wide windows cost most and run out last
@@ -19,6 +20,8 @@ _RADIANS_A_METRE = 0.2  # of doubt: who is off by a metre after five looks that 
 _LEAST_RAD = 0.1
 _SPACING_M = 4.0  # between the submaps that are searched
 _SUBMAPS = 6  # of them at most
+_SUBMAPS_ANYWHERE = 400
+_MEMBERS_ANYWHERE = 12  # keyframes whose points are sought together
 _LEAST_SHARE = 0.55  # of the highest score, below which nothing was found
 _SAME_M = 2.0  # within which two submaps tell the same place
 _RIVAL = 0.9  # of the best score, from which on another place is as good
@@ -55,21 +58,37 @@ class PlanarSearch:
             return None
         self.next_m = source.travelled_m + _SHARE_OF_DOUBT * float(doubts_m[near].max())
         anchors = self._anchors(near, T_world)
-        points = self._surroundings(keyframes)
+        points = self._surroundings(keyframes, self.submaps.half_width)
+        T_first = lie.inverse(T_world[anchors]) @ T_world[-1]
         seeds = [
-            self._seed(points, anchor, keyframes, T_world, len(doubts_m), float(doubts_m[anchor]))
+            _seed(
+                points,
+                self.submaps.around(anchor, keyframes, len(doubts_m) - 1),
+                T,
+                doubt_m,
+                _LEAST_RAD + _RADIANS_A_METRE * doubt_m,
+            )
+            for anchor, T, doubt_m in zip(anchors, T_first, doubts_m[anchors].tolist(), strict=True)
+        ]
+        return _best(anchors, seeds, T_world)
+
+    def find_anywhere(
+        self, keyframes: Sequence[Keyframe], T_world: Matrix, old: NDArray[np.int64], known: int
+    ) -> Found | None:
+        """Where the newest keyframe fits best among older ones that tell nothing of where it may be.
+
+        old : these keyframes; known : how many of the last ones odometry joins to the newest
+        """
+        anchors = self._anchors(old, T_world, most=_SUBMAPS_ANYWHERE)
+        points = self._surroundings(keyframes, min(known, _MEMBERS_ANYWHERE))
+        newest = len(keyframes) - 1
+        seeds = [
+            _seed(points, self.submaps.around(anchor, keyframes, newest), lie.identity(2), _SPACING_M, math.pi)
             for anchor in anchors
         ]
-        shares = np.array([seed.share for seed in seeds])
-        best = int(np.argmax(shares))
-        T_found = np.array([T_world[a] @ seed.T_target_source for a, seed in zip(anchors, seeds, strict=True)])
-        elsewhere = np.linalg.norm((T_found - T_found[best])[:, :2, 2], axis=1) > _SAME_M
-        rival = max(seeds[best].rival, float(shares[elsewhere].max(initial=0.0)))
-        if rival >= _RIVAL * shares[best]:
-            return None
-        return Found(anchors[best], seeds[best].T_target_source)
+        return _best(anchors, seeds, T_world)
 
-    def _anchors(self, near: NDArray[np.int64], T_world: Matrix) -> list[int]:
+    def _anchors(self, near: NDArray[np.int64], T_world: Matrix, most: int = _SUBMAPS) -> list[int]:
         """Anchors among the keyframes within reach, the nearest to the newest first, none close to another."""
         positions = T_world[:, :2, 2]
         anchors = np.unique([self.submaps.anchor_of(index) for index in near.tolist()])
@@ -77,24 +96,30 @@ class PlanarSearch:
         chosen: list[int] = []
         for anchor in nearest_first.tolist():
             away_m = np.linalg.norm(positions[chosen] - positions[anchor], axis=1)
-            if len(chosen) < _SUBMAPS and (away_m >= _SPACING_M).all():
+            if len(chosen) < most and (away_m >= _SPACING_M).all():
                 chosen.append(anchor)
         return chosen
 
-    def _surroundings(self, keyframes: Sequence[Keyframe]) -> Points:
+    def _surroundings(self, keyframes: Sequence[Keyframe], count: int) -> Points:
         """The points of the last keyframes, as seen from the newest: one scan alone may fit in many places."""
         T_source_odom = lie.inverse(keyframes[-1].T_odom_lidar)
-        members = keyframes[-self.submaps.half_width :]
+        members = keyframes[-count:]
         return np.vstack([lie.transform(T_source_odom @ member.T_odom_lidar, member.points) for member in members])
 
-    def _seed(
-        self, points: Points, anchor: int, keyframes: Sequence[Keyframe], T_world: Matrix, old: int, doubt_m: float
-    ) -> Seed:
-        submap = self.submaps.around(anchor, keyframes, old - 1)
-        return CorrelativeMap(submap, lie.identity(2)).best(
-            points,
-            lie.inverse(T_world[anchor]) @ T_world[-1],
-            half_width_m=doubt_m,
-            half_width_rad=_LEAST_RAD + _RADIANS_A_METRE * doubt_m,
-            least=_LEAST_SHARE,
-        )
+
+def _seed(points: Points, submap: VoxelMap, T_first: Pose, half_width_m: float, half_width_rad: float) -> Seed:
+    return CorrelativeMap(submap, lie.identity(2)).best(
+        points, T_first, half_width_m=half_width_m, half_width_rad=half_width_rad, least=_LEAST_SHARE
+    )
+
+
+def _best(anchors: Sequence[int], seeds: Sequence[Seed], T_world: Matrix) -> Found | None:
+    """The best of all seeds; None where nothing is like it, or another place as good."""
+    shares = np.array([seed.share for seed in seeds])
+    best = int(np.argmax(shares))
+    T_found = np.array([T_world[a] @ seed.T_target_source for a, seed in zip(anchors, seeds, strict=True)])
+    elsewhere = np.linalg.norm((T_found - T_found[best])[:, :2, 2], axis=1) > _SAME_M
+    rival = max(seeds[best].rival, float(shares[elsewhere].max(initial=0.0)))
+    if rival >= _RIVAL * shares[best]:
+        return None
+    return Found(anchors[best], seeds[best].T_target_source)

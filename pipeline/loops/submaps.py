@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pipeline import lie
 from pipeline.config import LocalMapConfig
 from pipeline.data import Keyframe
+from pipeline.loops.pieces import Pieces
 from pipeline.matching import VoxelMap
 
 _HELD = 64  # submaps in memory; the one unused for longest goes first
@@ -16,10 +17,12 @@ _HELD = 64  # submaps in memory; the one unused for longest goes first
 class Submaps:
     """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame, its voxels of the size used there.
 
-    Neighbouring keyframes are placed by odometry, which over so short a way is as good as any pose known later.
+    Neighbouring keyframes are placed by odometry, which over so short a way is as good as any pose known later;
+    those of another piece are left out.
     """
 
-    def __init__(self, dimension: int, half_width: int, config: LocalMapConfig) -> None:
+    def __init__(self, dimension: int, half_width: int, config: LocalMapConfig, pieces: Pieces) -> None:
+        self.pieces = pieces
         self.dimension = dimension
         self.half_width = half_width
         self.config = config
@@ -31,10 +34,11 @@ class Submaps:
 
     def around(self, anchor: int, keyframes: Sequence[Keyframe], newest: int) -> VoxelMap:
         """The submap of an anchor out of the keyframes up to ``newest``."""
-        last = min(anchor + self.half_width, newest)
+        begin, end = self.pieces.span(anchor, len(keyframes))
+        first, last = max(anchor - self.half_width, begin), min(anchor + self.half_width, newest, end - 1)
         submap = self.held.pop((anchor, last), None)
         if submap is None:
-            submap = self._build(keyframes[anchor], keyframes[max(anchor - self.half_width, 0) : last + 1])
+            submap = self._build(keyframes[anchor], keyframes[first : last + 1])
         self.held[anchor, last] = submap
         if len(self.held) > _HELD:
             self.held.popitem(last=False)

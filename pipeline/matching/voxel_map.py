@@ -16,6 +16,8 @@ _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 class VoxelMap:
     """A map that points are inserted into and scans are matched against; grows and forgets by itself.
 
+    A map without a limit of the distance forgets nothing.
+
     ``voxels`` holds the arrays for the kernels; nobody else writes into them.
     """
 
@@ -32,7 +34,7 @@ class VoxelMap:
     def insert(self, points: Points, T_map_lidar: Pose) -> None:
         """Add points (N, d) of the lidar frame; every so often forget what is far or old."""
         self.insertions += 1
-        if self.insertions % _SWEEP_EVERY == 0:
+        if self.insertions % _SWEEP_EVERY == 0 and self.config.max_distance_m < np.inf:
             self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)
         if len(self) + len(points) > len(self.voxels.cells):
             self._rebuild(2 * (len(self) + len(points)), T_map_lidar, np.inf)

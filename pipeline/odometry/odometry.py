@@ -21,6 +21,7 @@ from pipeline.preprocess import Resolution, Sweep
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
 _DOUBT = 2.0  # cost per point over its running mean, from which on other guesses are tried
+_ELSEWHERE = 3.0  # the same, from which on a scan after a long gap has no place in the map
 _ROUGH = 0.05  # share of the cost of a point without a partner, below which nothing is doubted
 _RECENT = 20  # scans that a map with other voxels starts from
 _MEMORY = 0.9  # of that running mean, per scan
@@ -59,6 +60,7 @@ class Odometry:
         prepared = perf_counter()
         prediction = self.predictor.predict(scan)
         matched = sparse.from_middle(self.predictor.velocity)
+        usual_cost, elsewhere_m = self.usual_cost, 0.0
         if not len(matched):
             match = nothing_to_match(prediction, self.config.preprocess)
             state, reason = State.LOST, match.reason
@@ -67,6 +69,10 @@ class Odometry:
             if sparse.is_distorted and match.inlier_share >= self.config.matching.min_inlier_share:
                 matched, match = self._deskewed(scan, sparse, match, prediction)
             state, reason = self._judge(match)
+            if self.predictor.is_out_of_reach(scan) and self._fits_badly(match, state, usual_cost):
+                elsewhere_m = self.predictor.reach_m(scan)
+                match, state = self._begin_anew(matched), State.OK
+                reason = f"may be {elsewhere_m:.0f} m away after a time without scans: a new map begins"
         else:
             match = first_match(self.predictor.T_odom_lidar, matched, self.config.matching)
             state, reason = State.OK, match.reason
@@ -88,6 +94,7 @@ class Odometry:
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
             map_s=perf_counter() - aligned,
+            elsewhere_m=elsewhere_m,
         )
         return tracked if T_stamp_middle is None else seen_from(tracked, T_stamp_middle)
 
@@ -141,6 +148,18 @@ class Odometry:
         cost = best.cost / len(points)
         self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
+
+    def _fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
+        """Whether a scan that may be anywhere is not where it was found."""
+        least = _ROUGH * 0.5 * self.config.matching.kernel_scale_m**2
+        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, least)
+
+    def _begin_anew(self, points: Points) -> Match:
+        """Forget the map, in which there is no place for the scan; a new one begins where the last scan was."""
+        self.local_map = VoxelMap(self.dimension, self.config.local_map, self.resolution.scale)
+        self.recent.clear()
+        self.usual_cost = 0.0
+        return first_match(self.predictor.T_odom_lidar, points, self.config.matching)
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """What speaks against a match, m²: its own cost, and how far from the expected pose it is."""

@@ -110,6 +110,15 @@ class Predictor:
             min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
         )
 
+    def reach_m(self, scan: Scan) -> float:
+        """How far a scan may be from the last one at the most."""
+        speed_m_s = float(np.linalg.norm(self.T_previous_current[:-1, -1])) / max(self.usual_s, 1e-3)
+        return self._silence_s(scan) * max(self.config.max_speed_m_s, speed_m_s)
+
+    def is_out_of_reach(self, scan: Scan) -> bool:
+        """Whether a scan may be further off than it can be looked for: so long have there been none."""
+        return self._silence_s(scan) * self.config.max_speed_m_s > _LARGEST_WINDOW_M
+
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Take the pose that the scan turned out to have: that of its match or, where it is lost, the expected."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
@@ -178,12 +187,23 @@ class Predictor:
         """
         if self.last_scan is None:
             return 0.0
-        stamped_s = (scan.stamp_ns - self.last_scan.stamp_ns) * 1e-9
-        logged_s = (scan.log_time_ns - self.last_scan.log_time_ns) * 1e-9
+        stamped_s, logged_s = self._since(self.last_scan, scan)
         if not self.usual_s or _are_alike(stamped_s, self.usual_s):
             return stamped_s
         is_sound = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
         return stamped_s if is_sound else self.usual_s
+
+    def _silence_s(self, scan: Scan) -> float:
+        """Seconds since the last scan, however many; 0 where the stamps and the log disagree."""
+        if self.last_scan is None:
+            return 0.0
+        stamped_s, logged_s = self._since(self.last_scan, scan)
+        return stamped_s if _are_alike(stamped_s, logged_s) else 0.0
+
+    @staticmethod
+    def _since(last: Scan, scan: Scan) -> tuple[float, float]:
+        """Seconds between two scans by their stamps and by the log."""
+        return (scan.stamp_ns - last.stamp_ns) * 1e-9, (scan.log_time_ns - last.log_time_ns) * 1e-9
 
     def _has_gap_before(self, scan: Scan) -> bool:
         """Whether scans are missing."""

@@ -19,6 +19,7 @@ class Tracked:
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
     from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
+    ``elsewhere_m`` is how far away it may be where nothing says how it came there, 0 as a rule.
     """
 
     scan: Scan
@@ -31,6 +32,7 @@ class Tracked:
     preprocess_s: float
     match_s: float
     map_s: float
+    elsewhere_m: float = 0.0
 
 
 def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> Match:

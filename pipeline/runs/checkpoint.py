@@ -11,10 +11,12 @@ from pipeline import config, data
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.kernels.voxels import Voxels
+from pipeline.loops.anywhere_closer import AnywhereCloser
 from pipeline.loops.closer import LoopCloser
 from pipeline.loops.doubt import Doubt
 from pipeline.loops.gallery import Gallery
 from pipeline.loops.near_closer import NearCloser
+from pipeline.loops.pieces import Pieces
 from pipeline.loops.place import Place
 from pipeline.loops.place_closer import PlaceCloser
 from pipeline.loops.planar_search import PlanarSearch
@@ -25,12 +27,14 @@ from pipeline.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
 from pipeline.odometry import Odometry
 from pipeline.odometry.experience import Experience
 from pipeline.odometry.prediction import Predictor
+from pipeline.point_store import PointStore, StoredPoints
 from pipeline.preprocess import Resolution, Sweep
 from pipeline.runs.provenance import package_version
 from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
 from pipeline.slam import Slam
 
 CHECKPOINT_FILE = "state.checkpoint"
+POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
 
 
@@ -49,6 +53,7 @@ _CLASSES = Classes(
         Checkpoint, Slam, Odometry, Predictor, Experience, Resolution, Sweep, VoxelMap, Voxels,
         PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
         Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
+        PointStore, StoredPoints, Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
@@ -56,6 +61,7 @@ _CLASSES = Classes(
         (PoseGraph, "_problem"): None,
         (PoseGraph, "_factor_is_now"): False,
         (Submaps, "held"): OrderedDict(),
+        (PointStore, "file"): None,
     },
 )  # fmt: skip
 

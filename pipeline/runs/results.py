@@ -80,7 +80,7 @@ def _cloud(result: SlamResult, config: Config) -> Cloud:
         return Cloud(points, 0)
     views = (
         View(pose, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-        for pose, keyframe in zip(result.state.poses, result.keyframes, strict=True)
+        for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True)
     )
     gone = moved(points, built.voxel_size_m, views)
     return Cloud(points[~gone], int(gone.sum()))
@@ -89,7 +89,7 @@ def _cloud(result: SlamResult, config: Config) -> Cloud:
 def _grid(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
     """The grid of all keyframes, coarser than asked for where the world is too large."""
     resolution_m = fitting_resolution(
-        result.state.poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
+        result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
     return draw_grid(_scans(result), fitting, max_range_m=config.grid_max_range_m)
@@ -97,5 +97,5 @@ def _grid(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
 
 def _scans(result: SlamResult) -> Iterator[tuple[Pose, Points]]:
     """Keyframes with their optimised poses."""
-    for pose, keyframe in zip(result.state.poses, result.keyframes, strict=True):
+    for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True):
         yield pose, keyframe.points

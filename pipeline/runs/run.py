@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -12,10 +12,10 @@ import msgspec
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Trajectory
+from pipeline.data import Scan, Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
-from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoints
+from pipeline.runs.checkpoint import CHECKPOINT_FILE, POINTS_FILE, Checkpoints
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.directory import RUN_FILE, RunDirectory
@@ -163,10 +163,7 @@ def _process(
     left: Left | None,
 ) -> _Recorded:
     """Every scan through the chain and into the recording, then the results into files."""
-    slam, scans, notes = Slam(config, log.T_base_lidar), log.scans(), ()
-    if left is not None:
-        slam, scans = left.checkpoint.slam, after(tuple(steps.rows), scans, left.folder)
-        notes = _resumed(folder, len(steps))
+    slam, scans, notes = _start(config, log, folder, steps, left)
     journal = Journal(folder / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     checkpoints = Checkpoints(folder, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
     recorder = record(
@@ -193,14 +190,22 @@ def _process(
         steps.write(folder / "steps.parquet", result.trajectory)
         if config.outputs.mcap:
             write_results_mcap(folder, log, steps, result)
+        slam.points.close()
         held_s = _hold(recording, progress)
     return _Recorded(result, cloud, judged, (*notes, *recording.warnings), held_s)
 
 
-def _resumed(folder: Path, scans: int) -> tuple[str, ...]:
-    """What to say of a run that went on after so many scans."""
+def _start(
+    config: Config, log: Log, folder: Path, steps: StepTable, left: Left | None
+) -> tuple[Slam, Iterator[Scan], tuple[str, ...]]:
+    """The chain, new or as it was left, the scans that it has not seen, and what to say of that."""
+    if left is None:
+        return Slam(config, log.T_base_lidar, folder / POINTS_FILE), log.scans(), ()
+    slam = left.checkpoint.slam
+    slam.points.reopen(folder / POINTS_FILE)
     before = set_aside_recording(folder)
-    return (f"went on after {scans:,} scans" + (f"; the recording up to there is {before}" if before else ""),)
+    note = f"went on after {len(steps):,} scans" + (f"; the recording up to there is {before}" if before else "")
+    return slam, after(tuple(steps.rows), log.scans(), left.folder), (note,)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:
@@ -256,7 +261,7 @@ def _complete(
         return _report(directory.path, report)
     replaced = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=duration_s)
     replaced.write(directory.path / RUN_FILE)
-    for file in (JOURNAL_FILE, CHECKPOINT_FILE):
+    for file in (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE):
         (directory.path / file).unlink(missing_ok=True)
     warnings = _report(directory.path, report)
     directory.complete()

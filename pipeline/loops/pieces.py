@@ -1,0 +1,42 @@
+"""The pieces of a log between which nobody knows how the lidar moved, until a loop joins them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.graph.pose_graph import PoseGraph
+
+_CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two pieces
+
+
+class Pieces:
+    """Keyframes from one beginning up to the next are one piece."""
+
+    def __init__(self) -> None:
+        self.beginnings = [0]
+
+    def begin(self, keyframe: int) -> None:
+        """Let a new piece begin at this keyframe."""
+        self.beginnings.append(keyframe)
+
+    def of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Number of the piece of each keyframe (...)."""
+        return np.searchsorted(self.beginnings, keyframes, side="right") - 1
+
+    def span(self, keyframe: int, count: int) -> tuple[int, int]:
+        """First keyframe and end of a keyframe's piece, of so many keyframes in all."""
+        number = int(self.of(np.array(keyframe)))
+        return self.beginnings[number], [*self.beginnings[1:], count][number]
+
+    def joined_to_newest(self, graph: PoseGraph) -> NDArray[np.bool_]:
+        """Which keyframes (K,) of the graph are of the newest one's piece, or of one that loops join to it."""
+        piece = self.of(np.arange(len(graph)))
+        joined = np.zeros(len(self.beginnings), np.bool_)
+        joined[-1] = True
+        if len(joined) == 1:
+            return joined[piece]
+        ends = piece[graph.edges[graph.is_loop & (graph.weight > _CLOSED)]]
+        for _ in joined:
+            joined[ends[joined[ends].any(axis=1)]] = True
+        return joined[piece]

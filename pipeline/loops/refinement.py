@@ -1,0 +1,62 @@
+"""Every scan of a planar log aligned once more, at the end, to the map that the corrected keyframes make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.config import Config, MatchingConfig
+from pipeline.data import Keyframe, Matrix
+from pipeline.kernels.refinement import refine
+from pipeline.matching import VoxelMap
+from pipeline.matching.matcher import root_mean_square_range, terms_of
+from pipeline.point_store import PointStore
+
+_TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
+_AT_ONCE = 4096  # scans in memory
+
+
+def refined(
+    poses: Matrix,
+    spans: NDArray[np.int64],
+    store: PointStore,
+    keyframes: Sequence[Keyframe],
+    config: Config,
+) -> Matrix:
+    """T_world_lidar (N, 3, 3) of all scans where they fit the keyframes of every pass best; near where they are.
+
+    A pose is held, as surely as an edge of odometry, where the map tells nothing.
+    spans : (N, 2) first row and number of each scan's points in the store
+    """
+    surfaces = _map_of(poses, keyframes, config)
+    sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
+    result = poses.copy()
+    for first in range(0, len(poses), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        points = np.concatenate([store.read(row, count) for row, count in spans[part].tolist()], dtype=np.float64)
+        terms = terms_of(_briefly(config), surfaces, False, root_mean_square_range(points))
+        held = np.diag(sigma**-2.0) * terms.variance
+        starts = np.append(0, np.cumsum(spans[part, 1]))
+        refine(surfaces.voxels, points, starts, result[part], held, config.matching.min_inlier_share, terms)
+    return result
+
+
+def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
+    """All keyframes in a map that forgets nothing."""
+    whole = msgspec.structs.replace(config.local_map, max_distance_m=inf, max_insertions=len(keyframes) + 1)
+    result = VoxelMap(2, whole)
+    for keyframe in keyframes:
+        result.insert(keyframe.points, poses[keyframe.scan_index])
+    return result
+
+
+def _briefly(config: Config) -> MatchingConfig:
+    """Poses that are good already need no more than a few steps, to partners nearby."""
+    return msgspec.structs.replace(
+        config.matching, reach_voxels=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD
+    )

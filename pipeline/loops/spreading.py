@@ -1,0 +1,25 @@
+"""Corrections of keyframes spread over all scans."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import lie
+from pipeline.data import Matrix
+
+
+def spread(T_world_keyframes: Matrix, numbers: NDArray[np.int64], odometry: Matrix) -> Matrix:
+    """World poses (N, d+1, d+1) of all scans: each keyframe's correction, blended between it and the next.
+
+    numbers : (K,) of the scans that are keyframes, the first of them 0; odometry : (N, d+1, d+1) T_odom_lidar
+    """
+    following = np.append(np.arange(1, len(numbers)), -1)
+    relative = lie.inverse(odometry[numbers]) @ odometry[numbers[following]]
+    target = lie.inverse(T_world_keyframes) @ T_world_keyframes[following]
+    correction = lie.log(target @ lie.inverse(relative))
+    before = np.searchsorted(numbers, np.arange(len(odometry)), side="right") - 1
+    span = np.append(np.diff(numbers), 1)[before]
+    share = np.clip((np.arange(len(odometry)) - numbers[before]) / span, 0.0, 1.0)
+    within = lie.inverse(odometry[numbers[before]]) @ odometry
+    return T_world_keyframes[before] @ lie.exp(share[:, None] * correction[before]) @ within

@@ -1,0 +1,87 @@
+"""Points of scans in a file instead of memory, so that a log of hours takes no more of that than a short one."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+
+_NUMBER = np.dtype("<f4")  # as lidars give them
+
+
+class PointStore:
+    """Grows by one scan after the other; what is in it is handed to the system at once and never changes.
+
+    Attributes
+    ----------
+    dimension : 2 or 3, of the points
+    rows : points that are in it
+    """
+
+    def __init__(self, dimension: int, path: Path | None = None) -> None:
+        """Path : of the file; without one it has no name and goes with the process."""
+        self.dimension = dimension
+        self.rows = 0
+        self.file = _nameless() if path is None else path.open("w+b", buffering=0)
+
+    def add(self, points: NDArray[np.floating]) -> StoredPoints:
+        """Write points (N, d), metres. Raises OSError where the disk is full."""
+        stored = StoredPoints(self, self.rows, len(points))
+        data = memoryview(np.ascontiguousarray(points, _NUMBER).tobytes())
+        self.file.seek(self.rows * self._row_bytes)
+        while data:
+            data = data[self.file.write(data) :]
+        self.rows += len(points)
+        return stored
+
+    def read(self, first: int, count: int) -> NDArray[np.float32]:
+        """(count, d) points from one row on. Raises InputError where the file has lost them."""
+        self.file.seek(first * self._row_bytes)
+        result = np.empty((count, self.dimension), _NUMBER)
+        rest = result.reshape(-1).view(np.uint8).data
+        while rest:
+            size = self.file.readinto(rest)
+            if not size:
+                raise InputError(f"{self.file.name}: ends before point {first + count}; run again")
+            rest = rest[size:]
+        return result
+
+    def reopen(self, path: Path) -> None:
+        """Go on with the file that another process wrote; what it added since this state was kept is cut off."""
+        size = self.rows * self._row_bytes
+        if not path.is_file() or path.stat().st_size < size:
+            raise InputError(f"{path}: is missing or too short; run without --resume")
+        os.truncate(path, size)
+        self.file = path.open("r+b", buffering=0)
+
+    def close(self) -> None:
+        """Let the file go; nothing can be read any more."""
+        self.file.close()
+
+    @property
+    def _row_bytes(self) -> int:
+        return self.dimension * _NUMBER.itemsize
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPoints:
+    """The points of one scan, ``count`` rows of a store from the ``first`` on."""
+
+    store: PointStore
+    first: int
+    count: int
+
+    def read(self) -> NDArray[np.float64]:
+        """(count, d) metres."""
+        return self.store.read(self.first, self.count).astype(np.float64)
+
+
+def _nameless() -> FileIO:
+    return tempfile.TemporaryFile(buffering=0)

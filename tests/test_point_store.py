@@ -1,0 +1,68 @@
+"""Points kept in a file: what goes in comes out, and a state that was kept is gone on from."""
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.memory import resident_mib
+from pipeline.point_store import PointStore
+
+
+def cloud(count, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32).astype(np.float64)
+
+
+def test_every_scan_comes_back_as_it_went_in():
+    store = PointStore(3)
+    clouds = [cloud(count, count) for count in (5, 0, 1000, 1)]
+    stored = [store.add(points) for points in clouds]
+    for points, kept in reversed(list(zip(clouds, stored, strict=True))):
+        assert kept.read().dtype == np.float64
+        assert np.array_equal(kept.read(), points)
+
+
+def test_what_lies_one_after_the_other_is_read_at_once():
+    store = PointStore(2)
+    first, second = store.add(np.zeros((2, 2))), store.add(np.ones((3, 2)))
+    assert np.array_equal(store.read(first.first, 5)[:, 0], [0, 0, 1, 1, 1])
+    assert second.first == 2 and store.rows == 5
+
+
+def test_points_stay_out_of_memory():
+    import os
+
+    store, points = PointStore(3), cloud(100_000)
+    store.add(points)
+    before_mib = resident_mib(os.getpid())
+    for _ in range(100):
+        store.add(points)
+    assert store.rows * 12 / 2**20 > 100.0
+    assert resident_mib(os.getpid()) - before_mib < 20.0
+
+
+def test_a_state_that_was_kept_goes_on_without_what_came_after_it(tmp_path):
+    path = tmp_path / "points"
+    store = PointStore(3, path)
+    kept = store.add(cloud(10, 1))
+    rows = store.rows
+    store.add(cloud(7, 2))
+    store.close()
+    again = PointStore(3)
+    again.rows = rows
+    again.reopen(path)
+    added = again.add(cloud(3, 3))
+    assert np.array_equal(again.read(0, 13), np.vstack([cloud(10, 1), cloud(3, 3)]))
+    assert (kept.count, added.first) == (10, 10)
+
+
+def test_a_file_that_lost_points_is_refused(tmp_path):
+    path = tmp_path / "points"
+    store = PointStore(3, path)
+    stored = store.add(cloud(10))
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(InputError, match="ends before point 10"):
+        stored.read()
+    with pytest.raises(InputError, match="too short; run without --resume"):
+        store.reopen(path)
+    with pytest.raises(InputError, match="missing"):
+        store.reopen(tmp_path / "none")
