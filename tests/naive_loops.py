@@ -48,6 +48,8 @@ def refine(voxels, points, starts, poses, prior, least_share, terms):
     """Each scan aligned by itself."""
     for k, (first, last) in enumerate(pairwise(starts)):
         T = poses[k].copy()
-        outcome = align(voxels, points[first:last], T, np.zeros(len(prior)), prior, terms)
+        scan = points[first:last]
+        range_m = np.sqrt((scan**2).sum(axis=1).mean())
+        outcome = align(voxels, scan, T, np.zeros(len(prior)), prior, range_m, terms.first_scale_m, terms)
         if outcome.ending == CONVERGED and outcome.pairs >= least_share * (last - first):
             poses[k] = T

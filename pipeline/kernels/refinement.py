@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from pipeline.kernels.matching import root_mean_square_range
 from pipeline.kernels.registration import CONVERGED, align
 
 
@@ -14,12 +15,14 @@ def refine(voxels, points, starts, poses, prior, least_share, terms):
     : starts[k + 1]]; poses : (K, d+1, d+1)
     prior : (k, k) information of each pose as it is, twists along the map's axes, times the variance of a residual
     least_share : of a scan's points that find a partner, below which it does not fit
-    terms : ``Terms`` of ``align``, range_m of the scans taken together
     """
     away = np.zeros(prior.shape[0])
     for k in range(poses.shape[0]):
         scan = points[starts[k] : starts[k + 1]]
         T = poses[k].copy()
-        outcome = align(voxels, scan, T, away, prior, terms)
+        range_m = root_mean_square_range(scan)
+        outcome = align(voxels, scan, T, away, prior, range_m, terms.first_scale_m, terms)
         if outcome.ending == CONVERGED and outcome.pairs >= least_share * scan.shape[0]:
-            poses[k] = T
+            for i in range(T.shape[0]):
+                for j in range(T.shape[0]):
+                    poses[k, i, j] = T[i, j]

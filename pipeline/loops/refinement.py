@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from math import inf
 
 import msgspec
@@ -11,14 +12,15 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config, MatchingConfig
-from pipeline.data import Keyframe, Matrix
+from pipeline.data import Keyframe, Matrix, Points
 from pipeline.kernels.refinement import refine
 from pipeline.matching import VoxelMap
-from pipeline.matching.matcher import root_mean_square_range, terms_of
+from pipeline.matching.matcher import terms_of
 from pipeline.point_store import PointStore
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
-_AT_ONCE = 4096  # scans in memory
+_THREADS = 2
+_AT_ONCE = 2048  # scans a thread, in memory
 
 
 def refined(
@@ -33,17 +35,28 @@ def refined(
     A pose is held, as surely as an edge of odometry, where the map tells nothing.
     spans : (N, 2) first row and number of each scan's points in the store
     """
-    surfaces = _map_of(poses, keyframes, config)
+    surfaces, least_share = _map_of(poses, keyframes, config), config.matching.min_inlier_share
+    terms = terms_of(_briefly(config), surfaces, wide=False)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
+    held = np.diag(sigma**-2.0) * terms.variance
     result = poses.copy()
-    for first in range(0, len(poses), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        points = np.concatenate([store.read(row, count) for row, count in spans[part].tolist()], dtype=np.float64)
-        terms = terms_of(_briefly(config), surfaces, False, root_mean_square_range(points))
-        held = np.diag(sigma**-2.0) * terms.variance
+
+    def refine_part(part: slice, points: Points) -> None:
         starts = np.append(0, np.cumsum(spans[part, 1]))
-        refine(surfaces.voxels, points, starts, result[part], held, config.matching.min_inlier_share, terms)
+        refine(surfaces.voxels, points, starts, result[part], held, least_share, terms)
+
+    with ThreadPoolExecutor(_THREADS) as pool:  # no scan depends on another, and kernels let others run
+        for first in range(0, len(poses), _THREADS * _AT_ONCE):
+            parts = [slice(first + k * _AT_ONCE, first + (k + 1) * _AT_ONCE) for k in range(_THREADS)]
+            clouds = [_points_of(spans[part], store) for part in parts]
+            list(pool.map(refine_part, parts, clouds))
     return result
+
+
+def _points_of(spans: NDArray[np.int64], store: PointStore) -> Points:
+    """The points of scans, one after the other, (N, 2)."""
+    scans = [store.read(row, count) for row, count in spans.tolist()]
+    return np.concatenate([np.empty((0, 2)), *scans], dtype=np.float64)
 
 
 def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
