@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 # Told apart on white and on black, also by most who see colours differently.
 _COLOURS = (
-    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#6f7fbf",
+    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
     "#b0413e", "#5f8f57",
 )  # fmt: skip
 

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import tomli_w
 
@@ -64,7 +65,7 @@ def write_evidence(folder: Path, evidence: Evidence) -> None:
 
 def method_folder(folder: Path, name: str) -> Path:
     """Where the files of a method lie."""
-    return folder / METHODS_FOLDER / name.replace("/", "_")
+    return folder / METHODS_FOLDER / quote(name, safe="+ ")
 
 
 def _write_method(own: Path, evidence: Evidence, name: str) -> None:

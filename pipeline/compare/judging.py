@@ -16,15 +16,10 @@ from pipeline.compare.outcome import STEPS_FILE, Outcome
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
-    KITTI_LENGTHS_M,
-    AbsoluteError,
-    Alignment,
-    Pairs,
     Relations,
     RelativeError,
-    absolute_error,
-    kitti_error,
-    lengths_for,
+    absolute_error_on_any_course,
+    kitti_error_on_any_course,
     pair,
     relation_error,
     relative_error_over_distance,
@@ -90,10 +85,8 @@ def degeneracy(outcome: Outcome) -> NDArray[np.float64]:
 
 def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     pairs = pair(outcome.trajectory, truth)
-    ate = _absolute(pairs)
-    lengths_m = lengths_for(ate.path_length_m)
-    every = 10 if lengths_m == KITTI_LENGTHS_M else 1
-    kitti = _or_none(lambda: kitti_error(pairs, lengths_m, every=every))
+    ate = absolute_error_on_any_course(pairs)
+    kitti = _or_none(lambda: kitti_error_on_any_course(pairs))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
     over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
     over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
@@ -123,13 +116,6 @@ def _rmse_m(error: RelativeError | None) -> float | None:
     return None if error is None else error.translation_m.rmse
 
 
-def _absolute(pairs: Pairs) -> AbsoluteError:
-    try:
-        return absolute_error(pairs)
-    except InputError:  # a way on a line leaves the alignment a free rotation
-        return absolute_error(pairs, Alignment.FIRST)
-
-
 def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
     """(N,) of the motion up to each scan; NaN where the method does not tell."""
     path = outcome.folder / STEPS_FILE
@@ -145,9 +131,9 @@ def _speed(outcomes: Sequence[Outcome]) -> Figures:
     if not whole:
         peak = max(outcome.report.peak_mib for outcome in outcomes)
         return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)
-    rest = np.concatenate([outcome.seconds[1:] for outcome in whole])
-    rest = rest if len(rest) else np.concatenate([outcome.seconds for outcome in whole])
-    cpu = np.concatenate([outcome.cpu_seconds[min(1, len(outcome.cpu_seconds) - 1) :] for outcome in whole])
+    first = min(1, len(whole[0].seconds) - 1)
+    rest = np.concatenate([outcome.seconds[first:] for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[first:] for outcome in whole])
     stages = _stages(whole[0])
     return Figures(
         median_s=float(np.median(rest)),
