@@ -23,6 +23,7 @@ from viz.messages import Message, Times
 
 RECORDING_FILE = "compare.rrd"
 _MAP_POINTS = 60_000
+_HEADROOM = 1.2  # over the 99th percentile
 _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 
@@ -72,7 +73,7 @@ def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
         faint = tuple((value + shade) // 2 for value, shade in zip(colour, entities.GREY, strict=True))
         archetype = rr.Points3D(points, colors=[faint], radii=[entities.pixels(0.5)])
         messages.append(Message(f"world/{name}/map", archetype))
-    for plot, values in (("error", course.error_m), ("time", 1e3 * course.seconds)):
+    for plot, values in _series(course).items():
         known = np.isfinite(values)
         if known.any():
             series = rr.SeriesLines(colors=[colour], names=[course.name], widths=[1.0])
@@ -80,6 +81,11 @@ def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
             columns = rr.Scalars.columns(scalars=values[known])
             messages.append(Message(f"plots/{plot}/{name}", columns, times[known]))
     return messages
+
+
+def _series(course: Course) -> dict[str, np.ndarray]:
+    """Scan by scan, by plot."""
+    return {"error": course.error_m, "time": 1e3 * course.seconds}
 
 
 def _blueprint(courses: Sequence[Course], table: Table) -> rrb.Blueprint:
@@ -96,21 +102,24 @@ def _blueprint(courses: Sequence[Course], table: Table) -> rrb.Blueprint:
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(table.dimension, box),
     )
-    shown = [plot for plot in _PLOTS if plot != "error" or any(np.isfinite(c.error_m).any() for c in courses)]
-    plots = [
-        rrb.TimeSeriesView(
-            origin=f"plots/{plot}",
-            name=_PLOTS[plot],
-            axis_x=whole_log(),
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == shown[-1]),
-        )
-        for plot in shown
-    ]
     return rrb.Blueprint(
-        rrb.Vertical(scene, rrb.Horizontal(*plots), row_shares=[2, 1]),
+        rrb.Vertical(scene, rrb.Horizontal(*_plots(courses)), row_shares=[2, 1]),
         time_panel(table.scans),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _plots(courses: Sequence[Course]) -> list[rrb.TimeSeriesView]:
+    """Of what is known of any course; a single scan that took for ever leaves the rest visible."""
+    views = []
+    for plot, name in _PLOTS.items():
+        values = np.concatenate([np.empty(0), *(_series(course)[plot] for course in courses)])
+        if np.isfinite(values).any():
+            highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
+            legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
+            axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
+            views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
+    return views
 
 
 def _stamps(directory: Path) -> np.ndarray:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.figures import columns_of
+from pipeline.compare.figures import Column, columns_of
 from pipeline.compare.outcome import CLOSURES_FILE, Status
+from pipeline.compare.table import Row as TableRow
 from pipeline.compare.table import Table, read_table
 from pipeline.config import MatchingConfig
 from pipeline.maps import read_ply
@@ -23,7 +24,7 @@ from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
 from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
-_TABLES = {"summary": "Summary", "accuracy": "More on accuracy", "time": "More on time"}
+_WIDEST = 10  # columns of a table beside the summary
 _NEARLY = 1.25  # times the thickness of the sharpest map
 
 
@@ -68,22 +69,31 @@ def _warnings(table: Table) -> Iterator[str]:
 
 
 def _figures(table: Table, courses: Sequence[Course]) -> Iterator[Section]:
-    """A row a method; of one that failed the summary says how, and the other tables nothing."""
+    """The summary, and all else in one table more, or in two where that would be too wide."""
+    yield Section("Summary", grid=_grid(table, table.rows, courses, columns_of(table.figures, "summary")))
+    ended = [row for row in table.rows if row.status is Status.OK]
+    accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
+    parts = {"More on accuracy": accuracy, "More on time": time}
+    if len(accuracy) + len(time) <= _WIDEST:
+        parts = {"More figures": [*accuracy, *time]}
+    for title, columns in parts.items():
+        if columns:
+            yield Section(title, grid=_grid(table, ended, courses, columns))
+
+
+def _grid(table: Table, rows: Sequence[TableRow], courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
+    """A row a method; one that failed says how in place of its figures."""
     chips = {course.name: chip(course) for course in courses}
-    for name, title in _TABLES.items():
-        columns = columns_of(table.figures, name)
-        shown = [column.cells(table.figures) for column in columns]
-        rows = []
-        for place, row in enumerate(table.rows):
-            cells = tuple(Cell(each[place].text, each[place].is_best) for each in shown)
-            if row.status is not Status.OK:
-                cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
-            if name == "summary" or (columns and row.status is Status.OK):
-                rows.append(Row(row.name, cells, chips.get(row.name)))
-        heads = (Head("method"), *(Head(column.head, column.unit, column.definition) for column in columns))
-        if rows:
-            notes = (f"{column.heading}: {column.definition}" for column in columns)
-            yield Section(title, grid=Grid(heads, tuple(rows), tuple(notes)))
+    shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
+    lines = []
+    for row in rows:
+        cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
+        if row.status is not Status.OK:
+            cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
+        lines.append(Row(row.name, cells, chips.get(row.name)))
+    heads = (Head("method"), *(Head(column.head, column.unit, column.definition) for column in columns))
+    notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
+    return Grid(heads, tuple(lines), notes)
 
 
 def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
@@ -92,7 +102,9 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
     drawn = [course for course in courses if len(course.positions)]
     if drawn:
         framing = _sharpest(table, drawn)
-        text = "Each moved onto the truth as for the ATE." if truth is not None else "All start in the same place."
+        text = "All start in the same place."
+        if truth is not None:
+            text = "Each moved onto the truth as for the ATE, one that did not come to its end by its first pose."
         if truth is None and len(framing) < len(drawn):
             whole = {course.name for course in framing}
             astray = ", ".join(course.name for course in drawn if course.name not in whole)

@@ -22,7 +22,7 @@ _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
 _BLIND = 0.01  # of the limit; less is drawn as that
-_BAR_INCHES = 0.75  # of a colour bar and its numbers
+_BAR_INCHES = 0.65  # of a colour bar and its numbers
 
 
 def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
@@ -132,7 +132,6 @@ def degeneracy_plan(name: str, course: Course, limit: float) -> Markup:
         )  # fmt: skip
         bar = sheet.figure.colorbar(dots, ax=sheet.axes, pad=0.02, aspect=15, format=_plain)
         bar.ax.minorticks_off()
-        bar.set_label("information")
         bar.outline.set_visible(False)
         sheet.axes.grid(visible=True)
         return sheet.svg()

@@ -103,7 +103,9 @@ def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: boo
     )
     whose = f" of {told[0].name}" if len(told) > 1 else ""
     where = Drawing(
-        "Where little was seen", f"The same on the way{whose}.", figures.degeneracy_plan("blind", told[0], limit)
+        "Where little was seen",
+        f"The same information on the way{whose}.",
+        figures.degeneracy_plan("blind", told[0], limit),
     )
     drawings = (*_consistency(courses, is_planar=is_planar), degeneracy, where)
     yield Section("Certainty", "", _legend(told), drawings)

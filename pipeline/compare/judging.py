@@ -37,7 +37,8 @@ class Judged:
     Attributes
     ----------
     figures : what it amounts to
-    T_reference_estimate : (4, 4) the alignment of the ATE, the identity without truth
+    T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
+        end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
     definitions : what was computed, in words
     """
@@ -50,14 +51,18 @@ class Judged:
     definitions: tuple[str, ...]
 
 
-def judge(outcomes: Sequence[Outcome], truth: Trajectory | None, relations: Relations | None) -> Judged:
-    """A method's runs; the first whole one stands for all, times are those of all."""
+def judge(
+    outcomes: Sequence[Outcome],
+    stamps_ns: NDArray[np.int64],
+    truth: Trajectory | None,
+    relations: Relations | None,
+) -> Judged:
+    """A method's runs over scans of these stamps; the first whole one stands for all, times are those of all."""
     outcome = representative(outcomes)
     figures = _speed(outcomes)
     blank = np.full(len(outcome.seconds), np.nan)
-    judged = Judged(figures, np.eye(4), blank, blank, blank, ())
     if not outcome.is_whole:
-        return judged
+        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, ())
     figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
     definitions: tuple[str, ...] = ()
     if relations is not None:
@@ -81,6 +86,16 @@ def degeneracy(outcome: Outcome) -> NDArray[np.float64]:
     if not path.exists():
         return np.empty(0)
     return pq.read_table(path, columns=["degeneracy_eigenvalue"])["degeneracy_eigenvalue"].to_numpy()
+
+
+def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
+    """Where a method that begins with the identity began."""
+    if truth is None:
+        return np.eye(4)
+    try:
+        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    except InputError:  # the truth begins later
+        return np.eye(4)
 
 
 def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
