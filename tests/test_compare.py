@@ -12,20 +12,24 @@ from scenes import shared_data
 from pipeline import lie
 from pipeline.__main__ import main
 from pipeline.compare.compare import Contest, compare
+from pipeline.compare.evidence import method_folder
 from pipeline.compare.figures import COLUMNS, Figures
 from pipeline.compare.methods import OURS, default_names, resolve
-from pipeline.compare.outcome import Status
+from pipeline.compare.outcome import EndReport, Outcome, Status
+from pipeline.compare.race import race
 from pipeline.compare.scan_store import store
-from pipeline.compare.table import markdown, read_table, text
+from pipeline.compare.table import Row, Table, markdown, read_table, text
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import absolute_error, disagreement, motion_nees, pair, sampled_map, sharpness
 from pipeline.logs import open_log
 from pipeline.odometry import Odometry
 from pipeline.runs.progress import Unwatched
+from pipeline.runs.provenance import Provenance
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import simulate
 from pipeline.trajectory import read_tum, write_kitti
+from pipeline.watched import Limits
 
 TESTS = Path(__file__).parent
 NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself")
@@ -157,6 +161,38 @@ def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(offic
     assert "not installed" in text(table) and "pip install" in markdown(table)
 
 
+def test_where_all_fail_the_tables_still_say_how(office, tmp_path):
+    table = run(office, tmp_path, "a", "b", settings_file=toml(
+        tmp_path / "a.toml", "".join(f'[{name}]\nmethod = "bad_odometries:Raises"\n' for name in "ab")
+    ))  # fmt: skip
+    assert text(table).count("at scan 10: ValueError") == markdown(table).count("at scan 10: ValueError") == 2
+
+
+def test_one_that_failed_is_best_at_nothing():
+    made = Provenance(True, "", [], "", 0.0, [], "", "", "", 2, {})
+    rows = [
+        Row(name, name, status, "", "", {}, Figures(peak_mib=mib, ate_m=mib), [])
+        for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
+    ]
+    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", rows, [], [], made, {})
+    assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
+
+
+def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
+    ran, blank = [], np.zeros(2)
+
+    def fake(method, scans, folder, limits):
+        ran.append(folder.name)
+        report = EndReport(Status.OK, "", has_compiled=len(ran) == 1)
+        return Outcome(report, blank, Trajectory(blank, blank), blank + len(ran), blank, folder)
+
+    monkeypatch.setattr("pipeline.compare.race._run", fake)
+    methods = resolve(("plicp",), 2, file=None)
+    outcomes = race(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
+    assert len(ran) == len(set(ran)) == 3
+    assert [outcome.seconds[0] for outcome in outcomes["plicp"]] == [2.0, 3.0]
+
+
 # the same scans for all
 
 
@@ -244,6 +280,26 @@ def test_what_does_not_exist_is_refused_by_name(tmp_path):
     refused(("svd",), 3, ours, match=r"\[plicp\] is not among the methods")
     refused(("plicp",), 3, toml(tmp_path / "d.toml", "plicp = 1\n"), match="is no table")
     refused(("plicp",), 3, tmp_path / "absent.toml", match="absent.toml")
+    refused(
+        ("plicp",), 3, toml(tmp_path / "e.toml", '[plicp]\nmethod = ["svd"]\n'), match=r"no method \"\['svd'\]\""
+    )
+    refused(("..",), 3, toml(tmp_path / "f.toml", '[".."]\nmethod = "svd"\n'), match="folder")
+
+
+def test_what_a_method_is_and_what_all_share_cannot_be_set_for_it(tmp_path):
+    svd = toml(tmp_path / "a.toml", '[plicp]\nmatching.matcher = "svd"\n')
+    refused(("plicp",), 3, svd, match=r"a\.toml: \[plicp\] matching\.matcher is svd, but plicp has plicp")
+    shared = toml(tmp_path / "b.toml", "[plicp]\nlog.end_s = 3.0\n")
+    refused(("plicp",), 3, shared, match="holds for all methods; give it as --log.end_s")
+    with pytest.raises(InputError, match="choose by --methods"):
+        resolve(("plicp",), 3, file=None, overrides=[Override("loops.enabled", "true", "--loops.enabled")])
+
+
+def test_methods_of_like_names_have_folders_of_their_own(tmp_path):
+    names = ("a/b", "a_b", "a b", "<script>", "plicp+loops")
+    folders = [method_folder(tmp_path, name) for name in names]
+    assert len({folder.name for folder in folders}) == len(names)
+    assert all(folder.parent == tmp_path / "methods" for folder in folders)
 
 
 # what errors are against

@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from pipeline.__main__ import main
 from pipeline.compare.figures import COLUMNS
 from pipeline.compare.table import read_table
+from pipeline.logs.write import LogWriter
 from pipeline.simulate import simulate
 from viz.course_figures import plan
 from viz.courses import Course
@@ -118,6 +119,29 @@ def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_pat
     ):
         assert title in seen["text"], title
     assert len(seen["svgs"]) >= 8
+
+
+def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
+    ranges_m = np.random.default_rng(0).normal(3.0, 0.01, 181)
+    with LogWriter(tmp_path / "still.mcap") as log:
+        for k in range(8):
+            stamp_ns = 10**18 + k * 10**8
+            log.laser_scan(
+                "/scan", stamp_ns, "lidar", -1.57, 0.01745, 0.0, ranges_m, range_min_m=0.1, range_max_m=30.0
+            )
+            log.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(3))
+    arguments = [
+        "run",
+        str(tmp_path / "still.mcap"),
+        "--out",
+        str(tmp_path / "out"),
+        "--rerun",
+        "off",
+        "--no-loops",
+    ]
+    assert main(arguments) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Accuracy" in text and "<td>–</td>" in text and "Loop closures" not in text
 
 
 @pytest.mark.parametrize("which", ["comparison", "one_run"])
