@@ -76,16 +76,18 @@ GOOD = """
     [mine]
     method = "bad_odometries:Shifted"
     step_m = 0.25
+    [unsteady]
+    method = "bad_odometries:Unsteady"
 """
 
 
 @pytest.fixture(scope="module")
 def good(office, tmp_path_factory):
-    """Two runs each of four methods that come to their end: the table and its directory."""
+    """Two runs each of five methods that come to their end: the table and its directory."""
     folder = tmp_path_factory.mktemp("good")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
-        names = ("plicp", "svd+loops", "coarse", "mine")
+        names = ("plicp", "svd+loops", "coarse", "mine", "unsteady")
         table = run(office, folder, *names, repeat=2, settings_file=toml(folder / "good.toml", GOOD))
     return table, folder / "out"
 
@@ -232,9 +234,19 @@ def test_ours_is_our_odometry_to_the_last_bit(office, good):
 
 
 def test_runs_of_the_same_method_are_compared_with_each_other(good):
-    assert [each.figures.repeats_apart_m for each in good[0].rows] == [0.0] * 4
+    *steady, unsteady = [each.figures.repeats_apart_m for each in good[0].rows]
+    assert steady == [0.0] * 4 and unsteady > 0.01
     scans = pq.read_table(good[1] / "per_scan.parquet")
-    assert set(scans["repeat"].to_pylist()) == {0, 1} and len(scans) == 2 * 4 * 60
+    assert set(scans["repeat"].to_pylist()) == {0, 1} and len(scans) == 2 * 5 * 60
+
+
+def test_every_run_of_a_method_is_judged_by_its_own_poses(office, good):
+    truth = read_tum(office.with_suffix(".tum")).poses[:, :3, 3]
+    scans = pq.read_table(good[1] / "per_scan.parquet").to_pandas()
+    for repeat in (0, 1):
+        rows = scans[(scans.method == "unsteady") & (scans.repeat == repeat)]
+        aligned = rows[["aligned_x", "aligned_y", "aligned_z"]].to_numpy()
+        np.testing.assert_allclose(rows.error_m, np.linalg.norm(aligned - truth, axis=1), atol=1e-6)
 
 
 def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):

@@ -182,6 +182,7 @@ def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparis
 def course(positions, **known):
     count = len(positions)
     unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "eigenvalue")}
+    unknown["relation_error_m"] = np.empty(0)
     return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
 
 

@@ -18,7 +18,15 @@ from pipeline.maps import read_ply
 from pipeline.trajectory import read_tum
 from viz import course_figures as figures
 from viz.compared_courses import read_courses
-from viz.course_sections import chip, error_section, knowledge_section, loop_section, time_section, way_section
+from viz.course_sections import (
+    chip,
+    error_section,
+    knowledge_section,
+    loop_section,
+    relation_section,
+    time_section,
+    way_section,
+)
 from viz.courses import Course, Floats
 from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
@@ -111,6 +119,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
             text += f" The corners are those of the sharper maps; what leaves the picture is of {astray}."
         yield way_section(drawn, framing, truth, is_planar=is_planar, text=text)
         yield from error_section(drawn, table.truth)
+        yield from relation_section(drawn)
         yield from time_section(drawn)
         yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
         yield from _map_section(directory, drawn, figures.frame(framing, truth), table.dimension)

@@ -64,7 +64,7 @@ def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
 
 
 def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: float, label: str) -> Markup:
-    """Share of the scans below a value, which is shown up to the 99.5th percentile of the worst course."""
+    """Share below a value, which is shown up to the 99.5th percentile of the worst course."""
     with Sheet(name) as sheet:
         ends = []
         for course in _known(courses, key):
@@ -75,7 +75,7 @@ def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: flo
         sheet.axes.set_xlim(0.9 * np.min(ends), 1.1 * np.max(ends))
         _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
-        _label(sheet.axes, label, "scans below [%]")
+        _label(sheet.axes, label, "share below [%]")
         return sheet.svg()
 
 

@@ -71,6 +71,19 @@ def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Sectio
     )
 
 
+def relation_section(courses: Sequence[Course]) -> Iterator[Section]:
+    """How far off they were over relations set by hand."""
+    known = _with(courses, "relation_error_m")
+    if known:
+        drawing = Drawing(
+            "Distribution",
+            "Share of the relations that are off by less.",
+            figures.distribution("relations", known, "relation_error_m", 1.0, "error of a relation [m]"),
+        )
+        text = "Distance between the motion of a relation and that of the trajectory."
+        yield Section("Error over relations", text, _legend(known), (drawing,))
+
+
 def time_section(courses: Sequence[Course]) -> Iterator[Section]:
     """How long a scan took."""
     known = _with(courses, "seconds")

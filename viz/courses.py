@@ -28,6 +28,7 @@ class Course:
     positions : (N, 3) metres, in one frame with the other courses
     distance_m : (N,) travelled
     error_m : (N,) distance from where it was
+    relation_error_m : (K,) the same of K relations, none where there are no relations
     seconds : (N,) what each scan took
     nees : (N,) squared error over covariance, 1 on average if exact
     eigenvalue : (N,) information per inlier along the worst direction
@@ -39,6 +40,7 @@ class Course:
     positions: Floats
     distance_m: Floats
     error_m: Floats
+    relation_error_m: Floats
     seconds: Floats
     nees: Floats
     eigenvalue: Floats

@@ -132,6 +132,7 @@ def _course(
         positions=poses[:, :3, 3],
         distance_m=path_length(poses),
         error_m=off.errors_m,
+        relation_error_m=np.empty(0),
         seconds=unknown if steps is None else _seconds(steps),
         nees=unknown if steps is None or truth is None else _nees(steps, truth),
         eigenvalue=unknown if steps is None else steps["degeneracy_eigenvalue"].to_numpy(),

@@ -16,6 +16,7 @@ from pipeline.compare.outcome import STEPS_FILE, Outcome
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
+    RelationError,
     Relations,
     RelativeError,
     absolute_error_on_any_course,
@@ -40,6 +41,7 @@ class Judged:
     T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
         end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
+    relations : the error over relations; None without any, or after a failure
     definitions : what was computed, in words
     """
 
@@ -48,6 +50,7 @@ class Judged:
     errors_m: NDArray[np.float64]
     errors_rad: NDArray[np.float64]
     nees: NDArray[np.float64]
+    relations: RelationError | None
     definitions: tuple[str, ...]
 
 
@@ -62,16 +65,15 @@ def judge(
     figures = _speed(outcomes)
     blank = np.full(len(outcome.seconds), np.nan)
     if not outcome.is_whole:
-        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, ())
+        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
     figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
-    definitions: tuple[str, ...] = ()
-    if relations is not None:
-        error = relation_error(outcome.trajectory, relations)
-        definitions = (error.definition,)
+    error = None if relations is None else relation_error(outcome.trajectory, relations)
+    if error is not None:
         figures = msgspec.structs.replace(
             figures, relations_m=error.translation_m.mean, relations_rad=error.rotation_rad.mean
         )
-    judged = Judged(figures, np.eye(4), blank, blank, blank, definitions)
+    definitions = () if error is None else (error.definition,)
+    judged = Judged(figures, np.eye(4), blank, blank, blank, error, definitions)
     return judged if truth is None else _against(truth, outcome, judged)
 
 
@@ -124,7 +126,7 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     )
     found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
     definitions = (*judged.definitions, *found)
-    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, definitions)
+    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, judged.relations, definitions)
 
 
 def _rmse_m(error: RelativeError | None) -> float | None:
