@@ -64,6 +64,16 @@ class DiesEarly(Dies):
         self.misbehave()
 
 
+class Unsteady(StandsStill):
+    """Never twice the same."""
+
+    def track(self, points, times_s, stamp_ns):
+        self.scans += 1
+        pose = np.eye(points.shape[1] + 1)
+        pose[:-1, -1] = np.random.default_rng().normal(scale=0.1, size=points.shape[1]) + 0.1 * self.scans
+        return pose
+
+
 class Shifted(StandsStill):
     """Ten centimetres forward a scan, or whatever it is told."""
 

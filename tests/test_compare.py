@@ -12,20 +12,24 @@ from scenes import shared_data
 from pipeline import lie
 from pipeline.__main__ import main
 from pipeline.compare.compare import Contest, compare
+from pipeline.compare.evidence import method_folder
 from pipeline.compare.figures import COLUMNS, Figures
 from pipeline.compare.methods import OURS, default_names, resolve
-from pipeline.compare.outcome import Status
+from pipeline.compare.outcome import EndReport, Outcome, Status
+from pipeline.compare.race import race
 from pipeline.compare.scan_store import store
-from pipeline.compare.table import markdown, read_table, text
+from pipeline.compare.table import Row, Table, markdown, read_table, text
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import absolute_error, disagreement, motion_nees, pair, sampled_map, sharpness
 from pipeline.logs import open_log
 from pipeline.odometry import Odometry
 from pipeline.runs.progress import Unwatched
+from pipeline.runs.provenance import Provenance
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import simulate
 from pipeline.trajectory import read_tum, write_kitti
+from pipeline.watched import Limits
 
 TESTS = Path(__file__).parent
 NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself")
@@ -72,16 +76,18 @@ GOOD = """
     [mine]
     method = "bad_odometries:Shifted"
     step_m = 0.25
+    [unsteady]
+    method = "bad_odometries:Unsteady"
 """
 
 
 @pytest.fixture(scope="module")
 def good(office, tmp_path_factory):
-    """Two runs each of four methods that come to their end: the table and its directory."""
+    """Two runs each of five methods that come to their end: the table and its directory."""
     folder = tmp_path_factory.mktemp("good")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
-        names = ("plicp", "svd+loops", "coarse", "mine")
+        names = ("plicp", "svd+loops", "coarse", "mine", "unsteady")
         table = run(office, folder, *names, repeat=2, settings_file=toml(folder / "good.toml", GOOD))
     return table, folder / "out"
 
@@ -117,16 +123,12 @@ def bad(office, tmp_path_factory):
 def test_every_bad_method_is_a_row_that_says_how_it_ended(bad):
     table = read_table(bad[1])
     for name, status, reason in (
-        ("raises", Status.CRASHED, "ValueError: no more <b>patience</b> at scan 10"),
-        ("hangs", Status.TIMED_OUT, "took longer than --time-limit (20 s) at scan 10"),
-        ("eats", Status.OUT_OF_MEMORY, "took more than --memory-limit (1 GiB) at scan 10"),
-        ("dies", Status.CRASHED, "ended by SIGSEGV at scan 10"),
-        (
-            "diesearly",
-            Status.CRASHED,
-            "ended by SIGSEGV while starting, or on the first scans, where it gets warm",
-        ),
-        ("losesitself", Status.CRASHED, "ValueError: a pose that is not finite at scan 10"),
+        ("raises", Status.CRASHED, "at scan 10: ValueError: no more <b>patience</b>"),
+        ("hangs", Status.TIMED_OUT, "at scan 10: took longer than --time-limit (20 s)"),
+        ("eats", Status.OUT_OF_MEMORY, "at scan 10: took more than --memory-limit (1 GiB)"),
+        ("dies", Status.CRASHED, "at scan 10: ended by SIGSEGV"),
+        ("diesearly", Status.CRASHED, "while starting or warming up: ended by SIGSEGV"),
+        ("losesitself", Status.CRASHED, "at scan 10: ValueError: a pose that is not finite"),
     ):
         assert (row(table, name).status, row(table, name).reason) == (status, reason)
         assert row(table, name).figures.ate_m is None
@@ -159,6 +161,38 @@ def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(offic
     assert "pip install 'scanchain[baselines]'" in row(table, "kiss-icp").reason
     assert row(table, "plicp").status is Status.OK
     assert "not installed" in text(table) and "pip install" in markdown(table)
+
+
+def test_where_all_fail_the_tables_still_say_how(office, tmp_path):
+    table = run(office, tmp_path, "a", "b", settings_file=toml(
+        tmp_path / "a.toml", "".join(f'[{name}]\nmethod = "bad_odometries:Raises"\n' for name in "ab")
+    ))  # fmt: skip
+    assert text(table).count("at scan 10: ValueError") == markdown(table).count("at scan 10: ValueError") == 2
+
+
+def test_one_that_failed_is_best_at_nothing():
+    made = Provenance(True, "", [], "", 0.0, [], "", "", "", 2, {})
+    rows = [
+        Row(name, name, status, "", "", {}, Figures(peak_mib=mib, ate_m=mib), [])
+        for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
+    ]
+    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", rows, [], [], made, {})
+    assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
+
+
+def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
+    ran, blank = [], np.zeros(2)
+
+    def fake(method, scans, folder, limits):
+        ran.append(folder.name)
+        report = EndReport(Status.OK, "", has_compiled=len(ran) == 1)
+        return Outcome(report, blank, Trajectory(blank, blank), blank + len(ran), blank, folder)
+
+    monkeypatch.setattr("pipeline.compare.race._run", fake)
+    methods = resolve(("plicp",), 2, file=None)
+    outcomes = race(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
+    assert len(ran) == len(set(ran)) == 3
+    assert [outcome.seconds[0] for outcome in outcomes["plicp"]] == [2.0, 3.0]
 
 
 # the same scans for all
@@ -200,9 +234,19 @@ def test_ours_is_our_odometry_to_the_last_bit(office, good):
 
 
 def test_runs_of_the_same_method_are_compared_with_each_other(good):
-    assert [each.figures.repeats_apart_m for each in good[0].rows] == [0.0] * 4
+    *steady, unsteady = [each.figures.repeats_apart_m for each in good[0].rows]
+    assert steady == [0.0] * 4 and unsteady > 0.01
     scans = pq.read_table(good[1] / "per_scan.parquet")
-    assert set(scans["repeat"].to_pylist()) == {0, 1} and len(scans) == 2 * 4 * 60
+    assert set(scans["repeat"].to_pylist()) == {0, 1} and len(scans) == 2 * 5 * 60
+
+
+def test_every_run_of_a_method_is_judged_by_its_own_poses(office, good):
+    truth = read_tum(office.with_suffix(".tum")).poses[:, :3, 3]
+    scans = pq.read_table(good[1] / "per_scan.parquet").to_pandas()
+    for repeat in (0, 1):
+        rows = scans[(scans.method == "unsteady") & (scans.repeat == repeat)]
+        aligned = rows[["aligned_x", "aligned_y", "aligned_z"]].to_numpy()
+        np.testing.assert_allclose(rows.error_m, np.linalg.norm(aligned - truth, axis=1), atol=1e-6)
 
 
 def test_methods_for_clouds_follow_planar_scans_in_the_plane(office, tmp_path):
@@ -231,7 +275,7 @@ def test_written_settings_can_be_given_back(good):
     again = resolve([each.name for each in table.rows], 2, file=folder / "settings.toml")
     for method, each in zip(again, table.rows, strict=True):
         assert (method.name, method.base) == (each.name, each.base)
-        assert method.settings | {"log": None} == each.settings | {"log": None}
+        assert method.settings == each.settings
 
 
 def test_what_does_not_exist_is_refused_by_name(tmp_path):
@@ -248,6 +292,26 @@ def test_what_does_not_exist_is_refused_by_name(tmp_path):
     refused(("svd",), 3, ours, match=r"\[plicp\] is not among the methods")
     refused(("plicp",), 3, toml(tmp_path / "d.toml", "plicp = 1\n"), match="is no table")
     refused(("plicp",), 3, tmp_path / "absent.toml", match="absent.toml")
+    refused(
+        ("plicp",), 3, toml(tmp_path / "e.toml", '[plicp]\nmethod = ["svd"]\n'), match=r"no method \"\['svd'\]\""
+    )
+    refused(("..",), 3, toml(tmp_path / "f.toml", '[".."]\nmethod = "svd"\n'), match="folder")
+
+
+def test_what_a_method_is_and_what_all_share_cannot_be_set_for_it(tmp_path):
+    svd = toml(tmp_path / "a.toml", '[plicp]\nmatching.matcher = "svd"\n')
+    refused(("plicp",), 3, svd, match=r"a\.toml: \[plicp\] matching\.matcher is svd, but plicp has plicp")
+    shared = toml(tmp_path / "b.toml", "[plicp]\nlog.end_s = 3.0\n")
+    refused(("plicp",), 3, shared, match="holds for all methods; give it as --log.end_s")
+    with pytest.raises(InputError, match="choose by --methods"):
+        resolve(("plicp",), 3, file=None, overrides=[Override("loops.enabled", "true", "--loops.enabled")])
+
+
+def test_methods_of_like_names_have_folders_of_their_own(tmp_path):
+    names = ("a/b", "a_b", "a b", "<script>", "plicp+loops")
+    folders = [method_folder(tmp_path, name) for name in names]
+    assert len({folder.name for folder in folders}) == len(names)
+    assert all(folder.parent == tmp_path / "methods" for folder in folders)
 
 
 # what errors are against
@@ -299,9 +363,25 @@ def test_the_best_of_a_column_is_marked_as_it_is_shown():
     ate = next(column for column in COLUMNS if column.key == "ate_m")
     nees = next(column for column in COLUMNS if column.key == "nees")
     rows = [Figures(ate_m=0.12341, nees=0.5), Figures(ate_m=0.12339, nees=1.2), Figures(ate_m=0.2), Figures()]
-    assert ate.best(rows) == [True, True, False, False]
-    assert nees.best(rows) == [False, True, False, False]
-    assert ate.best(rows[2:]) == [False, False]
+
+    def best(column, rows):
+        return [cell.is_best for cell in column.cells(rows)]
+
+    assert best(ate, rows) == [True, True, False, False]
+    assert best(nees, rows) == [False, True, False, False]
+    assert best(ate, rows[2:]) == [False, False]
+    assert best(ate, rows[:2]) == [False, False]
+
+
+def test_a_column_has_the_digits_that_its_smallest_figure_needs():
+    time = next(column for column in COLUMNS if column.key == "median_s")
+    for seconds, texts in (
+        ((0.23456, 2.9871), ["235", "2987"]),
+        ((0.031234, 0.23456), ["31.2", "234.6"]),
+        ((0.000212, 0.031234), ["0.21", "31.23"]),
+        ((0.0, None), ["0.00", "–"]),
+    ):
+        assert [cell.text for cell in time.cells([Figures(median_s=each) for each in seconds])] == texts
 
 
 def test_every_figure_is_shown_in_one_column():

@@ -15,7 +15,7 @@ from pipeline.evaluate import (
     Alignment,
     absolute_error,
     kitti_error,
-    lengths_for,
+    kitti_error_on_any_course,
     pair,
     read_relations,
     relation_error,
@@ -113,14 +113,30 @@ def test_rpe_over_frames_equals_evo(pairs, frames):
         np.testing.assert_allclose(errors, theirs.error, atol=1e-9)
 
 
-def test_rpe_over_distance_equals_evo_on_the_same_stretches(pairs):
-    metrics = pytest.importorskip("evo.core.metrics")
-    ours = relative_error_over_distance(pairs, 20.0)
+@pytest.mark.parametrize("which", ["pairs", "published"])
+@pytest.mark.parametrize(
+    "measure",
+    [lambda pairs: relative_error_over_distance(pairs, 10.0), lambda pairs: relative_error_over_time(pairs, 1.0)],
+)
+def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(which, measure, request):
+    metrics, lie_algebra = (pytest.importorskip(f"evo.core.{name}") for name in ("metrics", "lie_algebra"))
+    pairs = request.getfixturevalue(which)
+    ours = measure(pairs)
+    assert len(ours.stretches) > 15
+    theirs = [
+        metrics.RPE.rpe_base(pairs.reference[i], pairs.reference[j], pairs.estimate[i], pairs.estimate[j])
+        for i, j in ours.stretches
+    ]
+    np.testing.assert_allclose(ours.errors_m, [np.linalg.norm(each[:3, 3]) for each in theirs], atol=1e-9)
+    turns = [lie_algebra.so3_log_angle(each[:3, :3]) for each in theirs]
+    np.testing.assert_allclose(ours.errors_rad, turns, atol=1e-9)
+    assert ours.translation_m.rmse == pytest.approx(np.sqrt(np.mean(ours.errors_m**2)), abs=1e-12)
+
+
+def test_rpe_over_distance_takes_the_first_pose_far_enough(pairs):
     path = naive.travelled(pairs.reference)
-    for (i, j), error_m in zip(ours.stretches, ours.errors_m, strict=True):
+    for i, j in relative_error_over_distance(pairs, 20.0).stretches:
         assert path[j] - path[i] >= 20.0 - 1e-9 > path[j - 1] - path[i] - 2e-9
-        theirs = metrics.RPE.rpe_base(pairs.reference[i], pairs.reference[j], pairs.estimate[i], pairs.estimate[j])
-        assert error_m == pytest.approx(np.linalg.norm(theirs[:3, 3]), abs=1e-9)
 
 
 def test_rpe_over_time_takes_the_first_pose_late_enough(pairs):
@@ -169,9 +185,11 @@ def test_the_kitti_metric_of_a_real_drive_is_that_of_the_development_kit(publish
 
 
 def test_short_paths_are_judged_over_short_lengths(pairs):
-    assert lengths_for(63.8) == (10.0, 20.0, 40.0)
-    assert lengths_for(250.0) == (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-    error = kitti_error(pairs, lengths_for(250.0))
+    short = pair(disturbed(drive(65)), drive(65))
+    assert kitti_error_on_any_course(short) == kitti_error(short, (10.0, 20.0, 40.0), every=1)
+    error = kitti_error_on_any_course(pairs)
+    assert error == kitti_error(pairs)
+    assert [part.length_m for part in error.by_length] == [100.0 * k for k in range(1, 9)]
     assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6
 
 

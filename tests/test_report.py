@@ -12,11 +12,13 @@ from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from pipeline.__main__ import main
+from pipeline.compare.figures import COLUMNS
 from pipeline.compare.table import read_table
+from pipeline.logs.write import LogWriter
 from pipeline.simulate import simulate
 from viz.course_figures import plan
 from viz.courses import Course
-from viz.report import Chip, Drawing, Grid, Head, Page, Row, Section, write_page
+from viz.report import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent
@@ -89,6 +91,7 @@ def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, request, tmp_pa
 def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, tmp_path):
     seen, table = look(comparison / "report.html", tmp_path, width=1200), read_table(comparison)
     for title in (
+        "Summary", "More on accuracy", "More on time",
         "Trajectories", "Plan", "Error", "Over the distance", "Distribution", "Time per scan", "Along the log",
         "Covariance consistency", "Degeneracy along the way", "Maps", "Loop closures of plicp+loops",
         "Disagreement", "Command", "Versions", "Settings",
@@ -97,9 +100,10 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
     assert len(seen["svgs"]) >= 11 and seen["tables"] >= 2 and seen["bold"] >= 5
     for row in table.rows:
         assert row.name in seen["text"]
-    assert "raises crashed: ValueError: no more <b>patience</b>" in seen["text"]
-    for column in table.columns:
-        assert column.show(table.rows[0].figures) in seen["text"], column.key
+    assert "raises crashed: at scan 10: ValueError: no more <b>patience</b>" in seen["text"]
+    for column in COLUMNS:
+        for cell in column.cells(table.figures):
+            assert cell.text in seen["text"], column.key
 
 
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
@@ -115,6 +119,29 @@ def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_pat
     ):
         assert title in seen["text"], title
     assert len(seen["svgs"]) >= 8
+
+
+def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
+    ranges_m = np.random.default_rng(0).normal(3.0, 0.01, 181)
+    with LogWriter(tmp_path / "still.mcap") as log:
+        for k in range(8):
+            stamp_ns = 10**18 + k * 10**8
+            log.laser_scan(
+                "/scan", stamp_ns, "lidar", -1.57, 0.01745, 0.0, ranges_m, range_min_m=0.1, range_max_m=30.0
+            )
+            log.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(3))
+    arguments = [
+        "run",
+        str(tmp_path / "still.mcap"),
+        "--out",
+        str(tmp_path / "out"),
+        "--rerun",
+        "off",
+        "--no-loops",
+    ]
+    assert main(arguments) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Accuracy" in text and "<td>–</td>" in text and "Loop closures" not in text
 
 
 @pytest.mark.parametrize("which", ["comparison", "one_run"])
@@ -155,6 +182,7 @@ def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparis
 def course(positions, **known):
     count = len(positions)
     unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "eigenvalue")}
+    unknown["relation_error_m"] = np.empty(0)
     return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
 
 
@@ -167,7 +195,8 @@ def test_a_drawing_takes_the_colours_of_its_page():
 
 def test_every_text_of_a_page_is_escaped(tmp_path):
     chip, drawing = Chip(EVIL, "red"), Drawing(EVIL, EVIL, svg="<svg></svg>")
-    grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),))
+    grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),), (EVIL,))
     section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
-    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), EVIL, grid, (EVIL,), (section,)))
+    fold = Fold(EVIL, EVIL)
+    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), (EVIL,), (section,), (fold,)))
     assert "<script" not in (tmp_path / "a.html").read_text()

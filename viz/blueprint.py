@@ -26,9 +26,7 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     box : (2, 3) lowest and highest coordinates that the view should frame
     scans : how many there are, where that is known: they are played in half a minute, but no slower than 30 Hz
     """
-    whole = rrb.TimeAxis(
-        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
-    )
+    whole = whole_log()
     ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
     plots = rrb.Tabs(
         rrb.TimeSeriesView(origin=entities.TIME, name="time by stage", axis_x=whole, axis_y=ordinary_ms),
@@ -42,34 +40,44 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     side = rrb.Vertical(plots, state, texts, row_shares=[4, 1, 3])
     return rrb.Blueprint(
         rrb.Horizontal(_scene(dimension, box), side, column_shares=[5, 3]),
-        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
+        time_panel(scans),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
 
 
-def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
-    """The world; the two ways grow with the time cursor instead of showing their last piece only."""
-    so_far = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(
-                timeline,
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(),
-            )
-            for timeline in ("scan", "sensor_time")
-        ]
+def whole_log() -> rrb.TimeAxis:
+    """From the first scan to the last."""
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
     )
+
+
+def up_to_now() -> rrb.VisibleTimeRanges:
+    """For a way that grows with the time cursor instead of showing its last piece only."""
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.VisibleTimeRanges(
+        [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in ("scan", "sensor_time")]
+    )
+
+
+def time_panel(scans: int) -> rrb.TimePanel:
+    """Small, and as fast as ``blueprint`` says."""
+    return rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S))
+
+
+def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
+    """The world."""
     return rrb.Spatial3DView(
         origin=entities.WORLD,
         name="seen from above" if dimension == 2 else "scene",
-        overrides={entities.ODOMETRY: so_far, entities.TRAJECTORY: so_far},
+        overrides={entities.ODOMETRY: up_to_now(), entities.TRAJECTORY: up_to_now()},
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_eye(dimension, box),
+        eye_controls=eye(dimension, box),
     )
 
 
-def _eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
+def eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole way."""
     low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
     centre = 0.5 * (low + high)

@@ -12,16 +12,18 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from pipeline.compare.evidence import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.table import read_table
+from pipeline.compare.table import Table, read_table
 from pipeline.maps import read_ply
 from pipeline.trajectory import read_tum
 from viz import entities, shapes
+from viz.blueprint import eye, time_panel, up_to_now, whole_log
 from viz.compared_courses import read_courses
 from viz.courses import Course
 from viz.messages import Message, Times
 
 RECORDING_FILE = "compare.rrd"
 _MAP_POINTS = 60_000
+_HEADROOM = 1.2  # over the 99th percentile
 _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 
@@ -30,8 +32,8 @@ def record_comparison(directory: Path) -> None:
     table, courses = read_table(directory), read_courses(directory)
     stream = rr.RecordingStream(f"scanchain comparison {table.dimension}D")
     stream.set_log_time_enabled(False)
-    stream.set_sinks(rr.FileSink(directory / RECORDING_FILE), default_blueprint=_blueprint(courses))
-    stream.send_recording_name(directory.name)
+    stream.set_sinks(rr.FileSink(directory / RECORDING_FILE), default_blueprint=_blueprint(courses, table))
+    stream.send_recording_name(Path(table.log.split(", ")[0]).name)
     stamps_ns = _stamps(directory)
     for message in _messages(directory, courses, stamps_ns):
         message.send(stream)
@@ -46,12 +48,12 @@ def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray)
         way = shapes.positions(read_tum(truth_file).poses)
         line = rr.LineStrips3D([way], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
         messages.append(Message("world/ground_truth", line))
-    for place, course in enumerate(courses):
-        messages += _of(course, place, method_folder(directory, course.name) / MAP_FILE, stamps_ns)
+    for course in courses:
+        messages += _of(course, method_folder(directory, course.name) / MAP_FILE, stamps_ns)
     return messages
 
 
-def _of(course: Course, place: int, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
+def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
     """The way piece by piece, the lidar on it, the map, and the plots."""
     name = rr.escape_entity_path_part(course.name)
     colour, positions = _rgb(course.colour), course.positions.astype(np.float32)
@@ -68,9 +70,10 @@ def _of(course: Course, place: int, map_file: Path, stamps_ns: np.ndarray) -> li
     ]
     if map_file.exists():
         points = shapes.in_space(shapes.at_most(read_ply(map_file), _MAP_POINTS))
-        archetype = rr.Points3D(points, colors=[colour], radii=[entities.pixels(0.75)])
+        faint = tuple((value + shade) // 2 for value, shade in zip(colour, entities.GREY, strict=True))
+        archetype = rr.Points3D(points, colors=[faint], radii=[entities.pixels(0.5)])
         messages.append(Message(f"world/{name}/map", archetype))
-    for plot, values in (("error", course.error_m), ("time", 1e3 * course.seconds)):
+    for plot, values in _series(course).items():
         known = np.isfinite(values)
         if known.any():
             series = rr.SeriesLines(colors=[colour], names=[course.name], widths=[1.0])
@@ -80,32 +83,43 @@ def _of(course: Course, place: int, map_file: Path, stamps_ns: np.ndarray) -> li
     return messages
 
 
-def _blueprint(courses: Sequence[Course]) -> rrb.Blueprint:
-    """The ways above, maps of all but the first method switched off; plots below."""
-    so_far = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(
-                timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-            )
-            for timeline in ("scan", "sensor_time")
-        ]
-    )
+def _series(course: Course) -> dict[str, np.ndarray]:
+    """Scan by scan, by plot."""
+    return {"error": course.error_m, "time": 1e3 * course.seconds}
+
+
+def _blueprint(courses: Sequence[Course], table: Table) -> rrb.Blueprint:
+    """The ways above, maps of all but the first method switched off; plots below, one legend for both."""
     names = [rr.escape_entity_path_part(course.name) for course in courses]
-    overrides: dict[Any, Any] = {f"world/{name}/way": [so_far] for name in names}
+    overrides: dict[Any, Any] = {f"world/{name}/way": [up_to_now()] for name in names}
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
+    ends = [course.positions for course in courses[:1]]
+    box = np.array([ends[0].min(axis=0), ends[0].max(axis=0)]) if ends else None
     scene = rrb.Spatial3DView(
-        origin="world", name="ways and maps", overrides=overrides, line_grid=rrb.LineGrid3D(visible=False)
+        origin="world",
+        name="ways and maps",
+        overrides=overrides,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=eye(table.dimension, box),
     )
-    whole = rrb.TimeAxis(
-        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
-    )
-    shown = [plot for plot in _PLOTS if plot != "error" or any(np.isfinite(c.error_m).any() for c in courses)]
-    plots = [rrb.TimeSeriesView(origin=f"plots/{plot}", name=_PLOTS[plot], axis_x=whole) for plot in shown]
     return rrb.Blueprint(
-        rrb.Vertical(scene, rrb.Horizontal(*plots), row_shares=[3, 1]),
-        rrb.TimePanel(timeline="scan", state="collapsed"),
+        rrb.Vertical(scene, rrb.Horizontal(*_plots(courses)), row_shares=[2, 1]),
+        time_panel(table.scans),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _plots(courses: Sequence[Course]) -> list[rrb.TimeSeriesView]:
+    """Of what is known of any course; a single scan that took for ever leaves the rest visible."""
+    views = []
+    for plot, name in _PLOTS.items():
+        values = np.concatenate([np.empty(0), *(_series(course)[plot] for course in courses)])
+        if np.isfinite(values).any():
+            highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
+            legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
+            axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
+            views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
+    return views
 
 
 def _stamps(directory: Path) -> np.ndarray:

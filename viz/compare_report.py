@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.figures import Column
+from pipeline.compare.figures import Column, columns_of
 from pipeline.compare.outcome import CLOSURES_FILE, Status
+from pipeline.compare.table import Row as TableRow
 from pipeline.compare.table import Table, read_table
 from pipeline.config import MatchingConfig
 from pipeline.maps import read_ply
 from pipeline.trajectory import read_tum
 from viz import course_figures as figures
 from viz.compared_courses import read_courses
-from viz.course_sections import chip, error_section, knowledge_section, loop_section, time_section, way_section
+from viz.course_sections import (
+    chip,
+    error_section,
+    knowledge_section,
+    loop_section,
+    relation_section,
+    time_section,
+    way_section,
+)
 from viz.courses import Course, Floats
-from viz.map_figures import AROUND_M, map_picture
+from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
 from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
+_WIDEST = 10  # columns of a table beside the summary
 _NEARLY = 1.25  # times the thickness of the sharpest map
 
 
@@ -35,9 +46,7 @@ def write_compare_report(directory: Path) -> None:
         subtitle=_subtitle(table),
         facts=_facts(table),
         warnings=tuple(_warnings(table)),
-        grid_title="Summary",
-        grid=_figures(table, courses, [column for column in table.columns if column.is_main]),
-        legend=tuple(f"{_head(column)}: {column.definition}" for column in table.columns),
+        notes=tuple(table.notes),
         sections=tuple(_sections(directory, table, courses, truth)),
         folds=tuple(_folds(directory, table)),
     )
@@ -45,12 +54,8 @@ def write_compare_report(directory: Path) -> None:
 
 
 def _subtitle(table: Table) -> str:
-    against = (
-        f"Errors are against {table.truth}."
-        if table.truth
-        else ("There is no ground truth: surfaces and disagreement tell who is sharp or alone, not who is right.")
-    )
-    return f"The same {table.scans:,} decoded scans through each method, each in a process of its own. {against}"
+    how = "through each method, each in a process of its own"
+    return f"The same {table.scans:,} decoded scans {how}. {table.against}"
 
 
 def _facts(table: Table) -> tuple[tuple[str, str], ...]:
@@ -61,7 +66,7 @@ def _facts(table: Table) -> tuple[tuple[str, str], ...]:
         ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
         ("runs of a method", str(table.repeats)),
         ("machine", f"{made.platform}, {made.cores} cores"),
-        ("made", f"{made.started}, in {made.duration_s:.0f} s"),
+        ("made", f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"),
     )
 
 
@@ -71,37 +76,53 @@ def _warnings(table: Table) -> Iterator[str]:
             yield f"{row.name} {row.status}: {row.reason}"
 
 
-def _figures(table: Table, courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
+def _figures(table: Table, courses: Sequence[Course]) -> Iterator[Section]:
+    """The summary, and all else in one table more, or in two where that would be too wide."""
+    yield Section("Summary", grid=_grid(table, table.rows, courses, columns_of(table.figures, "summary")))
+    ended = [row for row in table.rows if row.status is Status.OK]
+    accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
+    parts = {"More on accuracy": accuracy, "More on time": time}
+    if len(accuracy) + len(time) <= _WIDEST:
+        parts = {"More figures": [*accuracy, *time]}
+    for title, columns in parts.items():
+        if columns:
+            yield Section(title, grid=_grid(table, ended, courses, columns))
+
+
+def _grid(table: Table, rows: Sequence[TableRow], courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
     """A row a method; one that failed says how in place of its figures."""
     chips = {course.name: chip(course) for course in courses}
-    best = [column.best(table.figures) for column in columns]
-    rows = []
-    for place, row in enumerate(table.rows):
-        cells = [
-            Cell(column.show(row.figures), is_best=best[index][place]) for index, column in enumerate(columns)
-        ]
+    shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
+    lines = []
+    for row in rows:
+        cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
         if row.status is not Status.OK:
-            cells = [Cell(f"{row.status}: {row.reason}", is_wide=True)]
-        rows.append(Row(row.name, tuple(cells), chips.get(row.name)))
+            cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
+        lines.append(Row(row.name, cells, chips.get(row.name)))
     heads = (Head("method"), *(Head(column.head, column.unit, column.definition) for column in columns))
-    return Grid(heads, tuple(rows))
+    notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
+    return Grid(heads, tuple(lines), notes)
 
 
 def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
-    others = [column for column in table.columns if not column.is_main]
-    yield Section("More figures", grid=_figures(table, courses, others))
+    yield from _figures(table, courses)
     is_planar = table.dimension == 2
     drawn = [course for course in courses if len(course.positions)]
     if drawn:
         framing = _sharpest(table, drawn)
-        text = "Each moved onto the truth as for the ATE."
-        if truth is None:
-            text = f"All start in the same place; framed by {', '.join(course.name for course in framing)}."
+        text = "All start in the same place."
+        if truth is not None:
+            text = "Each moved onto the truth as for the ATE, one that did not come to its end by its first pose."
+        if truth is None and len(framing) < len(drawn):
+            whole = {course.name for course in framing}
+            astray = ", ".join(course.name for course in drawn if course.name not in whole)
+            text += f" The corners are those of the sharper maps; what leaves the picture is of {astray}."
         yield way_section(drawn, framing, truth, is_planar=is_planar, text=text)
         yield from error_section(drawn, table.truth)
+        yield from relation_section(drawn)
         yield from time_section(drawn)
         yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
-        yield from _map_section(directory, drawn, figures.frame(framing, truth), AROUND_M[table.dimension])
+        yield from _map_section(directory, drawn, figures.frame(framing, truth), table.dimension)
     for course in courses:
         yield from loop_section(
             course, method_folder(directory, course.name) / CLOSURES_FILE, f"Loop closures of {course.name}"
@@ -118,28 +139,21 @@ def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
 
 
 def _map_section(
-    directory: Path, courses: Sequence[Course], way: tuple[Floats, Floats], around_m: float
+    directory: Path, courses: Sequence[Course], way: tuple[Floats, Floats], dimension: int
 ) -> Iterator[Section]:
-    """Maps, all within the same corners: those of the ways and some of the surroundings."""
-    drawings = []
-    clouds = {course.name: method_folder(directory, course.name) / MAP_FILE for course in courses}
-    clouds = {name: read_ply(path) for name, path in clouds.items() if path.exists()}
-    if not clouds:
+    """Maps, all within the same corners."""
+    files = [(course, method_folder(directory, course.name) / MAP_FILE) for course in courses]
+    maps = [(course, read_ply(file)) for course, file in files if file.exists()]
+    if not maps:
         return
-    low, high = way[0] - around_m, way[1] + around_m
-    for course in courses:
-        if course.name in clouds:
-            picture = map_picture(
-                f"map {course.name}", clouds[course.name], low, high, figures.proportions(low, high)
-            )
-            drawings.append(Drawing(course.name, "", picture, chip(course)))
-    yield Section(
-        "Maps",
-        "The same points of the same scans, put where each method has the lidar.",
-        (),
-        tuple(drawings),
-        is_small=True,
+    corners = surroundings(*way, [points for _, points in maps], dimension)
+    drawings = tuple(
+        Drawing(course.name, "", map_picture(f"map {course.name}", points, *corners), chip(course))
+        for course, points in maps
     )
+    text = "The same points of the same scans, put where each method has the lidar."
+    text += " Dark is low, bright is high." if dimension == 3 else ""
+    yield Section("Maps", text, drawings=drawings, is_small=True)
 
 
 def _disagreement(table: Table) -> Section:
@@ -158,12 +172,9 @@ def _disagreement(table: Table) -> Section:
 
 def _folds(directory: Path, table: Table) -> Iterator[Fold]:
     yield from provenance_folds(table.provenance, table.baselines)
-    yield Fold("Notes", "\n".join(table.notes))
     for row in table.rows:
         definitions = "".join(f"\n\n{definition}" for definition in row.definitions)
         yield Fold(row.name, f"{row.description or row.reason}{definitions}")
-    yield Fold("Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"))
-
-
-def _head(column: Column) -> str:
-    return f"{column.head} [{column.unit}]" if column.unit else column.head
+    yield Fold(
+        "Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"), is_long=True
+    )

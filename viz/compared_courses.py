@@ -7,23 +7,26 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from pipeline.compare.evidence import SCANS_FILE
+from pipeline.compare.evidence import RELATIONS_FILE, SCANS_FILE
 from pipeline.compare.table import Row, read_table
 from viz.courses import Course, Floats, colour_of
 
 
 def read_courses(directory: Path) -> list[Course]:
-    """One a method that began, in the order of the table, of its first run."""
-    scans = pq.read_table(directory / SCANS_FILE)
+    """One a method that began, in the order of the table, of the first run that came furthest."""
+    scans, file = pq.read_table(directory / SCANS_FILE), directory / RELATIONS_FILE
+    relations = pq.read_table(file) if file.exists() else None
     rows = read_table(directory).rows
-    courses = [_course(scans, row, place) for place, row in enumerate(rows)]
+    courses = [_course(scans, relations, row, place) for place, row in enumerate(rows)]
     return [course for course in courses if len(course.positions)]
 
 
-def _course(scans: pa.Table, row: Row, place: int) -> Course:
-    is_first_run = scans["repeat"].to_numpy() == 0
-    chosen = scans.filter(pa.array(is_first_run & (np.array(scans["method"].to_pylist()) == row.name)))
+def _course(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -> Course:
+    runs = _of(scans, row.name)
+    chosen = runs.filter(pa.array(runs["repeat"].to_numpy() == _furthest(runs["repeat"].to_numpy())))
+    errors_m = np.empty(0) if relations is None else _column(_of(relations, row.name), "error_m")
     return Course(
         name=row.name,
         colour=colour_of(place),
@@ -31,10 +34,21 @@ def _course(scans: pa.Table, row: Row, place: int) -> Course:
         positions=np.stack([_column(chosen, f"aligned_{axis}") for axis in "xyz"], axis=1),
         distance_m=_column(chosen, "distance_m"),
         error_m=_column(chosen, "error_m"),
+        relation_error_m=errors_m,
         seconds=_column(chosen, "seconds"),
         nees=_column(chosen, "nees"),
         eigenvalue=_column(chosen, "degeneracy_eigenvalue"),
     )
+
+
+def _of(table: pa.Table, method: str) -> pa.Table:
+    """Its rows."""
+    return table.filter(pa.array(np.array(table["method"].to_pylist(), object) == method))
+
+
+def _furthest(repeats: NDArray[np.int64]) -> int:
+    """The run with most scans, the first of several."""
+    return int(np.argmax(np.bincount(repeats))) if len(repeats) else 0
 
 
 def _column(table: pa.Table, name: str) -> Floats:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from markupsafe import Markup
 from scipy.special import gammaincinv
 
 from viz.courses import Course, Floats
-from viz.sheet import INK, WIDTH_INCHES, Sheet
+from viz.sheet import INK, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,19 +20,18 @@ _WINDOWS = 250  # that a value a scan is averaged over
 _MARGIN = 0.25
 _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
+_DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
+_BLIND = 0.01  # of the limit; less is drawn as that
+_BAR_INCHES = 0.65  # of a colour bar and its numbers
 
 
 def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
     """Seen from above, within corners."""
-    with Sheet(name, proportions(low, high)) as sheet:
-        axes = sheet.axes
-        _each(axes, courses, lambda course: (course.positions[:, 0], course.positions[:, 1]))
+    with Sheet.of_plan(name, low, high) as sheet:
+        _each(sheet.axes, courses, lambda course: (course.positions[:, 0], course.positions[:, 1]))
         if truth is not None:
-            axes.plot(*_thinned(truth)[:, :2].T, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        axes.set_aspect("equal")
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        _label(axes, "x [m]", "y [m]")
+            sheet.axes.plot(*_thinned(truth)[:, :2].T, **_DOTTED)
+        sheet.axes.grid(visible=True)
         return sheet.svg()
 
 
@@ -44,7 +43,7 @@ def height(name: str, courses: Sequence[Course], truth: Floats | None, low: Floa
             steps_m = np.linalg.norm(np.diff(truth, axis=0), axis=1)
             way_m = np.append(0.0, np.cumsum(steps_m))
             rows = np.linspace(0, len(truth) - 1, min(len(truth), _MAX_POINTS)).astype(int)
-            sheet.axes.plot(way_m[rows], truth[rows, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+            sheet.axes.plot(way_m[rows], truth[rows, 2], **_DOTTED)
         sheet.axes.set_ylim(low[2], high[2])
         longest_m = np.median([course.distance_m[-1] for course in courses if len(course.distance_m)])
         sheet.axes.set_xlim(0.0, 1.05 * max(float(longest_m), 1.0))
@@ -65,7 +64,7 @@ def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
 
 
 def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: float, label: str) -> Markup:
-    """Share of the scans below a value, which is shown up to the 99.5th percentile of the worst course."""
+    """Share below a value, which is shown up to the 99.5th percentile of the worst course."""
     with Sheet(name) as sheet:
         ends = []
         for course in _known(courses, key):
@@ -76,7 +75,7 @@ def distribution(name: str, courses: Sequence[Course], key: str, unit_scale: flo
         sheet.axes.set_xlim(0.9 * np.min(ends), 1.1 * np.max(ends))
         _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
-        _label(sheet.axes, label, "scans below [%]")
+        _label(sheet.axes, label, "share below [%]")
         return sheet.svg()
 
 
@@ -99,7 +98,7 @@ def consistency(name: str, courses: Sequence[Course], degrees_of_freedom: int) -
             _cumulative(sheet.axes, course, np.maximum(values, 1e-4))
         shares = np.linspace(0.001, 0.999, 200)
         ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
-        sheet.axes.plot(ideal, 100.0 * shares, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        sheet.axes.plot(ideal, 100.0 * shares, **_DOTTED)
         _logarithmic(sheet.axes, "x")
         sheet.axes.set_ylim(0.0, 100.0)
         _label(sheet.axes, "squared error over covariance (1 is exact on average)", "motions below [%]")
@@ -111,30 +110,30 @@ def degeneracy(name: str, courses: Sequence[Course], limit: float) -> Markup:
     with Sheet(name) as sheet:
         for course in _known(courses, "eigenvalue"):
             x = np.arange(len(course.eigenvalue), dtype=np.float64)
-            sheet.axes.plot(*_windowed(x, np.maximum(course.eigenvalue, 1e-9), np.min), **course.style)
-        sheet.axes.axhline(limit, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)))
+            sheet.axes.plot(*_windowed(x, np.maximum(course.eigenvalue, _BLIND * limit), np.min), **course.style)
+        sheet.axes.axhline(limit, **_DOTTED)
         _logarithmic(sheet.axes, "y")
         _label(sheet.axes, "scan", "information per inlier")
         return sheet.svg()
 
 
-def degeneracy_plan(name: str, course: Course) -> Markup:
-    """The same on the way itself, the worst scans on top."""
+def degeneracy_plan(name: str, course: Course, limit: float) -> Markup:
+    """The same on the way itself, from the limit to 1, the worst scans on top."""
+    from matplotlib.colors import LogNorm
+
     low, high = frame([course], None)
     order = np.argsort(-course.eigenvalue)
-    with Sheet(name, 0.85 * proportions(low, high)) as sheet:
+    with Sheet.of_plan(name, low, high, spare=_BAR_INCHES) as sheet:
         x, y = course.positions[order, :2].T
-        values = np.log10(np.maximum(course.eigenvalue[order], 1e-6))
         size = float(np.clip(3000.0 / len(order), 4.0, 30.0))
-        dots = sheet.axes.scatter(x, y, c=values, s=size, cmap="cool_r", linewidths=0, rasterized=True)
-        sheet.figure.subplots_adjust(right=0.92)
-        bar = sheet.figure.colorbar(dots, ax=sheet.axes, shrink=0.8, pad=0.02)
-        bar.set_label("information, log10")
+        dots = sheet.axes.scatter(
+            x, y, c=np.clip(course.eigenvalue[order], limit, 1.0), s=size, cmap="cool_r", linewidths=0,
+            norm=LogNorm(limit, 1.0), rasterized=True,
+        )  # fmt: skip
+        bar = sheet.figure.colorbar(dots, ax=sheet.axes, pad=0.02, aspect=15, format=_plain)
+        bar.ax.minorticks_off()
         bar.outline.set_visible(False)
-        sheet.axes.set_aspect("equal")
-        sheet.axes.set_xlim(low[0], high[0])
-        sheet.axes.set_ylim(low[1], high[1])
-        _label(sheet.axes, "x [m]", "y [m]")
+        sheet.axes.grid(visible=True)
         return sheet.svg()
 
 
@@ -146,11 +145,6 @@ def frame(courses: Sequence[Course], truth: Floats | None) -> tuple[Floats, Floa
     size = high - low
     margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
     return low - margin, high + margin
-
-
-def proportions(low: Floats, high: Floats) -> float:
-    """Inches of height for a plan of these corners."""
-    return float(np.clip(WIDTH_INCHES * (high[1] - low[1]) / (high[0] - low[0]), 1.8, 5.0))
 
 
 def _known(courses: Sequence[Course], key: str) -> list[Course]:
@@ -178,14 +172,19 @@ def _label(axes: Axes, x: str, y: str) -> None:
 
 def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """Plain numbers at 1, or at 1, 2 and 5 where there are few decades; so that labels have room."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator, NullLocator
 
     (axes.set_xscale if which == "x" else axes.set_yscale)("log")
     axis = axes.xaxis if which == "x" else axes.yaxis
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(_plain)
     axis.set_minor_locator(NullLocator())
+
+
+def _plain(value: float, _: float | None = None) -> str:
+    """A number of an axis without powers of ten."""
+    return f"{value:g}"
 
 
 def _thinned(values: Floats) -> Floats:

@@ -17,12 +17,18 @@ from viz.map_figures import loops_picture
 from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _DOTTED = "Dotted: the truth. "
+_MEDIANS = "Of long logs, medians of neighbouring scans."
 _FIRST_NUMBER = re.compile(r" -?\d[\d.e+-]*")
 
 
 def chip(course: Course) -> Chip:
     """The course in a legend."""
     return Chip(course.name, course.colour, course.is_dashed)
+
+
+def _legend(courses: Sequence[Course]) -> tuple[Chip, ...]:
+    """Of several courses; one needs none."""
+    return tuple(chip(course) for course in courses) if len(courses) > 1 else ()
 
 
 def way_section(
@@ -42,7 +48,7 @@ def way_section(
                 figures.height("height", courses, truth, *corners),
             )
         )
-    return Section("Trajectories", text, tuple(chip(course) for course in courses), tuple(drawings))
+    return Section("Trajectories", text, _legend(courses), tuple(drawings))
 
 
 def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Section]:
@@ -53,11 +59,9 @@ def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Sectio
     yield Section(
         "Error",
         f"Distance of each pose from the true one after rigid alignment, against {truth_name}.",
-        tuple(chip(course) for course in known),
+        _legend(known),
         (
-            Drawing(
-                "Over the distance", "Median of neighbouring scans.", figures.error_over_distance("error", known)
-            ),
+            Drawing("Over the distance", _MEDIANS, figures.error_over_distance("error", known)),
             Drawing(
                 "Distribution",
                 "Share of the scans that are off by less.",
@@ -67,6 +71,19 @@ def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Sectio
     )
 
 
+def relation_section(courses: Sequence[Course]) -> Iterator[Section]:
+    """How far off they were over relations set by hand."""
+    known = _with(courses, "relation_error_m")
+    if known:
+        drawing = Drawing(
+            "Distribution",
+            "Share of the relations that are off by less.",
+            figures.distribution("relations", known, "relation_error_m", 1.0, "error of a relation [m]"),
+        )
+        text = "Distance between the motion of a relation and that of the trajectory."
+        yield Section("Error over relations", text, _legend(known), (drawing,))
+
+
 def time_section(courses: Sequence[Course]) -> Iterator[Section]:
     """How long a scan took."""
     known = _with(courses, "seconds")
@@ -74,9 +91,9 @@ def time_section(courses: Sequence[Course]) -> Iterator[Section]:
         yield Section(
             "Time per scan",
             "",
-            tuple(chip(course) for course in known),
+            _legend(known),
             (
-                Drawing("Along the log", "Median of neighbouring scans.", figures.time_per_scan("time", known)),
+                Drawing("Along the log", _MEDIANS, figures.time_per_scan("time", known)),
                 Drawing(
                     "Distribution",
                     "Share of the scans that took less.",
@@ -99,10 +116,12 @@ def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: boo
     )
     whose = f" of {told[0].name}" if len(told) > 1 else ""
     where = Drawing(
-        "Where little was seen", f"The same on the way{whose}.", figures.degeneracy_plan("blind", told[0])
+        "Where little was seen",
+        f"The same information on the way{whose}.",
+        figures.degeneracy_plan("blind", told[0], limit),
     )
     drawings = (*_consistency(courses, is_planar=is_planar), degeneracy, where)
-    yield Section("Certainty", "", tuple(chip(course) for course in told), drawings)
+    yield Section("Certainty", "", _legend(told), drawings)
 
 
 def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Drawing]:
@@ -122,13 +141,12 @@ def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
         return
     table = pq.read_table(path)
     if not table.num_rows:
-        yield Section(title, "None was tried: the way never comes back to itself.")
+        yield Section(title, "None was tried: the way came back to no place that it had left.")
         return
     ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
     is_accepted = np.array([verdict == "accepted" for verdict in table["verdict"].to_pylist()])
     low, high = figures.frame([course], None)
-    inches = figures.proportions(low, high)
-    picture = loops_picture("loops", course, course.positions[ends], is_accepted, low, high, inches)
+    picture = loops_picture(f"loops {course.name}", course, course.positions[ends], is_accepted, low, high)
     yield Section(
         title,
         f"{len(ends):,} tried, {is_accepted.sum():,} accepted; each is a row of loops.parquet.",

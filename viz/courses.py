@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 # Told apart on white and on black, also by most who see colours differently.
 _COLOURS = (
-    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#6f7fbf",
+    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
     "#b0413e", "#5f8f57",
 )  # fmt: skip
 
@@ -28,6 +28,7 @@ class Course:
     positions : (N, 3) metres, in one frame with the other courses
     distance_m : (N,) travelled
     error_m : (N,) distance from where it was
+    relation_error_m : (K,) the same of K relations, none where there are no relations
     seconds : (N,) what each scan took
     nees : (N,) squared error over covariance, 1 on average if exact
     eigenvalue : (N,) information per inlier along the worst direction
@@ -39,6 +40,7 @@ class Course:
     positions: Floats
     distance_m: Floats
     error_m: Floats
+    relation_error_m: Floats
     seconds: Floats
     nees: Floats
     eigenvalue: Floats

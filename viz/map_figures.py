@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from markupsafe import Markup
 
@@ -12,15 +14,29 @@ from viz.sheet import INK, Sheet
 _ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
-AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around a way
+AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around a way, at most
+_SHOWN_SHARES, _MARGIN_M = (0.2, 99.8), 1.0  # per cent of the points
 
 
-def map_picture(name: str, points: Points, low: Floats, high: Floats, inches: float) -> Markup:
+def surroundings(low: Floats, high: Floats, clouds: Sequence[Points], dimension: int) -> tuple[Floats, Floats]:
+    """Corners of a map: those of a way and some of what is around it, as far as there are points."""
+    ends = np.array([np.percentile(points, _SHOWN_SHARES, axis=0) for points in clouds if len(points)])
+    if not len(ends):
+        return low, high
+    around_m = AROUND_M[dimension]
+    lowest, highest = ends[:, 0].min(axis=0) - _MARGIN_M, ends[:, 1].max(axis=0) + _MARGIN_M
+    return (
+        np.minimum(low, np.maximum(low - around_m, lowest)),
+        np.maximum(high, np.minimum(high + around_m, highest)),
+    )
+
+
+def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the colour is the height, where there is any."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     shown = shown[inside]
-    with Sheet(name, inches) as sheet:
+    with Sheet.of_plan(name, low, high) as sheet:
         size = float(np.clip(12_000.0 / max(len(shown), 1), 0.08, 1.5))
         if not len(shown) or not np.ptp(shown[:, 2]):
             sheet.axes.scatter(shown[:, 0], shown[:, 1], s=size, c=_POINTS, linewidths=0, rasterized=True)
@@ -31,28 +47,18 @@ def map_picture(name: str, points: Points, low: Floats, high: Floats, inches: fl
                 shown[:, 0], shown[:, 1], s=size, c=shown[:, 2], cmap="viridis", vmin=bottom, vmax=top,
                 linewidths=0, rasterized=True,
             )  # fmt: skip
-        _frame(sheet, low, high)
         return sheet.svg()
 
 
 def loops_picture(
-    name: str, course: Course, edges: Floats, is_accepted: np.ndarray, low: Floats, high: Floats, inches: float
+    name: str, course: Course, edges: Floats, is_accepted: np.ndarray, low: Floats, high: Floats
 ) -> Markup:
     """The way (grey) with its closures, accepted and rejected; ``edges`` (E, 2, 3) from place to place."""
-    with Sheet(name, inches) as sheet:
+    with Sheet.of_plan(name, low, high) as sheet:
         sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
         for chosen, colour in ((~is_accepted, _REJECTED), (is_accepted, _ACCEPTED)):
             gaps = np.full((int(chosen.sum()), 1, 2), np.nan)
             lines = np.concatenate([edges[chosen][:, :, :2], gaps], axis=1).reshape(-1, 2)
             sheet.axes.plot(lines[:, 0], lines[:, 1], color=colour, linewidth=0.9)
         sheet.axes.plot(*course.positions[0, :2], marker="o", markersize=4, color=INK)
-        _frame(sheet, low, high)
         return sheet.svg()
-
-
-def _frame(sheet: Sheet, low: Floats, high: Floats) -> None:
-    sheet.axes.set_aspect("equal")
-    sheet.axes.set_xlim(low[0], high[0])
-    sheet.axes.set_ylim(low[1], high[1])
-    sheet.axes.set_xlabel("x [m]")
-    sheet.axes.set_ylabel("y [m]")

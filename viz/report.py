@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -23,7 +23,7 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell; a ``wide`` one stretches to the end of its row."""
+    """A table's cell; ``is_wide`` stretches it to the end of its row."""
 
     text: str
     is_best: bool = False
@@ -51,10 +51,11 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A table."""
+    """A table, and what must be known to read it, a line each."""
 
     heads: tuple[Head, ...]
     rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,25 +82,24 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Fold:
-    """Text that is shown on demand, as it stands."""
+    """Text that is shown on demand, as it stands; on paper too, unless ``is_long``."""
 
     title: str
     text: str
+    is_long: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report; ``facts`` are label and value, ``warnings`` stand out, ``grid`` is the main table."""
+    """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not."""
 
     title: str
     subtitle: str
     facts: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
-    grid_title: str
-    grid: Grid
-    legend: tuple[str, ...]
+    notes: tuple[str, ...]
     sections: tuple[Section, ...]
-    folds: tuple[Fold, ...] = field(default=())
+    folds: tuple[Fold, ...] = ()
 
 
 def write_page(path: Path, page: Page) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -13,10 +13,8 @@ import pyarrow.parquet as pq
 
 from pipeline import lie
 from pipeline.data import Pose, Trajectory
-from pipeline.errors import InputError
-from pipeline.evaluate import Pairs, align, pair
+from pipeline.evaluate import absolute_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
-from pipeline.evaluate.alignment import Alignment
 from pipeline.maps import read_ply
 from pipeline.runs.consistency import nees_of_steps
 from pipeline.runs.directory import RUN_FILE
@@ -29,9 +27,10 @@ from pipeline.trajectory import read_tum
 from viz import course_figures as figures
 from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats, colour_of
-from viz.map_figures import AROUND_M, map_picture
+from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
-from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from viz.report import REPORT_FILE, Drawing, Fold, Page, Section, write_page
+from viz.run_tables import accuracy_section, stages_section
 
 
 def write_run_report(directory: Path) -> None:
@@ -44,13 +43,11 @@ def write_run_report(directory: Path) -> None:
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
         warnings=(made.stopped,) if made.stopped else (),
-        grid_title="Time of a scan",
-        grid=_stages(metrics),
-        legend=tuple(notes),
+        notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         folds=(
             *provenance_folds(made, {}),
-            Fold("Configuration", (directory / "config.toml").read_text(encoding="utf-8")),
+            Fold("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
         ),
     )
     write_page(directory / REPORT_FILE, page)
@@ -70,26 +67,10 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
     yield (
         "matching",
-        f"{100.0 * m.median_inlier_share:.0f} % inliers, {1e3 * m.median_residual_m:.1f} mm (medians)",
+        f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
     )
-    if m.ground_truth is not None:
-        truth = m.ground_truth
-        yield "ATE", f"{truth.optimised.ate_rmse_m:.4f} m over {truth.path_length_m:.1f} m, against {truth.source}"
-        if truth.optimised.kitti_translation_share is not None:
-            yield "KITTI", f"{100.0 * truth.optimised.kitti_translation_share:.3f} %"
     yield "configuration", made.configuration
     yield "machine", f"{made.platform}, {made.cores} cores"
-
-
-def _stages(metrics: Metrics) -> Grid:
-    """Time by stage."""
-    heads = (Head("stage"), *(Head(stage, "ms") for stage in STAGES), Head("all but read", "ms"))
-    names = (*STAGES, "all_but_read")
-    rows = [
-        Row(name, tuple(Cell(f"{figures_ms[stage]:.2f}") for stage in names))
-        for name, figures_ms in (("median", metrics.median_ms), ("95th percentile", metrics.p95_ms))
-    ]
-    return Grid(heads, tuple(rows))
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
@@ -97,43 +78,61 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
-    T = np.eye(4) if truth is None else _alignment(pair(trajectory, truth))
+    optimised, before = _against(trajectory, truth), _against(odometry, truth)
     courses = [
-        _course("optimised", 0, trajectory, truth, T, steps),
-        _course("odometry", 3, odometry, truth, T if truth is None else _alignment(pair(odometry, truth)), None),
+        _course("optimised", 0, trajectory, optimised, steps, truth),
+        _course("odometry", 3, odometry, before, None, truth),
     ]
+    if metrics.ground_truth is not None:
+        yield accuracy_section(metrics.ground_truth)
+    yield stages_section(metrics)
     is_planar = metrics.dimension == 2
     way = None if truth is None else truth.poses[:, :3, 3]
     text = "Each moved onto the truth as for the ATE." if truth is not None else ""
     section = way_section(courses, courses, way, is_planar=is_planar, text=text)
-    drawings = (*section.drawings, _map(directory, courses[0], T, metrics.dimension))
+    drawings = (*section.drawings, _map(directory, courses[0], optimised.T_truth_way, metrics.dimension))
     yield replace(section, title="Trajectory and map", drawings=drawings)
     if metrics.ground_truth is not None:
         yield from error_section(courses, metrics.ground_truth.source)
     yield from time_section(courses[:1])
-    limit = float(read_layer(directory / "config.toml")["matching.min_information"])
-    yield from knowledge_section(courses[:1], limit, is_planar=is_planar)
-    yield from loop_section(courses[0], directory / "loops.parquet", "Loop closures")
+    config = read_layer(directory / "config.toml")
+    yield from knowledge_section(courses[:1], float(config["matching.min_information"]), is_planar=is_planar)
+    if config["loops.enabled"]:
+        yield from loop_section(courses[0], directory / "loops.parquet", "Loop closures")
+
+
+@dataclass(frozen=True, slots=True)
+class _Off:
+    """A way against the truth: how it was moved onto it, and (N,) metres off, NaN where nothing is known."""
+
+    T_truth_way: Pose
+    errors_m: Floats
+
+
+def _against(trajectory: Trajectory, truth: Trajectory | None) -> _Off:
+    errors_m = np.full(len(trajectory), np.nan)
+    if truth is None:
+        return _Off(np.eye(4), errors_m)
+    pairs = pair(trajectory, truth)
+    ate = absolute_error_on_any_course(pairs)
+    errors_m[pairs.indices[:, 0]] = ate.errors_m
+    return _Off(ate.T_reference_estimate, errors_m)
 
 
 def _course(
-    name: str, place: int, trajectory: Trajectory, truth: Trajectory | None, T: Pose, steps: pa.Table | None
+    name: str, place: int, trajectory: Trajectory, off: _Off, steps: pa.Table | None, truth: Trajectory | None
 ) -> Course:
     """One of the two ways; what is known of the scans belongs to the first."""
     unknown = np.full(len(trajectory), np.nan)
-    poses = T @ trajectory.poses
-    errors_m = unknown.copy()
-    if truth is not None:
-        pairs = pair(trajectory, truth)
-        aligned = (T @ pairs.estimate)[:, :3, 3]
-        errors_m[pairs.indices[:, 0]] = np.linalg.norm(aligned - pairs.reference[:, :3, 3], axis=1)
+    poses = off.T_truth_way @ trajectory.poses
     return Course(
         name=name,
         colour=colour_of(place),
         is_dashed=False,
         positions=poses[:, :3, 3],
         distance_m=path_length(poses),
-        error_m=errors_m,
+        error_m=off.errors_m,
+        relation_error_m=np.empty(0),
         seconds=unknown if steps is None else _seconds(steps),
         nees=unknown if steps is None or truth is None else _nees(steps, truth),
         eigenvalue=unknown if steps is None else steps["degeneracy_eigenvalue"].to_numpy(),
@@ -149,14 +148,6 @@ def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
     return Trajectory(steps["stamp_ns"].to_numpy(), poses)
 
 
-def _alignment(pairs: Pairs) -> Pose:
-    """As for the ATE: rigid, or by the first pose where a straight way leaves that open."""
-    try:
-        return align(pairs.estimate, pairs.reference, Alignment.RIGID)
-    except InputError:
-        return align(pairs.estimate, pairs.reference, Alignment.FIRST)
-
-
 def _seconds(steps: pa.Table) -> Floats:
     """All stages but reading."""
     return np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)
@@ -168,8 +159,7 @@ def _nees(steps: pa.Table, truth: Trajectory) -> Floats:
 
 def _map(directory: Path, course: Course, T: Pose, dimension: int) -> Drawing:
     """The points of the map around the way."""
-    low, high = figures.frame([course], None)
-    low, high = low - AROUND_M[dimension], high + AROUND_M[dimension]
     points = lie.transform(T, read_ply(directory / "map.ply"))
-    picture = map_picture("map", points, low, high, figures.proportions(low, high))
-    return Drawing("Map", "map.ply, seen from above.", picture)
+    corners = surroundings(*figures.frame([course], None), [points], dimension)
+    colours = "; dark is low, bright is high" if dimension == 3 else ""
+    return Drawing("Map", f"map.ply, seen from above{colours}.", map_picture("map", points, *corners))

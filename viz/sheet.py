@@ -6,17 +6,20 @@ import io
 import re
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_INCHES = 4.6
+_WIDTH = 4.6  # inches
 INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
 _DPI = 140  # of what is drawn as pixels
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
+_LOWEST, _HIGHEST = 1.5, 5.2  # inches of a plan
 _SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.size": 8.0,
@@ -39,7 +42,7 @@ _SETTINGS: dict[str, Any] = {
 class Sheet:
     """One drawing with one pair of axes; a context, inside which ``axes`` is drawn on.
 
-    height_inches : of the whole sheet, which is ``WIDTH_INCHES`` wide
+    height_inches : of the whole sheet
     name : tells its parts from those of other drawings on the same page
     """
 
@@ -49,10 +52,10 @@ class Sheet:
 
         self._context = mpl.rc_context(cast("Any", _SETTINGS | {"svg.hashsalt": name}))
         self._context.__enter__()
-        self.figure: Figure = Figure(figsize=(WIDTH_INCHES, height_inches))
+        self.figure: Figure = Figure(figsize=(_WIDTH, height_inches))
         self.axes: Axes = self.figure.add_subplot()
         self.figure.subplots_adjust(  # a layout engine would draw everything twice
-            _LEFT / WIDTH_INCHES, _BOTTOM / height_inches, 1 - _RIGHT / WIDTH_INCHES, 1 - _TOP / height_inches
+            _LEFT / _WIDTH, _BOTTOM / height_inches, 1 - _RIGHT / _WIDTH, 1 - _TOP / height_inches
         )
 
     def __enter__(self) -> Sheet:
@@ -60,6 +63,19 @@ class Sheet:
 
     def __exit__(self, *_: object) -> None:
         self._context.__exit__(None, None, None)
+
+    @classmethod
+    def of_plan(cls, name: str, low: NDArray[np.float64], high: NDArray[np.float64], spare: float = 0.0) -> Sheet:
+        """A sheet in the proportions of what lies between two corners; ``spare`` inches stay free beside it."""
+        inches = _WIDTH - _LEFT - _RIGHT - spare
+        height = inches * (high[1] - low[1]) / (high[0] - low[0]) + _BOTTOM + _TOP
+        sheet = cls(name, float(np.clip(height, _LOWEST, _HIGHEST)))
+        sheet.axes.set_aspect("equal")
+        sheet.axes.set_xlim(low[0], high[0])
+        sheet.axes.set_ylim(low[1], high[1])
+        sheet.axes.set_xlabel("x [m]")
+        sheet.axes.set_ylabel("y [m]")
+        return sheet
 
     def svg(self) -> Markup:
         """The drawing, to be put into a page as it is; no text of a log is ever drawn."""

@@ -101,7 +101,7 @@ def compare(
     contest = Contest(
         logs=logs,
         out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
-        methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
+        methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         settings_file=settings,
         overrides=(*shortcuts, *truth_topic, *overrides(ctx)),
         ground_truth=truth_file,

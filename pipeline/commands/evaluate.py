@@ -130,21 +130,14 @@ def _against(
     trajectory: Trajectory, reference: Trajectory, align: str, limit_s: float, stretches: list[Stretch]
 ) -> Results:
     """Every metric that the trajectories allow."""
-    from pipeline.evaluate import (
-        Alignment,
-        absolute_error,
-        kitti_error,
-        lengths_for,
-        pair,
-    )
+    from pipeline.evaluate import Alignment, absolute_error, kitti_error_on_any_course, pair
 
     pairs = pair(trajectory, reference, limit_s=limit_s)
-    absolute = absolute_error(pairs, Alignment(align))
     metrics: dict[str, Callable[[], Result]] = {
         **{stretch.name: partial(stretch.error, pairs) for stretch in stretches},
-        "kitti": lambda: kitti_error(pairs, lengths_for(absolute.path_length_m)),
+        "kitti": partial(kitti_error_on_any_course, pairs),
     }
-    results = Results({"ate": absolute}, {})
+    results = Results({"ate": absolute_error(pairs, Alignment(align))}, {})
     for name, metric in metrics.items():
         try:
             results.found[name] = metric()

@@ -92,7 +92,10 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
         limits = limits_for(len(scans), contest.time_s, contest.memory_mib)
         outcomes = race(methods, scans, Path(shared), repeat=contest.repeat, limits=limits, progress=progress)
         progress.say("judging and drawing")
-        judged = {name: judge(runs, reference.truth, reference.relations) for name, runs in outcomes.items()}
+        judged = {
+            name: judge(runs, scans.stamps_ns, reference.truth, reference.relations)
+            for name, runs in outcomes.items()
+        }
         evidence = Evidence(methods, scans, outcomes, judged, maps_of(scans, outcomes), reference)
         write_evidence(directory.path, evidence)
         provenance = msgspec.structs.replace(provenance.hashed(hashing), complete=True)

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import tomli_w
 
-from pipeline.compare.judging import Judged, representative
+from pipeline.compare.judging import Judged, judge, representative
 from pipeline.compare.maps import picture_points
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
 from pipeline.compare.scan_store import StoredScans
-from pipeline.compare.scan_table import RunOfMethod, write_scans
+from pipeline.compare.scan_table import RunOfMethod, write_relations, write_scans
 from pipeline.data import Points, Trajectory
 from pipeline.evaluate import Relations
 from pipeline.maps import write_ply
 from pipeline.trajectory import write_tum
 
-SCANS_FILE, SETTINGS_FILE, TRUTH_FILE = "per_scan.parquet", "settings.toml", "ground_truth.tum"
+SCANS_FILE, RELATIONS_FILE = "per_scan.parquet", "per_relation.parquet"
+SETTINGS_FILE, TRUTH_FILE = "settings.toml", "ground_truth.tum"
 METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tum"
 
 
@@ -48,12 +50,8 @@ class Evidence:
 
 def write_evidence(folder: Path, evidence: Evidence) -> None:
     """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
-    runs = [
-        RunOfMethod(name, repeat, outcome, evidence.judged[name])
-        for name, outcomes in evidence.outcomes.items()
-        for repeat, outcome in enumerate(outcomes)
-    ]
-    write_scans(folder / SCANS_FILE, runs, evidence.scans.stamps_ns)
+    write_scans(folder / SCANS_FILE, list(_runs(evidence)), evidence.scans.stamps_ns)
+    write_relations(folder / RELATIONS_FILE, evidence.judged)
     if evidence.reference.truth is not None:
         write_tum(folder / TRUTH_FILE, evidence.reference.truth)
     settings = {method.name: {"method": method.base} | method.settings for method in evidence.methods}
@@ -62,9 +60,19 @@ def write_evidence(folder: Path, evidence: Evidence) -> None:
         _write_method(method_folder(folder, method.name), evidence, method.name)
 
 
+def _runs(evidence: Evidence) -> Iterator[RunOfMethod]:
+    """Every run, judged by itself."""
+    stamps_ns, truth = evidence.scans.stamps_ns, evidence.reference.truth
+    for name, outcomes in evidence.outcomes.items():
+        for repeat, outcome in enumerate(outcomes):
+            stands_for_all = outcome is representative(outcomes)
+            judged = evidence.judged[name] if stands_for_all else judge([outcome], stamps_ns, truth, None)
+            yield RunOfMethod(name, repeat, outcome, judged)
+
+
 def method_folder(folder: Path, name: str) -> Path:
     """Where the files of a method lie."""
-    return folder / METHODS_FOLDER / name.replace("/", "_")
+    return folder / METHODS_FOLDER / quote(name, safe="+ ")
 
 
 def _write_method(own: Path, evidence: Evidence, name: str) -> None:

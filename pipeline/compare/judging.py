@@ -16,15 +16,11 @@ from pipeline.compare.outcome import STEPS_FILE, Outcome
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
-    KITTI_LENGTHS_M,
-    AbsoluteError,
-    Alignment,
-    Pairs,
+    RelationError,
     Relations,
     RelativeError,
-    absolute_error,
-    kitti_error,
-    lengths_for,
+    absolute_error_on_any_course,
+    kitti_error_on_any_course,
     pair,
     relation_error,
     relative_error_over_distance,
@@ -42,8 +38,10 @@ class Judged:
     Attributes
     ----------
     figures : what it amounts to
-    T_reference_estimate : (4, 4) the alignment of the ATE, the identity without truth
+    T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
+        end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
+    relations : the error over relations; None without any, or after a failure
     definitions : what was computed, in words
     """
 
@@ -52,26 +50,30 @@ class Judged:
     errors_m: NDArray[np.float64]
     errors_rad: NDArray[np.float64]
     nees: NDArray[np.float64]
+    relations: RelationError | None
     definitions: tuple[str, ...]
 
 
-def judge(outcomes: Sequence[Outcome], truth: Trajectory | None, relations: Relations | None) -> Judged:
-    """A method's runs; the first whole one stands for all, times are those of all."""
+def judge(
+    outcomes: Sequence[Outcome],
+    stamps_ns: NDArray[np.int64],
+    truth: Trajectory | None,
+    relations: Relations | None,
+) -> Judged:
+    """A method's runs over scans of these stamps; the first whole one stands for all, times are those of all."""
     outcome = representative(outcomes)
     figures = _speed(outcomes)
     blank = np.full(len(outcome.seconds), np.nan)
-    judged = Judged(figures, np.eye(4), blank, blank, blank, ())
     if not outcome.is_whole:
-        return judged
+        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
     figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
-    definitions: tuple[str, ...] = ()
-    if relations is not None:
-        error = relation_error(outcome.trajectory, relations)
-        definitions = (error.definition,)
+    error = None if relations is None else relation_error(outcome.trajectory, relations)
+    if error is not None:
         figures = msgspec.structs.replace(
             figures, relations_m=error.translation_m.mean, relations_rad=error.rotation_rad.mean
         )
-    judged = Judged(figures, np.eye(4), blank, blank, blank, definitions)
+    definitions = () if error is None else (error.definition,)
+    judged = Judged(figures, np.eye(4), blank, blank, blank, error, definitions)
     return judged if truth is None else _against(truth, outcome, judged)
 
 
@@ -88,12 +90,20 @@ def degeneracy(outcome: Outcome) -> NDArray[np.float64]:
     return pq.read_table(path, columns=["degeneracy_eigenvalue"])["degeneracy_eigenvalue"].to_numpy()
 
 
+def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
+    """Where a method that begins with the identity began."""
+    if truth is None:
+        return np.eye(4)
+    try:
+        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    except InputError:  # the truth begins later
+        return np.eye(4)
+
+
 def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     pairs = pair(outcome.trajectory, truth)
-    ate = _absolute(pairs)
-    lengths_m = lengths_for(ate.path_length_m)
-    every = 10 if lengths_m == KITTI_LENGTHS_M else 1
-    kitti = _or_none(lambda: kitti_error(pairs, lengths_m, every=every))
+    ate = absolute_error_on_any_course(pairs)
+    kitti = _or_none(lambda: kitti_error_on_any_course(pairs))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
     over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
     over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
@@ -116,18 +126,11 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     )
     found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
     definitions = (*judged.definitions, *found)
-    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, definitions)
+    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, judged.relations, definitions)
 
 
 def _rmse_m(error: RelativeError | None) -> float | None:
     return None if error is None else error.translation_m.rmse
-
-
-def _absolute(pairs: Pairs) -> AbsoluteError:
-    try:
-        return absolute_error(pairs)
-    except InputError:  # a way on a line leaves the alignment a free rotation
-        return absolute_error(pairs, Alignment.FIRST)
 
 
 def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
@@ -145,9 +148,9 @@ def _speed(outcomes: Sequence[Outcome]) -> Figures:
     if not whole:
         peak = max(outcome.report.peak_mib for outcome in outcomes)
         return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)
-    rest = np.concatenate([outcome.seconds[1:] for outcome in whole])
-    rest = rest if len(rest) else np.concatenate([outcome.seconds for outcome in whole])
-    cpu = np.concatenate([outcome.cpu_seconds[min(1, len(outcome.cpu_seconds) - 1) :] for outcome in whole])
+    first = min(1, len(whole[0].seconds) - 1)
+    rest = np.concatenate([outcome.seconds[first:] for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[first:] for outcome in whole])
     stages = _stages(whole[0])
     return Figures(
         median_s=float(np.median(rest)),

@@ -39,17 +39,19 @@ class EndReport(Struct, frozen=True):
     ----------
     status, reason : how it ended; the reason is empty where all went well
     description : what the method does, with its settings
-    start_s : import, compilation and a throwaway instance on the first scans
+    start_s : import, loading what is compiled, and a throwaway instance on the first scans
     finish_s : after the last scan, as for the last optimisation
     peak_mib : of its resident memory, interpreter and packages included
+    has_compiled : whether kernels were compiled in between, so that its times say nothing
     """
 
     status: Status
     reason: str
-    description: str
-    start_s: float
-    finish_s: float
-    peak_mib: float
+    description: str = ""
+    start_s: float = 0.0
+    finish_s: float = 0.0
+    peak_mib: float = 0.0
+    has_compiled: bool = False
 
 
 @dataclass(frozen=True, slots=True)

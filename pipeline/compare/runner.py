@@ -71,4 +71,4 @@ def _brought(method: Method) -> Baseline:
     try:
         return getattr(import_module(module), name)(**method.settings)
     except (ImportError, AttributeError) as error:
-        raise InputError(f"{method.name}: {method.base} cannot be had ({error}); check PYTHONPATH") from error
+        raise InputError(f"{method.base} cannot be had ({error}); check PYTHONPATH") from error

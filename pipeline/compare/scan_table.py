@@ -1,8 +1,8 @@
-"""per_scan.parquet: one row a scan, a method and a run of it."""
+"""per_scan.parquet, one row a scan, a method and a run of it; per_relation.parquet, one a relation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from pipeline.data import Matrix
 from pipeline.evaluate.absolute import path_length
 from pipeline.runs.step_table import pose_columns
 
-SCANS_FILE = "per_scan.parquet"
 _NOTES = {
     "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
@@ -44,6 +43,27 @@ def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.i
 
     tables = [pa.table(_columns(run, stamps_ns)) for run in runs]
     pq.write_table(pa.concat_tables(tables).replace_schema_metadata(_NOTES), path, compression="zstd")
+
+
+def write_relations(path: Path, judged: Mapping[str, Judged]) -> None:
+    """Write the errors over relations, where there are any."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    errors = {name: each.relations for name, each in judged.items() if each.relations is not None}
+    tables = [
+        pa.table(
+            {
+                "method": pa.array([name] * len(error.used), pa.string()),
+                "relation": error.used,
+                "error_m": error.errors_m,
+                "error_rad": error.errors_rad,
+            }
+        )
+        for name, error in errors.items()
+    ]
+    if tables:
+        pq.write_table(pa.concat_tables(tables), path, compression="zstd")
 
 
 def final_poses(outcome: Outcome) -> Matrix:

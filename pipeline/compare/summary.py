@@ -40,7 +40,7 @@ def summarise(evidence: Evidence, log: Log, limits: Limits, provenance: Provenan
         rows=rows,
         disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
         notes=[
-            f"every run may take {limits.time_s:.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
+            f"every run may take {limits.time_s:,.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
             *([evidence.reference.note] if evidence.reference.note else []),
             *log.notes,
             *log.damage,

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from pipeline.compare.figures import COLUMNS, Column, Figures, columns_of
+from pipeline.compare.figures import COLUMNS, Figures, columns_of
 from pipeline.compare.outcome import Status
 from pipeline.runs.provenance import Provenance
 
@@ -63,14 +63,16 @@ class Table(Struct, frozen=True):
     baselines: dict[str, str]
 
     @property
-    def columns(self) -> list[Column]:
-        """The columns that any method has a figure for."""
-        return columns_of(self.figures)
+    def against(self) -> str:
+        """What errors are against, in a sentence."""
+        if self.truth:
+            return f"Errors are against {self.truth}."
+        return "There is no ground truth: surfaces and to others tell who is sharp or alone, not who is right."
 
     @property
     def figures(self) -> list[Figures]:
-        """Those of all rows."""
-        return [row.figures for row in self.rows]
+        """What the rows are compared by; nothing of one that did not end well."""
+        return [row.figures if row.status is Status.OK else Figures() for row in self.rows]
 
 
 def write_table(folder: Path, table: Table) -> None:
@@ -87,46 +89,34 @@ def read_table(folder: Path) -> Table:
 
 
 def markdown(table: Table) -> str:
-    """The main columns for a README, the best of each in bold, and below it what they say."""
-    columns = columns_of(table.figures, main=True)
-    head = ["method", *(_head(column) for column in columns)]
+    """The summary for a README, the best of each column in bold, and below it what the columns say."""
+    columns = columns_of(table.figures, "summary")
+    head = ["method", *(column.heading for column in columns)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    best = [column.best(table.figures) for column in columns]
+    shown, bar = [column.cells(table.figures) for column in columns], "\\|"
     for place, row in enumerate(table.rows):
+        cells = [f"**{cells[place].text}**" if cells[place].is_best else cells[place].text for cells in shown]
         if row.status is not Status.OK:
-            ending = f"{row.status}: {row.reason}".replace("|", "\\|")
-            lines.append(f"| {row.name} | {' | '.join([ending, *[''] * (len(columns) - 1)])} |")
-            continue
-        cells = [
-            f"**{column.show(row.figures)}**" if best[index][place] else column.show(row.figures)
-            for index, column in enumerate(columns)
-        ]
-        lines.append(f"| {row.name} | {' | '.join(cells)} |")
-    notes = [f"*{_head(column)}*: {column.definition}." for column in columns]
-    return "\n".join([*lines, "", *notes]) + "\n"
+            cells = [f"{row.status}: {row.reason}".replace("|", bar), *[""] * (len(columns) - 1)]
+        lines.append(f"| {row.name.replace('|', bar)} | {' | '.join(cells)} |")
+    notes = [f"- *{column.heading}*: {column.definition}" for column in columns]
+    return "\n".join([*lines, "", table.against, "", *notes]) + "\n"
 
 
 def text(table: Table) -> str:
-    """The main columns, well set; the best of each starred; then who failed and why."""
-    columns = columns_of(table.figures, main=True)
-    best = [column.best(table.figures) for column in columns]
-    grid = [["method", *(column.head for column in columns)], ["", *(column.unit for column in columns)]]
-    for place, row in enumerate(table.rows):
-        marks = ["*" if best[index][place] else " " for index in range(len(columns))]
-        cells = [column.show(row.figures) + mark for column, mark in zip(columns, marks, strict=True)]
-        grid.append([row.name, *(cells if row.status is Status.OK else [f" {row.status} "])])
-    names = max(len(line[0]) for line in grid)
-    widths = [max(len(line[i]) for line in grid if len(line) > 2) for i in range(1, len(columns) + 1)]
-    lines = [
-        f"{line[0]:<{names}}  "
-        + "  ".join(f"{cell:>{width}}" for cell, width in zip(line[1:], widths, strict=False))
-        for line in grid
-    ]
+    """The summary, well set; the best of each column starred; then who failed and why."""
+    columns = columns_of(table.figures, "summary")
+    shown = [column.cells(table.figures) for column in columns]
+    names = [row.name if row.status is Status.OK else f"{row.name}: {row.status}" for row in table.rows]
+    names = ["method", "", *names]
+    lines = [f"{name:<{max(map(len, names))}}" for name in names]
+    for column, cells in zip(columns, shown, strict=True):
+        texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
+        lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
-    against = (
-        f"errors against {table.truth}" if table.truth else "no ground truth: surfaces and to others are none"
+    return (
+        "\n".join([*(line.rstrip() for line in lines), f"* best of its column. {table.against}", *endings]) + "\n"
     )
-    return "\n".join([*(line.rstrip() for line in lines), f"* best of its column; {against}", *endings]) + "\n"
 
 
 def _csv(table: Table) -> str:
@@ -138,7 +128,3 @@ def _csv(table: Table) -> str:
     for row in table.rows:
         writer.writerow([row.name, row.status, *(getattr(row.figures, key) for key in keys)])
     return buffer.getvalue()
-
-
-def _head(column: Column) -> str:
-    return f"{column.head} {column.unit}".strip()

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import sys
 import traceback
-from contextlib import suppress
+from collections.abc import Iterable
+from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
@@ -28,18 +29,21 @@ from pipeline.compare.outcome import (
     Status,
 )
 from pipeline.compare.scan_store import StoredScans, open_store
-from pipeline.data import Trajectory
-from pipeline.errors import MissingExtraError
+from pipeline.data import Pose, Scan, Trajectory
+from pipeline.errors import MissingExtraError, ScanchainError
 from pipeline.memory import die_first, peak_mib
+from pipeline.runs.compiling import telling_of_compilation
+from pipeline.runs.progress import Unwatched
 
 METHOD_FILE = "method.msgpack"
-WARM_UP_SCANS = 4
+_WARM_UP_SCANS = 4
+_LONGEST = 300  # characters of an error that others raise
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     """Track every scan, then finish."""
     began = perf_counter()
-    _warm_up(scans, method)
+    warm_up(scans.scans(), method, scans.T_base_lidar)
     racer = runner.start(method, scans.T_base_lidar)
     start_s = perf_counter() - began
     size = scans.dimension + 1
@@ -57,16 +61,16 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     ended = perf_counter()
     trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
     np.save(folder / TRAJECTORY_FILE, trajectory.poses)
-    return EndReport(Status.OK, "", racer.description, start_s, perf_counter() - ended, peak_mib())
+    return EndReport(Status.OK, "", racer.description, start_s, perf_counter() - ended)
 
 
-def _warm_up(scans: StoredScans, method: Method) -> None:
+def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
     if not runner.can_start_again(method):
         return
-    racer = runner.start(method, scans.T_base_lidar)
+    racer = runner.start(method, T_base_lidar)
     with suppress(Exception):
-        for scan in islice(scans.scans(), WARM_UP_SCANS):
+        for scan in islice(scans, _WARM_UP_SCANS):
             racer.track(scan)
 
 
@@ -75,16 +79,40 @@ def main() -> None:
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
     die_first()
     method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
+    compiler = _Compiler()
+    with telling_of_compilation(compiler) if method.is_ours else nullcontext():
+        report = _report(open_store(store), method, folder)
+    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=compiler.has_compiled)
+    (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
+
+
+class _Compiler(Unwatched):
+    """Hears that something is compiled."""
+
+    has_compiled = False
+
+    def say(self, line: str) -> None:
+        self.has_compiled = True
+
+
+def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
+    """Of the work, or of what came in between."""
     try:
-        report = work(open_store(store), method, folder)
+        return work(scans, method, folder)
     except MissingExtraError as error:
-        report = EndReport(Status.MISSING, str(error), "", 0.0, 0.0, peak_mib())
+        return EndReport(Status.MISSING, str(error))
     except MemoryError as error:
-        report = EndReport(Status.OUT_OF_MEMORY, f"MemoryError: {error}", "", 0.0, 0.0, peak_mib())
+        return EndReport(Status.OUT_OF_MEMORY, _words(error))
+    except ScanchainError as error:
+        return EndReport(Status.CRASHED, str(error))
     except Exception as error:  # others' code may raise anything
         traceback.print_exc()
-        report = EndReport(Status.CRASHED, f"{type(error).__name__}: {error}", "", 0.0, 0.0, peak_mib())
-    (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
+        return EndReport(Status.CRASHED, _words(error))
+
+
+def _words(error: Exception) -> str:
+    """What it says, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:_LONGEST]}"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
 
-from pipeline.evaluate.absolute import AbsoluteError, absolute_error
+from pipeline.evaluate.absolute import AbsoluteError, absolute_error, absolute_error_on_any_course
 from pipeline.evaluate.alignment import Alignment, align
 from pipeline.evaluate.consistency import motion_nees
 from pipeline.evaluate.disagreement import disagreement
@@ -10,7 +10,7 @@ from pipeline.evaluate.kitti import (
     KittiError,
     LengthError,
     kitti_error,
-    lengths_for,
+    kitti_error_on_any_course,
 )
 from pipeline.evaluate.pairing import PAIRING_LIMIT_S, Pairs, pair
 from pipeline.evaluate.reference import read_reference
@@ -46,10 +46,11 @@ __all__ = [
     "Sharpness",
     "Statistics",
     "absolute_error",
+    "absolute_error_on_any_course",
     "align",
     "disagreement",
     "kitti_error",
-    "lengths_for",
+    "kitti_error_on_any_course",
     "motion_nees",
     "pair",
     "read_reference",

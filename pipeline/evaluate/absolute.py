@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.data import Matrix, Pose
+from pipeline.errors import InputError
 from pipeline.evaluate.alignment import Alignment, align
 from pipeline.evaluate.pairing import Pairs
 from pipeline.evaluate.statistics import Statistics
@@ -77,6 +78,14 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
         errors_m=errors_m,
         errors_rad=errors_rad,
     )
+
+
+def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
+    """After rigid alignment or, where a straight course leaves that a free rotation, by the first pose."""
+    try:
+        return absolute_error(pairs)
+    except InputError:
+        return absolute_error(pairs, Alignment.FIRST)
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:

@@ -16,14 +16,7 @@ from pipeline.evaluate.relative import motion_errors
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
-
-
 _LONG_PATH_M = 200.0  # from here on the published lengths leave a choice of starts
-
-
-def lengths_for(path_length_m: float) -> tuple[float, ...]:
-    """The published lengths where the path is long enough for them, else 10, 20 and 40 m."""
-    return KITTI_LENGTHS_M if path_length_m >= _LONG_PATH_M else SHORT_LENGTHS_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,17 +77,25 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
         raise InputError(
             f"no stretch of {min(lengths_m):g} m fits into a path of {travelled_m[-1]:.1f} m; take shorter lengths"
         )
+    starts = "pose" if every == 1 else f"{every}th pose"
     lengths = ", ".join(f"{length_m:g}" for length_m in lengths_m)
     return KittiError(
         definition=(
             f"KITTI: translation and angle of (P_i⁻¹ P_j)⁻¹ (R_i⁻¹ R_j) over the length, mean of {len(share)} "
-            f"stretches of {lengths} m from every {every} poses; {pairs.description}"
+            f"stretches of {lengths} m from every {starts}; {pairs.description}"
         ),
         translation_share=_mean(share),
         rotation_rad_per_m=_mean(turn),
         stretches=len(share),
         by_length=tuple(by_length),
     )
+
+
+def kitti_error_on_any_course(pairs: Pairs) -> KittiError:
+    """The published lengths where the path is long enough for them, else 10, 20 and 40 m from every pose."""
+    if path_length(pairs.reference)[-1] >= _LONG_PATH_M:
+        return kitti_error(pairs)
+    return kitti_error(pairs, SHORT_LENGTHS_M, every=1)
 
 
 def _drift(

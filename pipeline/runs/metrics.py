@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 
 import msgspec
@@ -11,7 +12,7 @@ from msgspec import Struct
 
 from pipeline.data import State, Trajectory, Verdict
 from pipeline.errors import InputError
-from pipeline.evaluate import Alignment, absolute_error, kitti_error, lengths_for, pair
+from pipeline.evaluate import absolute_error_on_any_course, kitti_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
 from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
@@ -22,13 +23,13 @@ _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
 
 
 class Accuracy(Struct, frozen=True):
-    """A trajectory against the ground truth; ``kitti_*`` are null where the path is too short."""
+    """A trajectory against the ground truth; what the path is too short for is null."""
 
     pairs: int
     ate_rmse_m: float
     ate_mean_m: float
     ate_max_m: float
-    ate_share_of_path: float
+    ate_share_of_path: float | None
     ate_rotation_rmse_rad: float
     kitti_translation_share: float | None
     kitti_rotation_rad_per_m: float | None
@@ -45,7 +46,7 @@ class GroundTruth(Struct, frozen=True):
 
 
 class Metrics(Struct, frozen=True):
-    """A run in numbers; ``*_ms`` are over the scans, by stage.
+    """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
     Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
     """
@@ -72,9 +73,14 @@ class Metrics(Struct, frozen=True):
     median_ms: dict[str, float]
     p95_ms: dict[str, float]
     median_inlier_share: float
-    median_residual_m: float
+    median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
+
+    @property
+    def residual(self) -> str:
+        """Of matching, in words."""
+        return "–" if self.median_residual_m is None else f"{1e3 * self.median_residual_m:.1f} mm"
 
     def write(self, path: Path) -> None:
         """Write as JSON; what is not finite becomes null."""
@@ -92,6 +98,7 @@ def measure(
 ) -> Metrics:
     """The numbers of a finished run."""
     matches = [row.match for row in steps.rows]
+    residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
@@ -119,7 +126,7 @@ def measure(
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
         median_inlier_share=float(np.median([match.inlier_share for match in matches])),
-        median_residual_m=float(np.median([match.residual_m for match in matches])),
+        median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
     )
@@ -146,7 +153,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"accepted; chi2 {m.chi2:.4g}",
         f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
-        f"residual {1e3 * m.median_residual_m:.1f} mm, {m.median_iterations:.0f} iterations (medians)",
+        f"residual {m.residual}, {m.median_iterations:.0f} iterations (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
@@ -159,12 +166,9 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
 
 def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, float]:
     pairs = pair(trajectory, reference)
+    ate = absolute_error_on_any_course(pairs)
     try:
-        ate = absolute_error(pairs)
-    except InputError:  # a way on a line leaves the alignment a free rotation
-        ate = absolute_error(pairs, Alignment.FIRST)
-    try:
-        kitti = kitti_error(pairs, lengths_for(ate.path_length_m))
+        kitti = kitti_error_on_any_course(pairs)
     except InputError:
         kitti = None
     accuracy = Accuracy(
@@ -172,7 +176,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
-        ate_share_of_path=ate.share_of_path,
+        ate_share_of_path=ate.share_of_path if ate.path_length_m >= _SHORTEST_PATH_M else None,
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
@@ -184,8 +188,8 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
     lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
-        share, rotation = 100.0 * accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
-        of_path = f" ({share:.3f} % of the path)" if truth.path_length_m >= _SHORTEST_PATH_M else ""
+        share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
+        of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"
         lines.append(
             f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m{of_path}, "
             f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"

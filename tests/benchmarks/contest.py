@@ -1,4 +1,8 @@
-"""One log, many odometries: every scan goes through all of them in turn, so that they meet the same machine."""
+"""One log, many odometries: every scan goes through all of them in turn, so that they meet the same machine.
+
+They are those of ``scanchain compare``, with its settings, its warm-up and its verb, which alone is timed; there
+each has a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -15,42 +19,25 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import baselines
-from pipeline.baselines import Baseline
+from pipeline.compare.methods import Method, resolve
+from pipeline.compare.runner import Runner, start
+from pipeline.compare.worker import warm_up
 from pipeline.config import LogConfig
-from pipeline.data import Pose, RawPoints, Scan, Trajectory
+from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import Override, load_settings
 
 OURS = ("plicp", "svd")
-WARM_UP_SCANS = 4
 
 Answer = TypeVar("Answer")
 
 
-class Ours:
-    """Our odometry behind the verb of the baselines, with the configuration that a run would choose."""
-
-    def __init__(self, matcher: str) -> None:
-        config = load_settings(3, overrides=(Override("matching.matcher", matcher, "--methods"),)).config
-        self.odometry = Odometry(config, np.eye(4))
-        deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
-        self.description = f"ours, {matcher}, scan to map, one thread, preset lidar3d, no wheels, {deskewing}"
-        self.index = 0
-
-    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
-        scan = Scan(self.index, stamp_ns, stamp_ns, points, times_s, 0, None)
-        self.index += 1
-        return self.odometry.track(scan).T_odom_lidar
-
-
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A log in memory: scans and, where the log has it, the ground truth."""
+    """A log in memory: scans, where the lidar sits and, where the log has it, the ground truth."""
 
     scans: list[Scan]
+    T_base_lidar: Pose
     ground_truth: Trajectory | None
 
     @property
@@ -82,7 +69,7 @@ def read(path: Path, count: int) -> Recording:
     log = open_log([path], LogConfig())
     if log.dimension != 3:
         raise InputError(f"{path}: {log.topic} is 2D; this benchmark is for 3D lidars")
-    return Recording(list(islice(log.scans(), count)), log.ground_truth())
+    return Recording(list(islice(log.scans(), count)), log.T_base_lidar, log.ground_truth())
 
 
 def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
@@ -91,16 +78,16 @@ def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
     return (*OURS, "kiss-icp", "small-vgicp", "small-gicp", genz, "open3d-p2l")
 
 
-def create(name: str) -> Baseline:
-    """One of ours or of the baselines, ready for the first scan."""
-    return Ours(name) if name in OURS else baselines.create(name)
+def create(name: str, T_base_lidar: Pose) -> Runner:
+    """One of ours or of the baselines, ready for the first scan of a 3D log."""
+    return start(_method(name), T_base_lidar)
 
 
 def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
     """All methods over all scans, in turn, each scan starting with another one; the time is that of ``track``."""
     for name in methods:
-        _warm_up(name, recording.scans)
-    racers = [create(name) for name in methods]
+        warm_up(recording.scans, _method(name), recording.T_base_lidar)
+    racers = [create(name, recording.T_base_lidar) for name in methods]
     poses = np.full((len(methods), len(recording.scans), 4, 4), np.nan)
     seconds, cpu_seconds = np.zeros((2, len(methods), len(recording.scans)))
     failures = [""] * len(methods)
@@ -111,7 +98,7 @@ def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
                 continue
             started, cpu_started = perf_counter(), process_time()
             try:
-                poses[m, k] = racers[m].track(scan.points, scan.times_s, scan.stamp_ns)
+                poses[m, k] = racers[m].track(scan)
             except Exception as error:  # others' code may raise anything; the race goes on
                 failures[m] = f"scan {k}: {type(error).__name__}: {error}"
             seconds[m, k], cpu_seconds[m, k] = perf_counter() - started, process_time() - cpu_started
@@ -132,10 +119,5 @@ def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Ans
         return executor.submit(function, *arguments).result()
 
 
-def _warm_up(name: str, scans: list[Scan]) -> None:
-    """Import and compile; GenZ-ICP, which is compiled, gets no scan here because it would remember it."""
-    throwaway = create(name)
-    if name.startswith("genz"):
-        return
-    for scan in scans[:WARM_UP_SCANS]:
-        throwaway.track(scan.points, scan.times_s, scan.stamp_ns)
+def _method(name: str) -> Method:
+    return resolve((name,), 3, file=None)[0]

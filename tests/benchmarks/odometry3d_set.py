@@ -79,7 +79,7 @@ def scores(path: Path, methods: tuple[str, ...]) -> list[Score]:
 
 def score(run: Run, ground_truth: Trajectory) -> Score:
     """Errors of a run against the truth."""
-    median_s = float(np.median(run.seconds))
+    median_s = float(np.median(run.seconds[1:]))
     if not run.is_whole:
         return Score(np.inf, False, np.inf, np.inf, True, median_s)
     pairs = pair(run.trajectory, ground_truth)

@@ -40,9 +40,10 @@ def measure(path: Path, method: str, scans: int) -> PeakMemory | None:
 def main() -> None:
     path, method, *count = sys.argv[1:]
     first_mib = 0.0
-    odometry = create(method)
-    for scan in islice(open_log([Path(path)], LogConfig()).scans(), int(count[0]) if count else None):
-        odometry.track(scan.points, scan.times_s, scan.stamp_ns)
+    log = open_log([Path(path)], LogConfig())
+    odometry = create(method, log.T_base_lidar)
+    for scan in islice(log.scans(), int(count[0]) if count else None):
+        odometry.track(scan)
         first_mib = first_mib or peak_mib()
     print(f"{peak_mib():.1f} {peak_mib() - first_mib:.1f}")
 
