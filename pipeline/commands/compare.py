@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import ScanchainError
+from pipeline.logs.source import Source
 from pipeline.settings import Override
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ _MIB_PER_GIB = 1024.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--methods", metavar="LIST", help="Names with commas. [default: all that make sense for the log]")
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to make. [default: runs/compare-LOG]")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
@@ -48,7 +50,7 @@ _MIB_PER_GIB = 1024.0
 @click.pass_context
 def compare(
     ctx: click.Context,
-    logs: tuple[Path, ...],
+    logs: tuple[Source, ...],
     methods: str | None,
     out: Path | None,
     gt: str | None,

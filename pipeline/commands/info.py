@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.logs.source import Source
 from pipeline.settings import load_settings
 
 if TYPE_CHECKING:
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def info(ctx: click.Context, logs: tuple[Path, ...], as_json: bool) -> None:
+def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     """Print what is in a log: topics, types, rates, and what a run with the same flags would use.
 
     \b

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
+from pipeline.logs.source import Source
 from pipeline.settings import Override
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make."
 )
@@ -55,7 +57,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.pass_context
 def run(
     ctx: click.Context,
-    logs: tuple[Path, ...],
+    logs: tuple[Source, ...],
     out: Path,
     config: Path | None,
     rerun: str,

@@ -24,6 +24,7 @@ from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import pair, read_reference, read_relations, relation_error
 from pipeline.logs import Log, open_log
+from pipeline.logs.source import Source
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
@@ -48,7 +49,7 @@ class Contest:
     command : the command line, for the report
     """
 
-    logs: tuple[Path, ...]
+    logs: tuple[Source, ...]
     out: Path
     methods: tuple[str, ...] = ()
     settings_file: Path | None = None

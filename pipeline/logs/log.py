@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -22,6 +21,7 @@ from pipeline.logs.point_times import PointTimes
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
+from pipeline.logs.source import Source, source_of
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
@@ -34,10 +34,10 @@ _HOLD_SCANS = 32
 _REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --topic"
 
 
-def open_log(paths: Path | str | Sequence[Path | str], config: LogConfig = _DEFAULTS) -> Log:
-    """A file or folder, or several as one log, topics chosen. Raises InputError for what cannot be read."""
-    named = [paths] if isinstance(paths, Path | str) else paths
-    return Log(index_files([Path(path) for path in named], config.rate_hz), config)
+def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
+    """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+    named = [sources] if isinstance(sources, Source | str) else sources
+    return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 
 class Log:

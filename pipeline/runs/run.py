@@ -15,6 +15,7 @@ from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
+from pipeline.logs.source import Source
 from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoints
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.compiling import telling_of_compilation
@@ -58,7 +59,7 @@ class Job:
     command : the command line, for run.json
     """
 
-    logs: tuple[Path, ...]
+    logs: tuple[Source, ...]
     out: Path
     config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
@@ -125,11 +126,11 @@ def run(
     return Finished(directory.path, metrics, text, warnings, stopped)
 
 
-def _check_distinct(paths: tuple[Path, ...]) -> None:
+def _check_distinct(sources: tuple[Source, ...]) -> None:
     """Refuse a file named twice: each of its scans would come twice."""
-    for path, count in Counter(path.resolve() for path in paths).items():
+    for source, count in Counter(source.resolve() for source in sources).items():
         if count > 1:
-            raise InputError(f"{path}: is named {count} times; name each file of a log once")
+            raise InputError(f"{source}: is named {count} times; name each file of a log once")
 
 
 def _check_prior(log: Log, config: Config) -> None:
