@@ -19,9 +19,9 @@ from pipeline.errors import InputError, MissingExtraError
 from pipeline.logs import open_log, read_ahead, remote, write
 from pipeline.logs.opening import index_files
 from pipeline.logs.read_ahead import ReadAhead, merged
-from pipeline.logs.source import Address, source_of
 from pipeline.runs.provenance import Provenance, identity_of
 from pipeline.simulate import simulate
+from pipeline.source import Address, source_of
 
 pytest.importorskip("fsspec", reason="the extra remote is not installed")
 

@@ -68,10 +68,8 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "way", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
     yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
     yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
-    yield (
-        "matching",
-        f"{100.0 * m.median_inlier_share:.0f} % inliers, {1e3 * m.median_residual_m:.1f} mm (medians)",
-    )
+    residual = "" if m.median_residual_m is None else f", {1e3 * m.median_residual_m:.1f} mm"
+    yield "matching", f"{100.0 * m.median_inlier_share:.0f} % inliers{residual} (medians)"
     if m.ground_truth is not None:
         truth = m.ground_truth
         yield "ATE", f"{truth.optimised.ate_rmse_m:.4f} m over {truth.path_length_m:.1f} m, against {truth.source}"

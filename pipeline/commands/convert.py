@@ -9,7 +9,7 @@ import click
 
 from pipeline.commands.log_type import LOG
 from pipeline.errors import InputError
-from pipeline.logs.source import Source
+from pipeline.source import Source
 
 
 @click.command()

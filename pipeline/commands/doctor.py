@@ -10,8 +10,8 @@ import click
 
 from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
-from pipeline.logs.source import Source
 from pipeline.settings import Override, load_settings
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.logs.doctor import Diagnosis

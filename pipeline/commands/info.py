@@ -11,8 +11,8 @@ import click
 
 from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
-from pipeline.logs.source import Source
 from pipeline.settings import load_settings
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.logs.info import LogInfo

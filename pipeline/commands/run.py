@@ -12,8 +12,8 @@ from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
-from pipeline.logs.source import Source
 from pipeline.settings import Override
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import SinkName, Viewing

@@ -24,11 +24,11 @@ from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import pair, read_reference, read_relations, relation_error
 from pipeline.logs import Log, open_log
-from pipeline.logs.source import Source
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
 from pipeline.settings import Override, load_settings
+from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)

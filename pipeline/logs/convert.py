@@ -10,10 +10,10 @@ from pipeline.errors import InputError
 from pipeline.logs.opening import index_files
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import EVERYTHING
-from pipeline.logs.source import Source
 from pipeline.logs.stream import decoded_messages
 from pipeline.logs.topics import topics_of
 from pipeline.logs.write import LogWriter
+from pipeline.source import Source
 
 _AHEAD = 4  # blocks
 

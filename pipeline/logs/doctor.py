@@ -10,8 +10,8 @@ from pipeline.logs.checks_scans import check_scans
 from pipeline.logs.checks_time import check_time
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.log import open_log
-from pipeline.logs.source import Source
 from pipeline.logs.survey import survey
+from pipeline.source import Source
 
 _ORDER = tuple(reversed(Severity))
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.resync import Resync, is_end, record_end, vouches_for_itself
-from pipeline.logs.source import Source
 from pipeline.logs.walk import Walk
+from pipeline.source import Source
 
 
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:

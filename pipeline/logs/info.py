@@ -13,7 +13,7 @@ from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
 from pipeline.logs.sizes import size_of
-from pipeline.logs.source import Source
+from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,12 +21,12 @@ from pipeline.logs.point_times import PointTimes
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
-from pipeline.logs.source import Source, source_of
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
 from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
 from pipeline.logs.wheels import WheelTrack
+from pipeline.source import Source, source_of
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it

@@ -17,8 +17,8 @@ from pipeline.logs.index import index_file
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.remote import RemoteFile
 from pipeline.logs.remote_index import index_by_summary
-from pipeline.logs.source import Source
 from pipeline.logs.whole import fetch_whole
+from pipeline.source import Source
 
 Indexer = Callable[[Path, int], FileIndex]
 

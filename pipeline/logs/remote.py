@@ -7,7 +7,7 @@ from time import sleep
 from typing import Any, TypeVar
 
 from pipeline.errors import InputError, MissingExtraError
-from pipeline.logs.source import Address
+from pipeline.source import Address
 
 T = TypeVar("T")
 
@@ -64,6 +64,13 @@ class RemoteFile:
                 return False
 
         return _patient(ask, str(self.address))
+
+
+def matching(pattern: Address) -> list[Address]:
+    """The addresses that a pattern with * stands for, in the order of their names."""
+    system, path = _system_of(pattern)
+    found = _patient(lambda: system.glob(path), str(pattern))
+    return [Address(system.unstrip_protocol(each)) for each in sorted(found)]
 
 
 def _system_of(address: Address) -> tuple[Any, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.logs.remote import RemoteFile
-from pipeline.logs.source import Source
+from pipeline.source import Source
 
 
 def files_of(path: Path) -> list[Path]:

@@ -22,13 +22,13 @@ _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
 
 
 class Accuracy(Struct, frozen=True):
-    """A trajectory against the ground truth; ``kitti_*`` are null where the path is too short."""
+    """A trajectory against the ground truth; shares of the path are null where it is too short for them."""
 
     pairs: int
     ate_rmse_m: float
     ate_mean_m: float
     ate_max_m: float
-    ate_share_of_path: float
+    ate_share_of_path: float | None
     ate_rotation_rmse_rad: float
     kitti_translation_share: float | None
     kitti_rotation_rad_per_m: float | None
@@ -45,7 +45,7 @@ class GroundTruth(Struct, frozen=True):
 
 
 class Metrics(Struct, frozen=True):
-    """A run in numbers; ``*_ms`` are over the scans, by stage.
+    """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where most have none.
 
     Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
     """
@@ -72,7 +72,7 @@ class Metrics(Struct, frozen=True):
     median_ms: dict[str, float]
     p95_ms: dict[str, float]
     median_inlier_share: float
-    median_residual_m: float
+    median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
 
@@ -119,7 +119,7 @@ def measure(
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
         median_inlier_share=float(np.median([match.inlier_share for match in matches])),
-        median_residual_m=float(np.median([match.residual_m for match in matches])),
+        median_residual_m=_finite(np.median([match.residual_m for match in matches])),
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
     )
@@ -146,7 +146,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"accepted; chi2 {m.chi2:.4g}",
         f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
-        f"residual {1e3 * m.median_residual_m:.1f} mm, {m.median_iterations:.0f} iterations (medians)",
+        f"residual {_millimetres(m.median_residual_m)}, {m.median_iterations:.0f} iterations (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
@@ -172,7 +172,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
-        ate_share_of_path=ate.share_of_path,
+        ate_share_of_path=_finite(ate.share_of_path),
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
@@ -181,11 +181,21 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
     return accuracy, ate.path_length_m
 
 
+def _finite(value: float | np.floating) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _millimetres(value_m: float | None) -> str:
+    return "unknown" if value_m is None else f"{1e3 * value_m:.1f} mm"
+
+
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
     lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
-        share, rotation = 100.0 * accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
-        of_path = f" ({share:.3f} % of the path)" if truth.path_length_m >= _SHORTEST_PATH_M else ""
+        share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
+        of_path = ""
+        if share is not None and truth.path_length_m >= _SHORTEST_PATH_M:
+            of_path = f" ({100.0 * share:.3f} % of the path)"
         lines.append(
             f"{name:<14} rmse {accuracy.ate_rmse_m:.4f} m{of_path}, "
             f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"

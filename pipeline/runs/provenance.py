@@ -17,7 +17,7 @@ from msgspec import Struct
 from pipeline.errors import InputError
 from pipeline.logs.remote import RemoteFile
 from pipeline.logs.sizes import files_of, size_of
-from pipeline.logs.source import Source, source_of
+from pipeline.source import Source, without_keys
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22
@@ -74,7 +74,7 @@ def describe_start(command: Sequence[str], logs: Sequence[Source], configuration
     return Provenance(
         complete=False,
         stopped="",
-        command=[str(source_of(word)) if "://" in word else word for word in command],  # without passwords
+        command=without_keys(command),
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         duration_s=0.0,
         logs=[_log_file(source) for source in logs],

@@ -15,7 +15,6 @@ from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
-from pipeline.logs.source import Source
 from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoints
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.compiling import telling_of_compilation
@@ -33,6 +32,7 @@ from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
+from pipeline.source import Source
 from pipeline.trajectory import read_tum, write_tum
 
 TRUTH_FILE = "ground_truth.tum"

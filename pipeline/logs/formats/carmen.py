@@ -20,7 +20,7 @@ from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, re
 from pipeline.logs.formats.made import made_block, made_channel, made_index
 from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
-from pipeline.logs.source import Source
+from pipeline.source import Source
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
@@ -37,6 +38,11 @@ class Address:
 
 
 Source = Path | Address
+
+
+def without_keys(words: Sequence[str]) -> list[str]:
+    """The words of a command line, addresses as they may be shown."""
+    return [str(source_of(word)) if "://" in word else word for word in words]
 
 
 def source_of(named: Source | str) -> Source:
