@@ -43,7 +43,8 @@ def convert(
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
     indexes = index_files(sources, rate_hz)
-    if len(indexes) == 1 and indexes[0].make is None:
+    is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
+    if len(indexes) == 1 and indexes[0].make is None and not is_folder:
         raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(topics_of(indexes), 0)

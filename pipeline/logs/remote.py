@@ -133,7 +133,8 @@ def _status(error: Exception) -> int:
 
 
 def _reason(error: Exception) -> str:
-    cause = error.__cause__ or error
-    status = _status(error)
+    cause, status = error.__cause__ or error, _status(error)
+    if isinstance(cause, FileNotFoundError):
+        return "not found"  # its text would be the address, keys and all
     text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
     return " ".join(text.split()) or type(cause).__name__
