@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.batch.table import totals
-from pipeline.batch.task import Row, State
+from pipeline.batch.task import Row
 from pipeline.runs.metrics import Metrics
 from pipeline.source import source_of, without_keys
 from pipeline.trajectory import read_tum
@@ -40,11 +40,12 @@ _HEADS = (
 def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
     """Draw and write the page; runs are looked up in the directory."""
     done = [row for row in rows if row.metrics is not None]
+    missing = len(rows) - len(done)
     page = Page(
         title=f"Batch of {len(rows):,} logs",
-        subtitle=f"{len(done):,} have a result. Each was run in a process of its own.",
+        subtitle="Each was run in a process of its own.",
         facts=tuple(totals(rows)),
-        warnings=tuple(f"{row.log} {row.state}: {row.reason}" for row in rows if row.state is not State.DONE),
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) if missing else (),
         grid_title="Logs",
         grid=Grid(_HEADS, tuple(map(_row, rows))),
         legend=tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint),

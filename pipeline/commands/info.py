@@ -30,6 +30,7 @@ def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
       scanchain info log.mcap
       scanchain info part_0.mcap part_1.mcap --json
       scanchain info drive.bag --log.topic /lidar_front/points
+      scanchain info https://host/log.mcap
     """
     from pipeline.logs.info import describe
 

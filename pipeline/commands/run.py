@@ -70,8 +70,9 @@ def run(
 ) -> None:
     """Make a trajectory, a map and a recording of a log.
 
-    LOG is an MCAP file, or anything that scanchain convert takes; several are read as one log. Any key of the
-    configuration is a flag, see scanchain config show.
+    LOG is an MCAP file, anything that scanchain convert takes, or the address of such a file: of an MCAP at https://
+    or s3:// only the parts are fetched that are read. Several are read as one log. Any key of the configuration is
+    a flag, see scanchain config show.
 
     \b
     Examples:
@@ -80,6 +81,7 @@ def run(
       scanchain run intel.clf.bz2 --out runs/intel
       scanchain run scans/ --out runs/scans --log.rate_hz 10
       scanchain run part_0.mcap part_1.mcap --out runs/log --topic /lidar_front/points
+      scanchain run s3://bucket/log.mcap --out runs/minute --start 600 --end 660
       scanchain run log.mcap --out runs/log --resume
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
