@@ -28,6 +28,7 @@ from pipeline.errors import InputError, ScanchainError
 from pipeline.runs.recorder import Recorder, SinkName, Viewing
 
 if TYPE_CHECKING:
+    from pipeline.batch.task import Row
     from pipeline.graph.optimisation import GraphChange
     from pipeline.landmarks.study import Study
 
@@ -57,8 +58,8 @@ for _command in _COMMANDS:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
     viewing = Viewing(
-        _record, _show, _draw, _report, _present_comparison, _draw_graph, _record_graph, _present_landmarks,
-        _record_landmarks,
+        _record, _show, _draw, _report, _present_batch, _present_comparison, _draw_graph, _record_graph,
+        _present_landmarks, _record_landmarks,
     )  # fmt: skip
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -127,6 +128,12 @@ def _report(directory: Path) -> None:
     from viz.run_report import write_run_report
 
     write_run_report(directory)
+
+
+def _present_batch(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
+    from viz.batch_report import write_batch_report
+
+    write_batch_report(directory, rows, command)
 
 
 def _present_comparison(directory: Path) -> None:

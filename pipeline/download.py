@@ -65,14 +65,14 @@ class _Part:
                     return
                 reason = "the server ended too early"
             except urllib.error.HTTPError as error:
-                if error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
-                    if error.headers.get("Content-Range", "") == f"bytes */{self.path.stat().st_size}":
-                        return
-                    self.path.unlink()  # the file on the server is another, and shorter
-                    continue
-                raise DownloadError(
-                    f"{self.url}: {error.code} {error.reason}; see whether its page moved"
-                ) from error
+                if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+                    raise DownloadError(
+                        f"{self.url}: {error.code} {error.reason}; see whether its page moved"
+                    ) from error
+                if error.headers.get("Content-Range", "") == f"bytes */{self.path.stat().st_size}":
+                    return
+                self.path.unlink()
+                reason = "the file on the server is another, and shorter, than the one begun"
             except _BROKEN as error:
                 reason = str(getattr(error, "reason", error)) or type(error).__name__
             if attempt == _ATTEMPTS:

@@ -7,14 +7,19 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from scenes import ROOT
+from web_server import serving
 
 from pipeline.__main__ import main
 from pipeline.batch.collecting import collect
 from pipeline.errors import InputError
+from pipeline.logs.write import LogWriter
+from pipeline.memory import resident_mib
 from pipeline.simulate import simulate
+from pipeline.source import Address
 
 POISON = """
 import sys
@@ -158,3 +163,72 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
         collect([], [])
     with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
         collect([], [tmp_path / "none.txt"])
+
+
+def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, capfd):
+    log, out = tmp_path / "still.mcap", tmp_path / "out"
+    angles = np.radians(np.arange(360.0))
+    ranges = 4.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))  # a square room
+    with LogWriter(log) as writer:
+        for stamp_ns in range(0, 2_000_000_000, 100_000_000):
+            writer.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(4))
+            writer.laser_scan(
+                "/scan", stamp_ns, "lidar", 0.0, np.radians(1.0), 0.0, ranges, range_min_m=0.1, range_max_m=20.0
+            )
+    assert main(["batch", str(log), "--out", str(out)]) == 0
+    assert main(["batch", str(log), "--out", str(out)]) == 0
+    (row,) = table(out).values()
+    assert (row["state"], row["scans"], row["ate_share_of_path"]) == ("done", 20, None)
+    assert "1 results were there before" in capfd.readouterr()[0].splitlines()[-1]
+
+
+def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):
+    pytest.importorskip("fsspec", reason="the extra remote is not installed")
+    out = tmp_path / "out"
+    bad = tmp_path / "<bad>.mcap"
+    bad.write_bytes(b"no log at all")
+    with serving({"/far.mcap?key=secret": (drawers / "log_04.mcap").read_bytes()}) as site:
+        words = [
+            "batch",
+            f"{site.url}/far.mcap?key=secret",
+            str(drawers / "log_05.mcap"),
+            str(bad),
+            "--out",
+            str(out),
+        ]
+        monkeypatch.setattr(sys, "argv", ["scanchain", *words])
+        assert main(words) == 1
+        first = made(out)
+        assert main(words) == 1 and made(out) == first
+        site.etag = '"two"'
+        assert main(words) == 1 and len(made(out)) == len(first) + 1 == 3
+    rows = table(out)
+    assert rows["far.mcap"]["log"] == f"{site.url}/far.mcap" and rows["far.mcap"]["scans"] == 20
+    page = (out / "report.html").read_text()
+    assert "Batch of 3 logs" in page and "&lt;bad&gt;.mcap" in page and "<bad>" not in page
+    assert page.count("<svg") == 3 + 2  # errors, speeds and memory; two ways
+    written = [file.read_bytes() for file in out.rglob("*") if file.is_file()]
+    assert not any(b"secret" in content for content in written)
+
+
+def test_of_remote_logs_a_pattern_names_those_that_match(monkeypatch):
+    fsspec = pytest.importorskip("fsspec", reason="the extra remote is not installed")
+    memory = fsspec.filesystem("memory")
+    for name in ("b.mcap", "a.mcap", "c.txt"):
+        memory.pipe_file(f"/drives/{name}", b"x")
+    found = collect([Address("memory://drives/*.mcap"), Address("https://host/log.mcap?take=[1]")], [])
+    assert [each.name for each in found] == ["a.mcap", "b.mcap", "log.mcap"]
+    with pytest.raises(InputError, match=r"none\*: matches nothing"):
+        collect([Address("memory://drives/none*")], [])
+
+
+def test_the_memory_of_children_counts():
+    before = resident_mib(os.getpid())
+    code = "x = b'x' * (64 << 20); print(len(x), flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        child.stdout.readline()
+        with_child = resident_mib(os.getpid())
+        child.communicate("\n")
+    assert with_child > before + 60.0 and resident_mib(child.pid) == 0.0

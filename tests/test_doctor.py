@@ -79,9 +79,14 @@ def test_a_gap_is_found_where_it_is(tmp_path):
 
     finding = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)))["gaps"]
     assert (
-        finding.severity == "warning" and finding.found == "1 gaps, the longest 2.1 s, 1.9 s after the first scan"
+        finding.severity == "warning"
+        and finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
     )
-    assert "--start" in finding.remedy
+    assert "--start" in finding.remedy and "at constant velocity" in finding.effect
+    on_wheels = diagnose(saved(tmp_path, drive(stamp=hole, log=hole, wheels=True)))["gaps"]
+    assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
+    later = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)), start_s=1.0)["gaps"]
+    assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
 
 def test_jitter_is_measured_against_the_period(tmp_path):

@@ -264,3 +264,18 @@ def test_a_recording_that_asks_for_an_account_says_what_to_do(capfd, tmp_path):
     assert main(["sequence", "get", "newer-college", "--out", str(tmp_path)]) == 2
     said = capfd.readouterr().err
     assert "ori-drs.github.io/newer-college-dataset" in said and "scanchain convert" in said
+
+
+def test_a_file_that_was_replaced_by_a_shorter_one_after_many_breaks_is_an_error_not_a_success(site, tmp_path):
+    site.cuts = [1_000_000, 500_000, 500_000]
+    answer = site.answer
+
+    def shrinking(handler):
+        if len(site.asked) == 3:
+            site.files["/file.bin"] = CONTENT[:100]
+        return answer(handler)
+
+    site.answer = shrinking
+    with pytest.raises(DownloadError, match="is another, and shorter, than the one begun"):
+        fetch(f"{site.url}/file.bin", tmp_path / "file.bin")
+    assert not (tmp_path / "file.bin").exists()

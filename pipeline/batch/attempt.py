@@ -16,7 +16,7 @@ from pipeline.watched import Ending, KilledFor, Limits, run_within
 _LOOK_S = 0.1
 _SYSTEM_KILL = -9
 _WORDS = 300  # of what a process said last
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
+_THREADS = tuple(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON"))
 
 
 def attempt(task: Task, stop: Event | None = None) -> Row:
@@ -44,7 +44,9 @@ def _tried(task: Task, stop: Event | None) -> Row:
     if state is State.DONE:
         metrics = msgspec.json.decode((task.run / "metrics.json").read_bytes(), type=Metrics)
     run = task.run.name if metrics is not None else ""
-    return Row(task.log, task.sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics)
+    return Row(
+        task.name, task.sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics
+    )
 
 
 def _verdict(task: Task, ending: Ending) -> tuple[State, str]:

@@ -14,8 +14,9 @@ from pipeline.batch.table import write_table
 from pipeline.batch.task import Row, State, Task, finished_row, key_of, unfinished_row
 from pipeline.errors import InputError
 from pipeline.memory import available_mib
-from pipeline.runs.provenance import sha256_of
+from pipeline.runs.provenance import identity_of
 from pipeline.settings import Override
+from pipeline.source import Source
 
 _SHARE = 0.75  # of the memory that is free, for all workers together
 
@@ -40,7 +41,7 @@ class Batch:
 
     Attributes
     ----------
-    logs : a file or folder each
+    logs : a file, folder or address each
     out : the batch's directory, made or gone on with
     config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
     workers : processes at a time on this machine
@@ -48,7 +49,7 @@ class Batch:
     retries : further tries of a log that crashed its process
     """
 
-    logs: tuple[Path, ...]
+    logs: tuple[Source, ...]
     out: Path
     config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
@@ -110,10 +111,10 @@ def _tasks(batch: Batch) -> list[Task]:
         memory_mib = _SHARE * available_mib() / batch.workers
     tasks = []
     for log in batch.logs:
-        sha256 = sha256_of(log)
+        sha256 = identity_of(log)
         tasks.append(
             Task(
-                log=str(log.absolute()),
+                log=str(log.absolute()) if isinstance(log, Path) else log.url,
                 sha256=sha256,
                 key=key_of(sha256 or str(log), batch.config_file, batch.overrides),
                 out=str(batch.out),
@@ -130,9 +131,9 @@ def _row_of(task: Task, rows: dict[str, Row]) -> Row:
     """The row of a task: its own, that of a log with the same contents, or why there is none."""
     if task.key in rows:
         row = rows[task.key]
-        return Row(task.log, *(getattr(row, name) for name in row.__struct_fields__[1:]))
+        return Row(task.name, *(getattr(row, name) for name in row.__struct_fields__[1:]))
     if not task.sha256:
-        return unfinished_row(task, State.FAILED, "cannot be read; check the path")
+        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} says why")
     return unfinished_row(task, State.NOT_RUN, "stopped by the user")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,32 +44,33 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 def summary(rows: Sequence[Row]) -> str:
     """How many ended how, what all results amount to, and each log without one."""
-    counts = Counter(row.state for row in rows)
-    ended = ", ".join(f"{counts[state]:,} {state}" for state in State if counts[state])
-    lines = [f"logs           {len(rows):,}: {ended}"]
-    results = [row.metrics for row in rows if row.metrics is not None]
-    if results:
-        lines += _totals(results)
+    lines = [f"{name:<14} {text}" for name, text in totals(rows)]
     lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
     return "\n".join(lines) + "\n"
 
 
-def _totals(results: Sequence[Metrics]) -> list[str]:
+def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """How many ended how, and what all results amount to: name and text."""
+    counts = Counter(row.state for row in rows)
+    ended = ", ".join(f"{counts[state]:,} {state}" for state in State if counts[state])
+    results = [row.metrics for row in rows if row.metrics is not None]
+    return [("logs", f"{len(rows):,}: {ended}"), *(_amounts(results) if results else ())]
+
+
+def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     scans, lost = sum(each.scans for each in results), sum(each.lost for each in results)
     way_km = 1e-3 * sum(each.travelled_m for each in results)
     hours = sum(each.log_span_s for each in results) / 3600.0
     speed = np.array([each.times_real_time for each in results])
-    lines = [
-        f"scans          {scans:,}, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h",
-        f"speed          {np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least",
-    ]
+    yield "scans", f"{scans:,}, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h"
+    yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimised.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:
-        lines.append(
-            f"ATE            rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
-            f"{len(errors_m):,} logs with ground truth"
+        yield (
+            "ATE",
+            f"rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
+            f"{len(errors_m):,} logs with ground truth",
         )
-    return lines
 
 
 def _cells(row: Row) -> dict[str, object]:

@@ -13,6 +13,7 @@ from msgspec import Struct
 from pipeline.runs.metrics import Metrics
 from pipeline.runs.provenance import package_version
 from pipeline.settings import Override, dump, load_settings
+from pipeline.source import source_of
 
 
 class State(StrEnum):
@@ -31,7 +32,8 @@ class Task(Struct, frozen=True):
 
     Attributes
     ----------
-    log : the file or folder; sha256 : of its contents, empty where it cannot be read
+    log : the file, folder or address; sha256 : that of its contents, of a remote log that of its address, size
+        and version, empty where it cannot be read
     key : of its contents and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
@@ -49,9 +51,14 @@ class Task(Struct, frozen=True):
     retries: int
 
     @property
+    def name(self) -> str:
+        """The log as it is called in what is written: an address without the keys in it."""
+        return str(source_of(self.log))
+
+    @property
     def run(self) -> Path:
         """The run directory; its name is that of the log and the key's first letters."""
-        return Path(self.out) / f"{Path(self.log).resolve().stem}-{self.key[:8]}"
+        return Path(self.out) / f"{source_of(self.log).resolve().stem}-{self.key[:8]}"
 
     @property
     def row_file(self) -> Path:
@@ -93,12 +100,12 @@ def finished_row(task: Task) -> Row | None:
     except (OSError, msgspec.DecodeError):
         return None
     is_done = row.state is State.DONE and (Path(task.out) / row.run / "metrics.json").is_file()
-    return msgspec.structs.replace(row, log=task.log) if is_done else None
+    return msgspec.structs.replace(row, log=task.name) if is_done else None
 
 
 def unfinished_row(task: Task, state: State, reason: str) -> Row:
     """The row of a task without a process to tell of."""
-    return Row(task.log, task.sha256, task.key, "", state, reason, 0, 0.0, 0.0, None)
+    return Row(task.name, task.sha256, task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
 def key_of(sha256: str, config_file: Path | None, overrides: Sequence[Override]) -> str:

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.limit_options import limit_options
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
+from pipeline.source import Source
+
+if TYPE_CHECKING:
+    from pipeline.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
-_MIB_PER_GIB = 1024.0
+_DAY_S = 86_400.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, type=_PATH)
+@click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
 @click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to make, or to go on with.")
 @click.option(
     "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="A list of logs, one a line."
@@ -24,20 +32,7 @@ _MIB_PER_GIB = 1024.0
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Logs at a time. [default: one a core]")
 @click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
-@click.option(
-    "--time-limit",
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="SECONDS",
-    default=86400.0,
-    show_default=True,
-    help="What a log may take.",
-)
-@click.option(
-    "--memory-limit",
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="GIB",
-    help="What a log may take. [default: its share of three quarters of what is free]",
-)
+@limit_options("a log", time_default="a day", memory_default="its share of three quarters of what is free")
 @click.option(
     "--retries",
     type=click.IntRange(0),
@@ -49,23 +44,24 @@ _MIB_PER_GIB = 1024.0
 @click.pass_context
 def batch(
     ctx: click.Context,
-    logs: tuple[Path, ...],
+    logs: tuple[Source, ...],
     out: Path,
     manifests: tuple[Path, ...],
     config: Path | None,
     workers: int | None,
     ray: str | None,
-    time_limit: float,
-    memory_limit: float | None,
+    time_limit: float | None,
+    memory_mib: float | None,
     retries: int,
     rerun: str,
 ) -> None:
     """Run many logs, each in a process of its own.
 
-    LOG is a file or folder that scanchain run takes, or a pattern in quotes. A log that crashes its process, hangs
-    or takes all memory is a row that says so; the others finish, and the exit code is 1. Called again, only what
-    has no result is run: a result belongs to the log's contents and the configuration in effect. DIR gets a run
-    directory a log, batch.parquet with a row a log, and summary.txt.
+    LOG is a file, folder or address that scanchain run takes, or a pattern in quotes. A log that crashes its
+    process, hangs or takes all memory is a row that says so; the others finish, and the exit code is 1. Called
+    again, only what has no result is run: a result belongs to the log's contents (of a remote log: its address,
+    size and version) and the configuration in effect. DIR gets a run directory a log, batch.parquet with a row a
+    log, report.html and summary.txt.
 
     \b
     Examples:
@@ -73,6 +69,7 @@ def batch(
       scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
       scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
       scanchain batch --manifest logs.txt --out /shared/all --ray auto
+      scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
     from pipeline.batch.batch import Batch, run_batch
     from pipeline.batch.cluster import on_cluster
@@ -89,14 +86,17 @@ def batch(
         overrides=changes,
         arguments=("--rerun", rerun, *_arguments(config, changes)),
         workers=workers or os.cpu_count() or 1,
-        time_s=time_limit,
-        memory_mib=None if memory_limit is None else _MIB_PER_GIB * memory_limit,
+        time_s=time_limit or _DAY_S,
+        memory_mib=memory_mib,
         retries=retries,
     )
     with Terminal("logs") as terminal:
         batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
     click.echo(batched.summary, nl=False)
-    click.echo(f"written        {out}: batch.parquet, summary.txt; {batched.kept:,} results were there before")
+    viewing: Viewing = ctx.obj
+    viewing.present_batch(job.out, batched.rows, sys.argv)
+    files = "batch.parquet, report.html, summary.txt"
+    click.echo(f"written        {out}: {files}; {batched.kept:,} results were there before")
     if batched.unfinished:
         total = len(batched.rows)
         raise ScanchainError(

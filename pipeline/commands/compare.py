@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.limit_options import limit_options
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import ScanchainError
 from pipeline.settings import Override
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
-_MIB_PER_GIB = 1024.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--methods", metavar="LIST", help="Names with commas. [default: all that make sense for the log]")
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to make. [default: runs/compare-LOG]")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
@@ -30,25 +32,14 @@ _MIB_PER_GIB = 1024.0
 @click.option(
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, in turn."
 )
-@click.option(
-    "--time-limit",
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="SECONDS",
-    help="What a run may take. [default: 300 and one a scan]",
-)
-@click.option(
-    "--memory-limit",
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="GIB",
-    help="What a run may take. [default: three quarters of what is free]",
-)
+@limit_options("a run", time_default="300 and one a scan", memory_default="three quarters of what is free")
 @click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
 @click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
 @click.pass_context
 def compare(
     ctx: click.Context,
-    logs: tuple[Path, ...],
+    logs: tuple[Source, ...],
     methods: str | None,
     out: Path | None,
     gt: str | None,
@@ -56,7 +47,7 @@ def compare(
     settings: Path | None,
     repeat: int,
     time_limit: float | None,
-    memory_limit: float | None,
+    memory_mib: float | None,
     topic: str | None,
     force: bool,
     as_json: bool,
@@ -108,7 +99,7 @@ def compare(
         relations=relations,
         repeat=repeat,
         time_s=time_limit,
-        memory_mib=None if memory_limit is None else _MIB_PER_GIB * memory_limit,
+        memory_mib=memory_mib,
         force=force,
         command=tuple(sys.argv),
     )

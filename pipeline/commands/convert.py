@@ -7,18 +7,20 @@ from pathlib import Path
 
 import click
 
+from pipeline.commands.log_type import LOG
 from pipeline.errors import InputError
+from pipeline.source import Source
 
 
 @click.command()
-@click.argument("source", metavar="SRC", type=click.Path(path_type=Path))
+@click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
 @click.option(
     "--rate", default=0.0, metavar="HZ", help="How often scans come whose files are not named by their stamps."
 )
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def convert(source: Path, destination: Path, rate: float, force: bool, as_json: bool) -> None:
+def convert(source: Source, destination: Path, rate: float, force: bool, as_json: bool) -> None:
     """Write a log of another format as MCAP. The other commands take all of these as they are, too.
 
     \b

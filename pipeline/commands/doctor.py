@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.settings import Override, load_settings
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.logs.doctor import Diagnosis
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def doctor(ctx: click.Context, logs: tuple[Path, ...], topic: str | None, as_json: bool) -> None:
+def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
     """Look at every scan of a log: what is wrong, what it does to the result, and the flag that mends it.
 
     Takes any key of the configuration as a run does, so that you can try whether a flag mends what was found.

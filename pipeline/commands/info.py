@@ -5,23 +5,24 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.settings import load_settings
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.logs.info import LogInfo
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def info(ctx: click.Context, logs: tuple[Path, ...], as_json: bool) -> None:
+def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     """Print what is in a log: topics, types, rates, and what a run with the same flags would use.
 
     \b
@@ -29,6 +30,7 @@ def info(ctx: click.Context, logs: tuple[Path, ...], as_json: bool) -> None:
       scanchain info log.mcap
       scanchain info part_0.mcap part_1.mcap --json
       scanchain info drive.bag --log.topic /lidar_front/points
+      scanchain info https://host/log.mcap
     """
     from pipeline.logs.info import describe
 

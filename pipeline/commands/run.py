@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
+from pipeline.source import Source
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import SinkName, Viewing
@@ -20,7 +22,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make."
 )
@@ -55,7 +57,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.pass_context
 def run(
     ctx: click.Context,
-    logs: tuple[Path, ...],
+    logs: tuple[Source, ...],
     out: Path,
     config: Path | None,
     rerun: str,
@@ -68,8 +70,9 @@ def run(
 ) -> None:
     """Make a trajectory, a map and a recording of a log.
 
-    LOG is an MCAP file, or anything that scanchain convert takes; several are read as one log. Any key of the
-    configuration is a flag, see scanchain config show.
+    LOG is an MCAP file, anything that scanchain convert takes, or the address of such a file: of an MCAP at https://
+    or s3:// only the parts are fetched that are read. Several are read as one log. Any key of the configuration is
+    a flag, see scanchain config show.
 
     \b
     Examples:
@@ -78,6 +81,7 @@ def run(
       scanchain run intel.clf.bz2 --out runs/intel
       scanchain run scans/ --out runs/scans --log.rate_hz 10
       scanchain run part_0.mcap part_1.mcap --out runs/log --topic /lidar_front/points
+      scanchain run s3://bucket/log.mcap --out runs/minute --start 600 --end 660
       scanchain run log.mcap --out runs/log --resume
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json

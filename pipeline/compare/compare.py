@@ -28,6 +28,7 @@ from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
 from pipeline.settings import Override, load_settings
+from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Contest:
     command : the command line, for the report
     """
 
-    logs: tuple[Path, ...]
+    logs: tuple[Source, ...]
     out: Path
     methods: tuple[str, ...] = ()
     settings_file: Path | None = None

@@ -77,7 +77,7 @@ def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
-    stored = memoryview(index.data)[block.offset : block.offset + block.size]
+    stored, crc = index.stored(block)
     size = block.uncompressed_size
     try:
         if not size:
@@ -98,14 +98,14 @@ def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
         raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({_one_line(error)})") from error
     if len(payload) != size:
         raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
-    if block.crc and zlib.crc32(payload) != block.crc:
+    if crc and zlib.crc32(payload) != crc:
         raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
     return payload
 
 
 def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
     """As much as the beginning of a chunk unpacks to; nothing of it has been checked."""
-    stored = memoryview(index.data)[block.offset : block.offset + block.size]
+    stored, _ = index.stored(block)
     try:
         if block.compression == "zstd":
             with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:

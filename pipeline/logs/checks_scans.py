@@ -137,7 +137,9 @@ def _rest(seen: Survey) -> Finding:
         return Finding("rest", Severity.WARNING, found, effect)
     if first_s > _LONG_REST_S:
         effect = "it does no harm, but takes time"
-        return Finding("rest", Severity.NOTE, found, effect, f"--start {np.floor(first_s):g}")
+        return Finding(
+            "rest", Severity.NOTE, found, effect, f"--start {np.floor(seen.into_log_s(rests[0].end_ns)):g}"
+        )
     return Finding("rest", Severity.OK, found)
 
 

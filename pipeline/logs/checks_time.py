@@ -11,7 +11,7 @@ from pipeline.logs.survey import Survey
 
 _GAP_PERIODS = 2.5
 _JITTER = 0.1  # of the period
-_LONG_GAP_S = 0.5
+_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _SLOW_HZ = 4.0
 _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
@@ -47,11 +47,15 @@ def _gaps(seen: Survey) -> Finding:
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
     longest = gaps[np.argmax(steps_s[gaps])]
-    at_s = (seen.log_ns[longest] - seen.log_ns[0]) * 1e-9
-    found = f"{len(gaps)} gaps, the longest {steps_s[longest]:.3g} s, {at_s:.1f} s after the first scan"
-    if steps_s[longest] < _LONG_GAP_S:
-        return Finding("gaps", Severity.NOTE, found, "the motion over them is predicted; short ones do no harm")
-    effect = "the motion over a gap is predicted; after a long one the match may settle at a wrong place"
+    at_s = seen.into_log_s(int(seen.log_ns[longest]))
+    found = (
+        f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
+        f"{at_s:.1f} s into the log"
+    )
+    predicted = f"the motion over a gap is predicted {'by the wheels' if seen.wheels else 'at constant velocity'}"
+    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if seen.wheels else _LONG_GAP_S):
+        return Finding("gaps", Severity.NOTE, found, f"{predicted}; short ones do no harm")
+    effect = f"{predicted}; after a long one the match may settle at a wrong place"
     return Finding(
         "gaps", Severity.WARNING, found, effect, f"--start or --end at {at_s:.1f} s, for the parts apart"
     )

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.logs.opening import index_files, is_mcap
+from pipeline.logs.opening import index_files
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import EVERYTHING
 from pipeline.logs.stream import decoded_messages
 from pipeline.logs.topics import topics_of
 from pipeline.logs.write import LogWriter
+from pipeline.source import Source
 
 _AHEAD = 4  # blocks
 
@@ -28,7 +29,7 @@ class Converted:
 
 
 def convert(
-    sources: Sequence[Path],
+    sources: Sequence[Source],
     destination: Path,
     *,
     rate_hz: float = 0.0,
@@ -39,8 +40,12 @@ def convert(
 
     rate_hz : as for ``index_files``. Raises InputError for what cannot be read or written.
     """
-    _check(sources, destination)
+    if destination.suffix != ".mcap":
+        raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
     indexes = index_files(sources, rate_hz)
+    is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
+    if len(indexes) == 1 and indexes[0].make is None and not is_folder:
+        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(topics_of(indexes), 0)
     damage = [line for index in indexes for line in index.damage]
@@ -58,13 +63,6 @@ def convert(
             )
     notes = tuple(line for index in indexes for line in index.notes)
     return Converted(destination, counts, notes, tuple(damage))
-
-
-def _check(sources: Sequence[Path], destination: Path) -> None:
-    if destination.suffix != ".mcap":
-        raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
-    if len(sources) == 1 and is_mcap(sources[0]):
-        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
 
 
 def _profile(indexes: Sequence[FileIndex]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from pipeline.config import Config, LogConfig
 from pipeline.logs.checks_scans import check_scans
@@ -12,6 +11,7 @@ from pipeline.logs.checks_time import check_time
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.log import open_log
 from pipeline.logs.survey import survey
+from pipeline.source import Source
 
 _ORDER = tuple(reversed(Severity))
 
@@ -28,7 +28,7 @@ class Diagnosis:
 
 
 def examine(
-    paths: Sequence[Path],
+    sources: Sequence[Source],
     config_of: Callable[[int], Config],
     log_config: LogConfig,
     progress: Callable[[int, int], None] | None = None,
@@ -37,7 +37,7 @@ def examine(
 
     config_of : what a run would use for a log of this dimension
     """
-    log = open_log(paths, log_config)
+    log = open_log(sources, log_config)
     notes = tuple(log.notes)
     seen = survey(log, progress)
     findings = [*check_time(seen), *check_scans(seen, config_of(log.dimension).preprocess)]

@@ -14,11 +14,15 @@ from pipeline.errors import InputError
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.resync import Resync, is_end, record_end, vouches_for_itself
 from pipeline.logs.walk import Walk
+from pipeline.source import Source
 
 
-def index_file(path: Path, number: int) -> FileIndex:
-    """Walk one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all."""
-    index = FileIndex(path, number, _map(path))
+def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
+    """Walk one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
+
+    source : what it is a copy of, and is called in what is said of it; None for itself
+    """
+    index = FileIndex(source or path, number, _map(path))
     data, walk, resync = index.data, Walk(index), Resync(index.data)
     offset, end = len(MAGIC), record_end(index.data, len(MAGIC))
     while not is_end(data, offset):
@@ -33,7 +37,9 @@ def index_file(path: Path, number: int) -> FileIndex:
             offset = resumed if 0 < resumed < end else end
         if not resumed:
             break
-        index.damage.append(f"{path}: the record at byte {offset} is damaged; reading went on at byte {resumed}")
+        index.damage.append(
+            f"{index.path}: the record at byte {offset} is damaged; reading went on at byte {resumed}"
+        )
         walk.close(offset, complete=False)
         offset, end = resumed, record_end(data, resumed)
     walk.finish(offset)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
@@ -14,6 +13,7 @@ from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
 from pipeline.logs.sizes import size_of
+from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +51,15 @@ class LogInfo:
     problem: str
 
 
-def describe(paths: Sequence[Path], config: LogConfig | None = None) -> LogInfo:
+def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
     config = config or LogConfig()
-    indexes = index_files(paths, config.rate_hz)
+    indexes = index_files(sources, config.rate_hz)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
     return LogInfo(
-        files=tuple(str(path) for path in paths),
-        size_bytes=sum(size_of(path) for path in paths),
+        files=tuple(str(source) for source in sources),
+        size_bytes=sum(size_of(source) for source in sources),
         start_ns=whole.begin_ns,
         duration_s=whole.duration_s,
         topics=_topics(indexes, whole.duration_s),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -27,6 +26,7 @@ from pipeline.logs.tally import Tally
 from pipeline.logs.told_poses import ToldPoses
 from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
 from pipeline.logs.wheels import WheelTrack
+from pipeline.source import Source, source_of
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
@@ -34,10 +34,10 @@ _HOLD_SCANS = 32
 _REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --topic"
 
 
-def open_log(paths: Path | str | Sequence[Path | str], config: LogConfig = _DEFAULTS) -> Log:
-    """A file or folder, or several as one log, topics chosen. Raises InputError for what cannot be read."""
-    named = [paths] if isinstance(paths, Path | str) else paths
-    return Log(index_files([Path(path) for path in named], config.rate_hz), config)
+def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
+    """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+    named = [sources] if isinstance(sources, Source | str) else sources
+    return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 
 class Log:

@@ -15,6 +15,10 @@ from pipeline.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from pipeline.logs.formats.made import natural_order
 from pipeline.logs.index import index_file
 from pipeline.logs.records import MAGIC, FileIndex
+from pipeline.logs.remote import RemoteFile
+from pipeline.logs.remote_index import index_by_summary
+from pipeline.logs.whole import fetch_whole
+from pipeline.source import Source
 
 Indexer = Callable[[Path, int], FileIndex]
 
@@ -25,29 +29,45 @@ _KNOWN = (
 )
 
 
-def index_files(paths: Sequence[Path], rate_hz: float = 0.0) -> list[FileIndex]:
-    """What lies where in a log's files and folders, every channel known and counted. Raises InputError.
+def index_files(sources: Sequence[Source], rate_hz: float = 0.0) -> list[FileIndex]:
+    """What lies where in a log's files, folders and addresses, every channel known and counted.
+
+    Raises InputError for what is no log, or cannot be read.
 
     rate_hz : at which the files of a folder come whose names tell no time; 0 where that is not known
     """
-    if not paths:
+    if not sources:
         raise InputError("no log was named; give at least one file or folder")
-    files = [part for path in paths for part in _parts(path)]
-    indexes = [_indexer(path, rate_hz)(path, number) for number, path in enumerate(files)]
+    files = [part for source in sources for part in _parts(source)]
+    indexes = [_index(source, number, rate_hz) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
     return indexes
 
 
-def is_mcap(path: Path) -> bool:
-    """Whether a file begins as MCAP does."""
-    return path.is_file() and _head(path).startswith(MAGIC)
+def _index(source: Source, number: int, rate_hz: float) -> FileIndex:
+    if isinstance(source, Path):
+        return _indexer(source, rate_hz)(source, number)
+    file = RemoteFile(source)
+    index = index_by_summary(file, number) if file.has_ranges else None
+    return index or _index_whole(file, number)
 
 
-def _parts(path: Path) -> list[Path]:
-    """The files of a folder that holds the parts of a log, in the order of their names; else the path itself."""
-    if not path.is_dir():
-        return [path]
+def _index_whole(file: RemoteFile, number: int) -> FileIndex:
+    """That of a copy of a remote file which has no index to read it by."""
+    copy = fetch_whole(file)
+    indexer = _file_indexer(copy)
+    index = index_file(copy, number, file.address) if indexer is index_file else indexer(copy, number)
+    why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
+    index.notes.insert(0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were fetched")
+    return index
+
+
+def _parts(source: Source) -> Sequence[Source]:
+    """The files of a folder that holds the parts of a log, in the order of their names; else the source itself."""
+    if not isinstance(source, Path) or not source.is_dir():
+        return [source]
+    path = source
     if (path / "metadata.yaml").is_file():
         return parts_of_bag(path)
     for suffix in _PART_SUFFIXES:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
+
+from pipeline.logs.read_ahead import ReadAhead
+from pipeline.source import Source
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
@@ -16,6 +18,8 @@ STATISTICS, DATA_END = 0x0B, 0x0F
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
+_CRC = struct.Struct("<I")
+_CRC_AT = RECORD.size + 24  # of a chunk record
 _LONGEST_STRING = 1 << 16  # bytes; a longer name is damage
 
 
@@ -65,7 +69,8 @@ class Block:
     Attributes
     ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked
+    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked, None that the chunk's head
+        has to be read for it
     start_ns, end_ns : log time of the first and last message
     entries : the channels in it; empty where the file does not say
     """
@@ -75,12 +80,17 @@ class Block:
     size: int
     compression: str
     uncompressed_size: int
-    crc: int
+    crc: int | None
     start_ns: int
     end_ns: int
     entries: tuple[Entry, ...] = ()
     is_chunk: bool = True
     is_cut: bool = False
+
+    @property
+    def chunk_offset(self) -> int:
+        """Where the record of a chunk begins, its head included."""
+        return self.offset - (_CRC_AT + 16 + len(self.compression) if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
@@ -95,16 +105,17 @@ class FileIndex:
     Attributes
     ----------
     number : its place among the files of the log
-    data : the bytes of an MCAP file; of another format ``make`` makes the contents of a block, of all channels or
-        of those wanted
+    data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
+        makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
     doubted : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
     is_trusted : whether what blocks say about their channels agrees with what the file says about itself
     """
 
-    path: Path
+    path: Source
     number: int
     data: mmap.mmap | bytes
+    remote: ReadAhead | None = None
     make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
     profile: str = ""
     library: str = ""
@@ -118,6 +129,25 @@ class FileIndex:
     doubted: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def stored(self, block: Block) -> tuple[memoryview, int]:
+        """A block's bytes as the file holds them, and the CRC-32 of what they unpack to, 0 for unchecked."""
+        if block.crc is not None:
+            return self.bytes_at(block.offset, block.size), block.crc
+        head = block.offset - block.chunk_offset
+        record = self.bytes_at(block.chunk_offset, head + block.size)
+        return record[head:], _CRC.unpack_from(record, _CRC_AT)[0]
+
+    def bytes_at(self, offset: int, size: int) -> memoryview:
+        """A part of an MCAP file, wherever it lies."""
+        if self.remote is None:
+            return memoryview(self.data)[offset : offset + size]
+        return self.remote.read(offset, size)
+
+    def expect(self, blocks: Iterable[Block]) -> None:
+        """Take note of which blocks will be read next, in this order."""
+        if self.remote is not None:
+            self.remote.expect([(block.chunk_offset, block.offset + block.size) for block in blocks])
 
     def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
         """Take in the schema record whose body starts at the offset."""

@@ -28,6 +28,10 @@ class Span(NamedTuple):
         """Whether the block may hold messages of the span."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
+    def covers(self, block: Block) -> bool:
+        """Whether all messages of the block lie in the span."""
+        return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
+
 
 EVERYTHING = Span(0, (1 << 64) - 1)
 
@@ -55,6 +59,9 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     for index in indexes:
         for number in (number for number, channel in index.channels.items() if channel.topic == topic):
             for block in filter(span.meets, index.blocks):
+                if block.entries and span.covers(block):
+                    count += sum(entry.messages for entry in block.entries if entry.channel == number)
+                    continue
                 times_ns = log_times(index, block, number)
                 count += int(np.count_nonzero((times_ns >= span.begin_ns) & (times_ns <= span.end_ns)))
     return count

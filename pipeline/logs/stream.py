@@ -56,6 +56,8 @@ def decoded_messages(
         if span.meets(block) and index.may_hold(block, wanted[block.file])
     ]
     blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
+    for index in indexes:
+        index.expect(block for block in blocks if block.file == index.number)
     waiting: list[tuple[int, int, int, int, Decoded]] = []
     results = _ahead(blocks, decode, ahead, damage)
     for (block, following), messages in zip(pairwise([*blocks, None]), results, strict=True):

@@ -15,6 +15,7 @@ from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
 from pipeline.logs.rest import Rest, RestWatch
 from pipeline.logs.scan_facts import ScanFacts, facts_of
+from pipeline.logs.selection import whole_span
 from pipeline.logs.stream import decoded_messages
 
 _FORGOTTEN = np.empty(0)
@@ -53,6 +54,10 @@ class Survey:
             if len(steps_s) and np.median(steps_s) > 0.0:
                 return float(np.median(steps_s))
         return 0.0
+
+    def into_log_s(self, log_time_ns: int) -> float:
+        """Seconds after the log's first message, as ``--start`` and ``--end`` count."""
+        return (log_time_ns - whole_span(self.log.indexes).begin_ns) * 1e-9
 
     def share(self, part: Callable[[ScanFacts], int]) -> float:
         """A count of beams over all beams of all scans."""

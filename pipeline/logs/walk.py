@@ -27,7 +27,7 @@ from pipeline.logs.records import (
 )
 from pipeline.logs.resync import CHUNK_HEAD, is_end
 
-_FOOTER = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
+FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
 
 _LARGEST_CHUNK = 1 << 30  # bytes; a size beyond is taken for damage, not believed
 _MODEST_CHUNK = 1 << 25  # bytes; a larger one is believed where it is at most
@@ -138,7 +138,7 @@ class Walk:
         if opcode == DATA_END:
             self.is_doubtful = not _is_summary_sound(self.index, body + length)
         elif opcode == FOOTER:
-            self.index.has_summary = _FOOTER.unpack_from(self.index.data, body)[0] > 0
+            self.index.has_summary = FOOTER_BODY.unpack_from(self.index.data, body)[0] > 0
         elif opcode == HEADER:
             self.index.profile, body = read_string(self.index.data, body)
             self.index.library, _ = read_string(self.index.data, body)
@@ -172,7 +172,7 @@ class Walk:
         start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(index.data, body)
         compression, records = read_string(index.data, body + CHUNK_HEAD.size)
         size = body + length - records - 8
-        if uncompressed > min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK):
+        if not is_believable(size, uncompressed):
             index.damage.append(
                 f"{index.path}: the chunk at byte {offset} claims to unpack from {size} to {uncompressed} bytes, "
                 f"more than is believed, and was left out"
@@ -191,14 +191,19 @@ class Walk:
         self.index.is_counted = True
 
 
+def is_believable(size: int, uncompressed: int) -> bool:
+    """Whether a chunk of so many bytes may be as large as it claims once it is unpacked."""
+    return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
+
+
 def _is_summary_sound(index: FileIndex, summary: int) -> bool:
     """Whether the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
     data = index.data
-    footer = len(data) - len(MAGIC) - _FOOTER.size - RECORD.size
+    footer = len(data) - len(MAGIC) - FOOTER_BODY.size - RECORD.size
     if footer < summary or data[-len(MAGIC) :] != MAGIC or data[footer] != FOOTER:
         return False
-    crc = _FOOTER.unpack_from(data, footer + RECORD.size)[2]
-    if not crc or zlib.crc32(data[summary : footer + RECORD.size + _FOOTER.size - 4]) == crc:
+    crc = FOOTER_BODY.unpack_from(data, footer + RECORD.size)[2]
+    if not crc or zlib.crc32(data[summary : footer + RECORD.size + FOOTER_BODY.size - 4]) == crc:
         return True
     index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was not believed")
     return False

@@ -14,7 +14,10 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from pipeline.errors import InputError
+from pipeline.logs.remote import RemoteFile
 from pipeline.logs.sizes import files_of, size_of
+from pipeline.source import Source, without_keys
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22
@@ -23,12 +26,14 @@ _BLOCK = 1 << 22
 class LogFile(Struct, frozen=True):
     """A file or folder that was read; ``sha256`` is empty until it is known.
 
-    That of a folder is taken over its files in the order of their names, each as its name and its contents.
+    That of a folder is taken over its files in the order of their names, each as its name and its contents. A
+    remote file, which need not be read whole, has its ETag or the time of its last change as ``version`` instead.
     """
 
     path: str
     size_bytes: int
     sha256: str
+    version: str = ""
 
 
 class Provenance(Struct, frozen=True):
@@ -64,15 +69,15 @@ class Provenance(Struct, frozen=True):
         )
 
 
-def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: str) -> Provenance:
+def describe_start(command: Sequence[str], logs: Sequence[Source], configuration: str) -> Provenance:
     """What is known when a run starts."""
     return Provenance(
         complete=False,
         stopped="",
-        command=list(command),
+        command=without_keys(command),
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         duration_s=0.0,
-        logs=[LogFile(str(path.resolve()), size_of(path), "") for path in logs],
+        logs=[_log_file(source) for source in logs],
         configuration=configuration,
         python=platform.python_version(),
         platform=platform.platform(),
@@ -81,12 +86,19 @@ def describe_start(command: Sequence[str], logs: Sequence[Path], configuration: 
     )
 
 
+def _log_file(source: Source) -> LogFile:
+    if isinstance(source, Path):
+        return LogFile(str(source.resolve()), size_of(source), "")
+    file = RemoteFile(source)
+    return LogFile(str(source), file.size, "", file.version)
+
+
 class Hashing:
     """SHA-256 of files, computed in a thread beside the run; a context manager."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = tuple(paths)
-        self._digests: dict[Path, str] = {}
+    def __init__(self, sources: Sequence[Source]) -> None:
+        self._sources = tuple(sources)
+        self._digests: dict[Source, str] = {}
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._work, name="log hash", daemon=True)
 
@@ -99,13 +111,14 @@ class Hashing:
         self._thread.join()
 
     def digests(self) -> list[str]:
-        """The hashes, in the order of the paths, waited for."""
+        """The hashes, in the order of the sources, waited for; those of remote files are empty."""
         self._thread.join()
-        return [self._digests.get(path, "") for path in self._paths]
+        return [self._digests.get(source, "") for source in self._sources]
 
     def _work(self) -> None:
-        for path in self._paths:
-            self._digests[path] = sha256_of(path, self._cancelled)
+        for source in self._sources:
+            if isinstance(source, Path):
+                self._digests[source] = sha256_of(source, self._cancelled)
 
 
 def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
@@ -123,6 +136,18 @@ def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
     except OSError:
         return ""
     return digest.hexdigest()
+
+
+def identity_of(source: Source) -> str:
+    """SHA-256 of a file or folder, of a remote file of its address, size and version; empty where unreadable."""
+    if isinstance(source, Path):
+        return sha256_of(source)
+    try:
+        file = RemoteFile(source)
+    except InputError:
+        return ""
+    address = str(source) if file.version else source.url
+    return hashlib.sha256(f"{address}\0{file.size}\0{file.version}".encode()).hexdigest()
 
 
 def package_version(package: str) -> str:

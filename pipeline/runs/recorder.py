@@ -15,6 +15,7 @@ from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
 
 if TYPE_CHECKING:
+    from pipeline.batch.task import Row
     from pipeline.graph.optimisation import GraphChange
     from pipeline.landmarks.study import Study
 
@@ -89,6 +90,7 @@ class Viewing:
 
     ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
     ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
+    ``present_batch`` adds a page on the rows that a command made;
     ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording;
     ``present_landmarks`` studies of landmark problems, as pictures and a page, in a directory;
     ``record_landmarks`` before and after to a recording.
@@ -98,6 +100,7 @@ class Viewing:
     show: Callable[[Path, bool], None]
     draw: Callable[[Path, Path], None]
     report: Callable[[Path], None]
+    present_batch: Callable[[Path, Sequence[Row], Sequence[str]], None]
     present_comparison: Callable[[Path], None]
     draw_graph: Callable[[GraphChange, Path], None]
     record_graph: Callable[[GraphChange, Path], None]

@@ -32,6 +32,7 @@ from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.settings import Override, dump, load_settings
 from pipeline.slam import Slam, SlamResult
+from pipeline.source import Source
 from pipeline.trajectory import read_tum, write_tum
 
 TRUTH_FILE = "ground_truth.tum"
@@ -58,7 +59,7 @@ class Job:
     command : the command line, for run.json
     """
 
-    logs: tuple[Path, ...]
+    logs: tuple[Source, ...]
     out: Path
     config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
@@ -125,11 +126,11 @@ def run(
     return Finished(directory.path, metrics, text, warnings, stopped)
 
 
-def _check_distinct(paths: tuple[Path, ...]) -> None:
+def _check_distinct(sources: tuple[Source, ...]) -> None:
     """Refuse a file named twice: each of its scans would come twice."""
-    for path, count in Counter(path.resolve() for path in paths).items():
+    for source, count in Counter(source.resolve() for source in sources).items():
         if count > 1:
-            raise InputError(f"{path}: is named {count} times; name each file of a log once")
+            raise InputError(f"{source}: is named {count} times; name each file of a log once")
 
 
 def _check_prior(log: Log, config: Config) -> None:

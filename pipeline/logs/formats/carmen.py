@@ -20,6 +20,7 @@ from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, re
 from pipeline.logs.formats.made import made_block, made_channel, made_index
 from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
+from pipeline.source import Source
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans
@@ -141,7 +142,7 @@ class _Carmen:
             self.index.notes.append(f"{self.index.path}: lines of kinds that are not read: {listed}")
 
 
-def _complaint(path: Path, malformed: list[int]) -> str:
+def _complaint(path: Source, malformed: list[int]) -> str:
     if not malformed:
         return ""
     return f"{path}: {len(malformed)} malformed lines were left out (the first: line {malformed[0]})"

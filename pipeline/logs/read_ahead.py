@@ -1,0 +1,87 @@
+"""Byte ranges of a remote file that are known to be wanted: fetched in large pieces, ahead of who reads them."""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from typing import NamedTuple
+
+_PIECE_BYTES = 4_000_000  # neighbours are fetched together up to this size
+_GAP_BYTES = 65_536  # read along with what lies on both sides of it, as asking anew takes longer
+_AHEAD = 3  # pieces
+_KEPT = 2  # pieces behind, as threads that read them overtake each other
+_REPEATED = 4  # ranges that nobody told of are kept: the first blocks are looked at more than once
+
+
+class Piece(NamedTuple):
+    """Bytes that are fetched at once."""
+
+    begin: int
+    end: int
+
+
+class ReadAhead:
+    """Reads ranges with ``fetch(offset, size)``, those that were told before in the order in which they were."""
+
+    def __init__(self, fetch: Callable[[int, int], bytes]) -> None:
+        self.fetch = fetch
+        self.fetch_alone = lru_cache(_REPEATED)(fetch)
+        self.pieces: list[Piece] = []
+        self.by_begin: list[
+            tuple[int, int]
+        ] = []  # byte at which a piece begins, its place in the order of reading
+        self.coming: dict[int, Future[bytes]] = {}
+        self.lock = threading.Lock()
+        self.pool = ThreadPoolExecutor(_AHEAD, thread_name_prefix="scanchain-fetch")
+
+    def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Take note of what will be read next: first byte and the one behind the last, in the order of reading."""
+        with self.lock:
+            self.pieces = merged(ranges)
+            self.by_begin = sorted((piece.begin, place) for place, piece in enumerate(self.pieces))
+            self.coming = {}
+
+    def read(self, offset: int, size: int) -> memoryview:
+        """So many bytes from the offset on; what nobody told of before is fetched by itself."""
+        with self.lock:
+            place = self._place_of(offset, size)
+            if place is None:
+                begin, coming = offset, None
+            else:
+                begin, coming = self.pieces[place].begin, self._ask_for(place)
+        data = self.fetch_alone(offset, size) if coming is None else coming.result()
+        return memoryview(data)[offset - begin : offset - begin + size]
+
+    def _place_of(self, offset: int, size: int) -> int | None:
+        """Which piece the bytes lie in."""
+        found = bisect_right(self.by_begin, (offset, len(self.pieces))) - 1
+        if found < 0:
+            return None
+        place = self.by_begin[found][1]
+        return place if offset + size <= self.pieces[place].end else None
+
+    def _ask_for(self, place: int) -> Future[bytes]:
+        """The piece of a place; those that follow are asked for as well, those passed forgotten."""
+        for number in range(place, min(place + 1 + _AHEAD, len(self.pieces))):
+            if number not in self.coming:
+                piece = self.pieces[number]
+                self.coming[number] = self.pool.submit(self.fetch, piece.begin, piece.end - piece.begin)
+        for number in [number for number in self.coming if number < place - _KEPT]:
+            del self.coming[number]
+        return self.coming[place]
+
+
+def merged(ranges: Iterable[tuple[int, int]]) -> list[Piece]:
+    """Ranges joined with those that follow close behind, up to the size of a piece."""
+    pieces: list[Piece] = []
+    for begin, end in ranges:
+        last = pieces[-1] if pieces else Piece(0, -_GAP_BYTES - 1)
+        is_close = last.end <= begin <= last.end + _GAP_BYTES and end - last.begin <= _PIECE_BYTES
+        if is_close:
+            pieces[-1] = Piece(last.begin, end)
+        else:
+            pieces.append(Piece(begin, end))
+    return pieces

@@ -1,0 +1,140 @@
+"""Bytes of a file that lies elsewhere, by ranges, through fsspec: S3, HTTP and whatever else it knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import sleep
+from typing import Any, TypeVar
+
+from pipeline.errors import InputError, MissingExtraError
+from pipeline.source import Address
+
+T = TypeVar("T")
+
+_ATTEMPTS = 4
+_PAUSE_S = 0.5  # after the first failure; twice as long after each further one
+_CONNECT_S, _SILENCE_S = 10.0, 30.0  # before a server counts as gone
+_ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
+
+
+class RemoteFile:
+    """A file at an address.
+
+    Attributes
+    ----------
+    size : bytes, 0 where the server does not say
+    version : its ETag or when it was last changed, empty where the server does not say
+    has_ranges : whether parts of it can be asked for
+    """
+
+    def __init__(self, address: Address) -> None:
+        """Ask for it. Raises InputError where it is not there, or not for us; MissingExtraError without fsspec."""
+        self.address = address
+        self._system, self._path = _system_of(address)
+        facts = _patient(lambda: self._system.info(self._path), str(address))
+        if facts["type"] != "file":
+            raise InputError(f"{address}: is a folder; name the files of a remote log one by one")
+        if facts.get("size") == 0:
+            raise InputError(f"{address}: is empty (0 bytes); record or copy it again")
+        self.size = int(facts.get("size") or 0)
+        told = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
+        self.version = str(next(filter(None, told), ""))
+        self.has_ranges = self.size > 0 and facts.get("partial", True) and self._tries_range()
+
+    def read(self, offset: int, size: int) -> bytes:
+        """So many bytes from the offset on. Raises InputError where they do not come, asked several times."""
+
+        def ask() -> bytes:
+            data: bytes = self._system.cat_file(self._path, start=offset, end=offset + size)
+            if len(data) != size:
+                raise ConnectionError(f"{len(data)} bytes came instead of {size}")
+            return data
+
+        return _patient(ask, f"{self.address}: byte {offset}") if size else b""
+
+    def _tries_range(self) -> bool:
+        """Whether the last byte comes alone; a web server that knows no ranges would send everything."""
+
+        def ask() -> bool:
+            try:
+                with self._system.open(self._path, "rb", cache_type="none") as file:
+                    file.seek(self.size - 1)
+                    return len(file.read(1)) == 1
+            except ValueError:
+                return False
+
+        return _patient(ask, str(self.address))
+
+
+def matching(pattern: Address) -> list[Address]:
+    """The addresses that a pattern with * stands for, in the order of their names."""
+    system, path = _system_of(pattern)
+    found = _patient(lambda: system.glob(path), str(pattern))
+    return [Address(system.unstrip_protocol(each)) for each in sorted(found)]
+
+
+def _system_of(address: Address) -> tuple[Any, str]:
+    """What fsspec reads the address with, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError:
+        raise MissingExtraError("fsspec", "remote") from None
+    options = {}
+    if address.url.lower().startswith(("http://", "https://")):
+        options = {"client_kwargs": {"timeout": _web_timeout()}}
+    try:
+        return url_to_fs(address.url, **options)
+    except ImportError as error:
+        raise InputError(f"{address}: {error}") from None
+    except ValueError as error:
+        raise InputError(f"{address}: {error}; give a path, s3:// or https://") from None
+
+
+def _web_timeout() -> Any:
+    """Not on the whole answer, which may be large, but on silence."""
+    try:
+        from aiohttp import ClientTimeout
+    except ImportError:
+        raise MissingExtraError("aiohttp", "remote") from None
+    return ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)
+
+
+def _patient(ask: Callable[[], T], what: str) -> T:
+    """The answer, asked for again where that may help."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            return ask()
+        except Exception as error:  # each file system raises what the libraries below it raise
+            reason = _reason(error)
+            if hopeless := _hopeless(error):
+                raise InputError(f"{what}: {hopeless} ({reason})") from error
+            if attempt == _ATTEMPTS:
+                raise InputError(f"{what}: cannot be read ({reason}); asked {_ATTEMPTS} times") from error
+            sleep(_PAUSE_S * 2 ** (attempt - 1))
+    raise AssertionError
+
+
+def _hopeless(error: Exception) -> str:
+    """What to do instead of asking again, empty where asking again may help."""
+    status = _status(error)
+    if status in _ABSENT or (isinstance(error, FileNotFoundError) and error.__cause__ is None):
+        return "no such file; check the address"
+    if status in _REFUSED or isinstance(error, PermissionError) or type(error).__name__ == "NoCredentialsError":
+        return (
+            "may not be read; for s3:// set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
+            "FSSPEC_S3_ANON=1 for a public bucket, for https:// give user:password@host or a signed address"
+        )
+    return "the server refuses it; check the address" if 400 <= status < 500 and status not in _PASSING else ""
+
+
+def _status(error: Exception) -> int:
+    """The HTTP status that an error stands for, 0 without one."""
+    return int(getattr(error.__cause__ or error, "status", 0) or 0)
+
+
+def _reason(error: Exception) -> str:
+    cause, status = error.__cause__ or error, _status(error)
+    if isinstance(cause, FileNotFoundError):
+        return "not found"  # its text would be the address, keys and all
+    text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
+    return " ".join(text.split()) or type(cause).__name__

@@ -1,0 +1,56 @@
+"""Where a log lies: a path on this machine, or an address."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote, urlsplit
+from urllib.request import url2pathname
+
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A file that is read over the network. As text it is without password and query, which may hold keys."""
+
+    url: str
+
+    def __str__(self) -> str:
+        parts = urlsplit(self.url)
+        return parts._replace(netloc=parts.netloc.rpartition("@")[2], query="", fragment="").geturl()
+
+    @property
+    def name(self) -> str:
+        """The last part of its path."""
+        return PurePosixPath(unquote(urlsplit(self.url).path)).name
+
+    @property
+    def stem(self) -> str:
+        """Its name without the last suffix."""
+        return PurePosixPath(self.name).stem
+
+    def resolve(self) -> Address:
+        """Itself: it is the same from everywhere."""
+        return self
+
+
+Source = Path | Address
+
+
+def without_keys(words: Sequence[str]) -> list[str]:
+    """The words of a command line, addresses as they may be shown."""
+    return [str(source_of(word)) if "://" in word else word for word in words]
+
+
+def source_of(named: Source | str) -> Source:
+    """What a text names: an address where it begins with ``s3://`` or the like, else a path."""
+    if not isinstance(named, str):
+        return named
+    if not _SCHEME.match(named):
+        return Path(named)
+    if named.lower().startswith("file://"):
+        return Path(url2pathname(urlsplit(named).path))
+    return Address(named)

@@ -1,0 +1,149 @@
+"""report.html of a batch: a row a log, the spread of the figures, every way in small."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.batch.table import totals
+from pipeline.batch.task import Row
+from pipeline.runs.metrics import Metrics
+from pipeline.source import source_of, without_keys
+from pipeline.trajectory import read_tum
+from viz import report
+from viz.courses import colour_of
+from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
+from viz.sheet import Sheet
+
+_MOST_WAYS = 60
+_MAX_POINTS = 1500  # of a line
+_HEADS = (
+    Head("log"),
+    Head("scans"),
+    Head("lost"),
+    Head("way", "m"),
+    Head("loops", "", "loop closures accepted"),
+    Head("inliers", "%", "median over the scans"),
+    Head("residual", "mm", "median over the scans"),
+    Head("ATE", "m", "rmse against the ground truth in the log, after optimisation"),
+    Head("KITTI", "%", "translational error of the KITTI metric"),
+    Head("speed", "× real time"),
+    Head("time", "s", "of the whole process"),
+    Head("memory", "MiB", "most that the process had"),
+)
+
+
+def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
+    """Draw and write the page; runs are looked up in the directory."""
+    done = [row for row in rows if row.metrics is not None]
+    missing = len(rows) - len(done)
+    page = Page(
+        title=f"Batch of {len(rows):,} logs",
+        subtitle="Each was run in a process of its own.",
+        facts=tuple(totals(rows)),
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) if missing else (),
+        notes=(),
+        sections=(_logs(rows), *_spread(done), *_ways(directory, done)),
+        folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),
+    )
+    write_page(directory / REPORT_FILE, page)
+
+
+def _logs(rows: Sequence[Row]) -> Section:
+    legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
+    return Section("Logs", grid=Grid(_HEADS, tuple(map(_row, rows)), legend))
+
+
+def _row(row: Row) -> report.Row:
+    """The figures of a log, or why it has none."""
+    m = row.metrics
+    if m is None:
+        return report.Row(_name(row), (Cell(f"{row.state}: {row.reason}", is_wide=True),))
+    truth = None if m.ground_truth is None else m.ground_truth.optimised
+    figures = (
+        f"{m.scans:,}",
+        f"{m.lost:,}",
+        f"{m.travelled_m:,.1f}",
+        f"{m.closures_accepted:,}",
+        f"{100.0 * m.median_inlier_share:.0f}",
+        _figure(m.median_residual_m, 1e3, 1),
+        _figure(None if truth is None else truth.ate_rmse_m, 1.0, 4),
+        _figure(None if truth is None else truth.kitti_translation_share, 100.0, 3),
+        f"{m.times_real_time:.1f}",
+        f"{row.duration_s:.1f}",
+        f"{row.peak_mib:,.0f}",
+    )
+    return report.Row(_name(row), tuple(map(Cell, figures)))
+
+
+def _figure(value: float | None, scale: float, digits: int) -> str:
+    return "–" if value is None else f"{scale * value:.{digits}f}"
+
+
+def _name(row: Row) -> str:
+    return source_of(row.log).name
+
+
+def _paths(row: Row) -> str:
+    return f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}"
+
+
+def _spread(done: Sequence[Row]) -> Iterator[Section]:
+    """How the figures of the logs spread, where there are some to compare."""
+    drawn = (
+        ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimised.ate_rmse_m),
+        ("Speed", "× real time", lambda row, m: m.times_real_time),
+        ("Memory", "MiB", lambda row, m: row.peak_mib),
+    )
+    drawings = [
+        Drawing(title, "", _sorted_values(title, unit, values))
+        for title, unit, figure in drawn
+        if len(values := _values(done, figure)) > 1
+    ]
+    if drawings:
+        yield Section("Spread", "Every log's figure, the least first.", drawings=tuple(drawings), is_small=True)
+
+
+def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None]) -> list[float]:
+    found = (figure(row, row.metrics) for row in done if row.metrics is not None)
+    return sorted(value for value in found if value is not None)
+
+
+def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
+    with Sheet(name) as sheet:
+        share = 100.0 * (np.arange(len(values)) + 1) / len(values)
+        sheet.axes.step(values, share, where="post", color=colour_of(0), marker="o", markersize=2.5)
+        sheet.axes.set_xlim(left=0.0)
+        sheet.axes.set_ylim(0.0, 105.0)
+        sheet.axes.set_xlabel(f"{name} [{unit}]")
+        sheet.axes.set_ylabel("logs at most so [%]")
+        sheet.axes.grid(visible=True)
+        return sheet.svg()
+
+
+def _ways(directory: Path, done: Sequence[Row]) -> Iterator[Section]:
+    """Every way from above, as far as a page can hold them."""
+    drawings = [
+        Drawing(_name(row), f"{row.run}", _way(row.key, directory / row.run / "trajectory.tum"))
+        for row in done[:_MOST_WAYS]
+    ]
+    text = f"The first {_MOST_WAYS} of {len(done):,}." if len(done) > _MOST_WAYS else ""
+    if drawings:
+        yield Section("Ways, optimised, seen from above", text, drawings=tuple(drawings), is_small=True)
+
+
+def _way(name: str, trajectory: Path) -> Markup:
+    positions = read_tum(trajectory).poses[:, :2, -1]
+    rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
+    with Sheet(name, height_inches=3.6) as sheet:
+        sheet.axes.plot(*positions[rows].T, color=colour_of(0))
+        sheet.axes.plot(*positions[0], color=colour_of(0), marker="o", markersize=4.0)
+        sheet.axes.set_aspect("equal", adjustable="datalim")
+        sheet.axes.set_xlabel("x [m]")
+        sheet.axes.set_ylabel("y [m]")
+        sheet.axes.grid(visible=True)
+        return sheet.svg()
