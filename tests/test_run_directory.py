@@ -186,6 +186,7 @@ def test_a_run_says_that_it_is_complete_and_what_it_read(tmp_path, office):
             "path": str(office),
             "size_bytes": office.stat().st_size,
             "sha256": hashlib.sha256(office.read_bytes()).hexdigest(),
+            "version": "",
         }
     ]
     assert said["versions"]["numpy"] == np.__version__ and said["duration_s"] > 0.0
