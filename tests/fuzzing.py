@@ -72,7 +72,7 @@ def mutants(seed, rng, count):
     """Cuts at every boundary of its records and beside them, then ``count`` random ones."""
     for record in seed.records:
         for length in (record.begin, record.begin + 1, record.begin + 9, record.end - 1):
-            yield cut_at(seed, length)
+            yield cut_at(seed.data, length)
     for _ in range(count):
         yield mutant(seed, rng)
 
@@ -80,7 +80,7 @@ def mutants(seed, rng, count):
 def complaint(seed, damaged, path):
     """What is wrong with how a damaged file is read, empty where nothing is."""
     path.write_bytes(damaged.data)
-    before = _peak_bytes()
+    before = peak_bytes()
     try:
         with at_most(LONGEST_S):
             scans, told = read(path)
@@ -88,8 +88,8 @@ def complaint(seed, damaged, path):
         return f"takes more than {LONGEST_S} s"
     except Exception:
         return traceback.format_exc()
-    if _peak_bytes() - before > MOST_BYTES:
-        return f"took {(_peak_bytes() - before) >> 20} MB more"
+    if peak_bytes() - before > MOST_BYTES:
+        return f"took {(peak_bytes() - before) >> 20} MB more"
     return _verdict(seed, damaged, scans, told)
 
 
@@ -124,7 +124,7 @@ def payload_complaints(folder, rng, count):
     for number in range(count):
         channel, data, decode = said[number % len(said)]
         changed = mutated_message(data, rng)
-        before = _peak_bytes()
+        before = peak_bytes()
         try:
             with at_most(LONGEST_S), np.errstate(all="ignore"):
                 decode(memoryview(changed))
@@ -135,8 +135,8 @@ def payload_complaints(folder, rng, count):
             yield f"{channel.type_name}: takes more than {LONGEST_S} s: {changed!r}"
         except Exception:
             yield f"{channel.type_name} in {channel.encoding}: {changed!r}\n{traceback.format_exc()}"
-        if _peak_bytes() - before > MOST_BYTES:
-            yield f"{channel.type_name}: took {(_peak_bytes() - before) >> 20} MB: {changed!r}"
+        if peak_bytes() - before > MOST_BYTES:
+            yield f"{channel.type_name}: took {(peak_bytes() - before) >> 20} MB: {changed!r}"
 
 
 def _messages(folder):
@@ -199,7 +199,7 @@ def _content(scan):
     return scan.stamp_ns, scan.points.tobytes()
 
 
-def _peak_bytes():
+def peak_bytes():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 

@@ -61,10 +61,18 @@ def test_a_file_that_is_no_log(tmp_path, content):
     says(complaint(tmp_path / "a.mcap"), "is no log that is known", repr(content[:8]), "give MCAP")
 
 
-@pytest.mark.parametrize("content", [b"#ROSBAG V2.0\n" * 10, b"#ROSBAG V1.2\n", b"SQLite format 3\0"])
-def test_a_bag_that_is_none(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"#ROSBAG V2.0\n", "holds: none"),
+        (b"#ROSBAG V2.0\n" * 10, "damaged to its end, at byte 13"),
+        (b"#ROSBAG V1.2\n", "rosbag migrate"),
+        (b"SQLite format 3\0", "cannot be read as a ROS bag"),
+    ],
+)
+def test_a_bag_that_is_none(tmp_path, content, said):
     (tmp_path / "a.mcap").write_bytes(content)
-    says(complaint(tmp_path / "a.mcap"), "cannot be read as a ROS bag", "reindex")
+    says(complaint(tmp_path / "a.mcap"), said)
 
 
 def test_the_magic_and_nothing_else(tmp_path):

@@ -172,7 +172,7 @@ class Walk:
         start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(index.data, body)
         compression, records = read_string(index.data, body + CHUNK_HEAD.size)
         size = body + length - records - 8
-        if uncompressed > min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK):
+        if not is_believable(size, uncompressed):
             index.damage.append(
                 f"{index.path}: the chunk at byte {offset} claims to unpack from {size} to {uncompressed} bytes, "
                 f"more than is believed, and was left out"
@@ -189,6 +189,11 @@ class Walk:
             self.index.counts[number] = count
         (self.chunks_told,) = struct.unpack_from("<I", data, body + 22)
         self.index.is_counted = True
+
+
+def is_believable(size: int, uncompressed: int) -> bool:
+    """Whether a chunk of so many bytes may be as large as it claims once it is unpacked."""
+    return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
 
 
 def _is_summary_sound(index: FileIndex, summary: int) -> bool:
