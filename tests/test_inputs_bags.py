@@ -141,9 +141,9 @@ def test_a_bag_whose_recording_never_ended_is_read_whole(tmp_path):
 
 
 def test_a_damaged_chunk_of_a_bag_is_left_out_and_told(tmp_path):
-    path, sweeps = many_chunks(tmp_path, "LZ4")
+    path, sweeps = many_chunks(tmp_path, "BZ2")
     content = bytearray(path.read_bytes())
-    content[content.index(b"compression=lz4", len(content) // 2) + 300] ^= 1
+    content[content.index(b"compression=bz2", len(content) // 2) + 300] ^= 1
     path.write_bytes(content)
     log = open_log(path)
     scans = list(log.scans())

@@ -27,8 +27,8 @@ from pipeline.logs.formats.ros1_bag_records import (
     MESSAGE,
     Record,
     as_ns,
+    channel_of,
     next_record,
-    read_fields,
     read_record,
     whole_records,
 )
@@ -106,14 +106,14 @@ class _Bag:
             payload = unpack(self.index, block)
             for record in whole_records(payload):
                 if record.opcode == CONNECTION:
-                    self._connection(record, payload)
+                    self._define(channel_of(self.index.number, record, payload))
                 elif record.opcode == MESSAGE:
                     number, time_ns = record.number(b"conn"), record.time_ns(b"time")
                     channel = self.index.channels.get(number)
                     strangers += channel is None
                     if channel is not None and (wanted is None or number in wanted):
                         messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
-        except (struct.error, KeyError):
+        except struct.error:
             damage = f"{name}: a record in it is malformed; what follows was left out"
             return Contents(messages, "" if block.is_cut else damage)
         return Contents(messages, f"{name}: {strangers} messages name no known connection" if strangers else "")
@@ -124,7 +124,7 @@ class _Bag:
     def _take(self, record: Record) -> None:
         try:
             self._sort(record)
-        except (struct.error, ValueError, KeyError):
+        except (struct.error, ValueError):
             self.index.damage.append(
                 f"{self.index.path}: the record at byte {record.offset} is malformed and was left out"
             )
@@ -138,7 +138,7 @@ class _Bag:
         if record.opcode == CHUNK:
             self._chunk(record)
         elif record.opcode == CONNECTION:
-            self._connection(record, memoryview(self.index.data))
+            self._define(channel_of(self.index.number, record, memoryview(self.index.data)))
         elif record.opcode == CHUNK_INFO:
             pairs = np.frombuffer(self.index.data, "<u4", 2 * record.number(b"count"), record.begin)
             for number, count in pairs.reshape(-1, 2).tolist():
@@ -165,25 +165,11 @@ class _Bag:
         times = np.frombuffer(self.index.data, _INDEX_TIMES, record.number(b"count"), record.begin)
         if len(times) and self.chunk is not None:
             self.entries.append(Entry(record.number(b"conn"), -1, len(times)))
-            self.times_ns += [as_ns(*times[np.argsort(times)[place]].tolist()[:2]) for place in (0, -1)]
+            times_ns = as_ns(times["s"].astype(np.int64), times["ns"])
+            self.times_ns += [int(times_ns.min()), int(times_ns.max())]
 
-    def _connection(self, record: Record, data: memoryview) -> None:
-        told = read_fields(bytes(data[record.begin : record.end]))
-        if told is None:
-            raise struct.error("connection without its fields")
-        number = record.number(b"conn")
-        texts = [told.get(name, b"").decode("utf-8", "replace") for name in (b"topic", b"type")]
-        topic, type_name = record.text(b"topic") or texts[0], texts[1]
-        channel = Channel(
-            (self.index.number, number),
-            topic,
-            "ros1",
-            number + 1,
-            type_name,
-            "ros1msg",
-            told[b"message_definition"],
-        )
-        self.index.channels.setdefault(number, channel)
+    def _define(self, channel: Channel) -> None:
+        self.index.channels.setdefault(channel.key[1], channel)
 
     def _close(self, *, complete: bool) -> None:
         """The chunk is over; what does not tell all of its messages is not believed."""

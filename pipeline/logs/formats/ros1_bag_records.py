@@ -9,11 +9,17 @@ import mmap
 import re
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.logs.records import Channel
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
+T = TypeVar("T", int, NDArray[np.int64])
 Data = mmap.mmap | memoryview | bytes
 
 _LENGTH = struct.Struct("<I")
@@ -45,8 +51,8 @@ class Record(NamedTuple):
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
-def as_ns(seconds: int, nanoseconds: int) -> int:
-    """A time of ROS in nanoseconds."""
+def as_ns(seconds: T, nanoseconds: T) -> T:
+    """Times of ROS in nanoseconds."""
     return seconds * 1_000_000_000 + nanoseconds
 
 
@@ -55,7 +61,7 @@ def read_record(data: Data, offset: int) -> Record | None:
     head = _sized(data, offset)
     if head is None or head.end + _LENGTH.size > len(data) or head.end - head.begin > _LONGEST_HEAD:
         return None
-    fields = read_fields(bytes(data[head.begin : head.end]))
+    fields = _read_fields(bytes(data[head.begin : head.end]))
     (size,) = _LENGTH.unpack_from(data, head.end)
     if fields is None or len(fields.get(b"op", b"")) != 1:
         return None
@@ -63,20 +69,15 @@ def read_record(data: Data, offset: int) -> Record | None:
     return Record(fields[b"op"][0], fields, offset, begin, begin + size)
 
 
-def read_fields(head: bytes) -> dict[bytes, bytes] | None:
-    """The fields of a head by name, None where it is not made of fields."""
-    fields: dict[bytes, bytes] = {}
-    offset = 0
-    while offset < len(head):
-        field = _sized(head, offset)
-        if field is None or field.end > len(head):
-            return None
-        name, equals, value = head[field.begin : field.end].partition(b"=")
-        if not equals:
-            return None
-        fields[name] = value
-        offset = field.end
-    return fields
+def channel_of(file: int, record: Record, data: Data) -> Channel:
+    """The channel that a connection record defines. Raises struct.error for one without its fields."""
+    told = _read_fields(bytes(data[record.begin : record.end]))
+    if told is None or b"message_definition" not in told:
+        raise struct.error("connection without its fields")
+    number = record.number(b"conn")
+    topic, type_name = record.text(b"topic"), told.get(b"type", b"").decode("utf-8", "replace")
+    definition = told[b"message_definition"]
+    return Channel((file, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
 
 
 def whole_records(data: Data) -> Iterator[Record]:
@@ -104,6 +105,22 @@ def next_record(data: Data, offset: int, believed: int) -> Record | None:
             if record.opcode != CONNECTION or begin >= believed:
                 return record
     return None
+
+
+def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
+    """The fields of a head by name, None where it is not made of fields."""
+    fields: dict[bytes, bytes] = {}
+    offset = 0
+    while offset < len(head):
+        field = _sized(head, offset)
+        if field is None or field.end > len(head):
+            return None
+        name, equals, value = head[field.begin : field.end].partition(b"=")
+        if not equals:
+            return None
+        fields[name] = value
+        offset = field.end
+    return fields
 
 
 class _Span(NamedTuple):
