@@ -211,7 +211,7 @@ def _clouds(folder):
     kinds["ply"] = PLY, ("ascii", "binary_little_endian", "binary_big_endian")
     for suffix, (head, forms) in kinds.items():
         for form in forms:
-            inside = _made(folder / form)
+            inside = _made(folder / f"{suffix}_{form}")
             stamps = {f"{cloud.stamp_ns}.{suffix}": cloud.stamp_ns for cloud in said}
             for name, cloud in zip(stamps, said, strict=True):
                 (inside / name).write_bytes(_cloud(cloud, suffix, head, form))

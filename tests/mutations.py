@@ -151,6 +151,13 @@ def cut_at(whole, length):
     return Mutant(whole[:length], f"cut off at byte {length}", [(length, len(whole))])
 
 
+def cut_and_flipped(whole, rng, longest):
+    """A beginning of a file, at most so long, with bits flipped in it."""
+    cut_off = cut_at(whole, int(rng.integers(longest // 4, longest)))
+    changed = flipped(cut_off.data, rng)
+    return Mutant(changed.data, f"{cut_off.what}, {changed.what}", [*cut_off.touched, *changed.touched])
+
+
 def emptied(whole, rng):
     return cut_at(whole, 0)
 
@@ -269,5 +276,5 @@ def _unpacked(body):
     (size,) = struct.unpack_from("<I", body, 28)
     name, stored = body[32 : 32 + size], body[40 + size :]
     if name == b"zstd":
-        return zstandard.decompress(stored, max_output_size=1 << 20)
+        return zstandard.decompress(stored, max_output_size=1 << 26)
     return lz4.frame.decompress(stored) if name == b"lz4" else stored
