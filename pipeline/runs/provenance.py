@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Struct
 
 from pipeline.logs.sizes import files_of, size_of
+from pipeline.runs.whole_file import write_whole
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22
@@ -48,13 +49,7 @@ class Provenance(Struct, frozen=True):
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
-        new = path.with_name(f"{path.name}.new")
-        try:
-            new.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
-            new.replace(path)
-        except OSError:
-            new.unlink(missing_ok=True)
-            raise
+        write_whole(path, msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
     def hashed(self, hashing: Hashing) -> Provenance:
         """With the hashes of its logs, waited for."""

@@ -27,6 +27,7 @@ from pipeline.runs.recorder import OpenRecorder
 from pipeline.runs.rescue import rescued
 from pipeline.runs.resuming import find_left
 from pipeline.runs.step_table import StepTable
+from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings
 from pipeline.slam import SlamResult
 from pipeline.trajectory import read_tum, write_tum
@@ -74,7 +75,7 @@ def run(
         progress.tell(f"going on after {len(steps):,} scans of {left.folder.name}")
     with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress):
         provenance.write(directory.path / RUN_FILE)
-        (directory.path / "config.toml").write_text(dump(settings.config), encoding="utf-8")
+        write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
             done = process(job, log, settings.config, directory, record, progress, steps, left)
             run_s = perf_counter() - started - done.held_s
