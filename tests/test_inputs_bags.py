@@ -173,6 +173,23 @@ def test_an_encrypted_bag_says_so(tmp_path):
         read(path)
 
 
+def test_of_a_db3_only_the_messages_that_are_damaged_are_lost(tmp_path):
+    sweeps, ros = recorders.clouds(30), Ros(recorders.ROS2)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    folder = recorders.bag2_of(tmp_path / "a", told, compression="MESSAGE")
+    path = folder / "a.db3"
+    frames = path.read_bytes().split(b"\x28\xb5\x2f\xfd")  # each begins with the magic of zstd
+    assert len(frames) == 31
+    damaged = b"\x28\xb5\x2f\xfd".join(frames[:12]) + b"\0\0\0\0" + b"\x28\xb5\x2f\xfd".join(frames[12:])
+    path.write_bytes(damaged)
+    log = open_log(folder)
+    scans = list(log.scans())
+    stamps = {scan.stamp_ns for scan in scans}
+    assert len(scans) == 29
+    assert_clouds(scans, [sweep for sweep in sweeps if sweep.stamp_ns in stamps])
+    assert "at least 1 messages from" in log.damage[0] and "29 scans" in log.damage[1]
+
+
 def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):
     (tmp_path / "metadata.yaml").write_text("a: [")
     with pytest.raises(InputError, match=r"metadata\.yaml: is not that of a ROS 2 bag"):

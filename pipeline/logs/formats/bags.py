@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,8 @@ from pipeline.logs.sizes import size_of
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
 _MOST_BLOCKS = 4096
+_MOST_TRIES = 400  # to read parts of a damaged block
+_LATEST_NS = (1 << 63) - 1
 
 
 def index_bag(path: Path, number: int) -> FileIndex:
@@ -64,25 +65,35 @@ class _Bag:
             self._cut()
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a span of time."""
+        """The messages of a span of time; one that cannot be read is halved until what is damaged stands alone."""
         chosen = [c for number, c in self.connections.items() if wanted is None or number in wanted]
         messages: list[Message] = []
-        damage = ""
-        try:
-            with self.lock:
-                for connection, time_ns, data in self._found(block, chosen):
-                    channel = self.index.channels[self.numbers[id(connection)]]
-                    messages.append(Message(channel, time_ns, memoryview(data)))
-        except Exception as error:  # whatever a damaged file makes the libraries below raise
-            reason = " ".join(str(error).split()) or type(error).__name__
-            damage = f"{self.index.path}: from {block.start_ns * 1e-9:.1f} s on it cannot be read ({reason})"
-        return Contents(messages, damage)
+        lost, first_ns, reason = 0, 0, ""
+        spans, tries = [self._ends(block)] if chosen else [], _MOST_TRIES
+        with self.lock:
+            while spans:
+                start_ns, stop_ns = spans.pop()
+                try:
+                    found = list(self.reader.messages(chosen, start_ns, stop_ns))
+                except Exception as error:  # whatever a damaged file makes the libraries below raise
+                    middle_ns, tries = (start_ns + stop_ns) // 2, tries - 1
+                    if start_ns < middle_ns and tries > 0:
+                        spans += [(middle_ns, stop_ns), (start_ns, middle_ns)]
+                    else:
+                        first_ns, reason = first_ns or start_ns, reason or _reason(error)
+                        lost += 1
+                    continue
+                messages += [
+                    Message(self.index.channels[self.numbers[id(connection)]], time_ns, memoryview(data))
+                    for connection, time_ns, data in found
+                ]
+        what = f"at least {lost} messages from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
+        return Contents(messages, f"{self.index.path}: {what}" if lost else "")
 
-    def _found(self, block: Block, chosen: Sequence[Any]) -> Iterable[tuple[Any, int, bytes]]:
-        """Messages of a span of time; the first and the last span have no outer end, whatever the bag says."""
+    def _ends(self, block: Block) -> tuple[int, int]:
+        """From when to when a block lasts; the first and the last reach as far as time, whatever the bag says."""
         is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
-        start_ns = None if is_first else block.start_ns
-        return self.reader.messages(chosen, start_ns, None if is_last else block.end_ns + 1) if chosen else ()
+        return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
 
     def _cut(self) -> None:
         """Spans of time of one length, so many that each holds a few megabytes on average."""
@@ -102,11 +113,15 @@ def _open(path: Path) -> Any:
         reader = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"{path}: cannot be read as a ROS bag ({reason}); ros2 bag reindex mends the folder of a ROS 2 bag"
+            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
+            "ros2 bag reindex mends the folder of a ROS 2 bag"
         ) from error
     return reader
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _is_sound(connection: Any) -> bool:
