@@ -39,7 +39,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         return index.make(block, wanted)
     payload = unpack(index, block)
     messages: list[Message] = []
-    strangers = 0
+    met = strangers = 0
     try:
         for opcode, begin, end in _records(payload):
             if opcode == SCHEMA:
@@ -48,6 +48,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                 index.add_channel(payload, begin)
             elif opcode == MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
+                met += 1
                 channel = index.channels.get(number)
                 strangers += channel is None
                 if channel is not None and (wanted is None or number in wanted):
@@ -55,8 +56,12 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     except (struct.error, UnicodeDecodeError):
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
-    damage = f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
-    return Contents(messages, damage if strangers else "")
+    told = sum(entry.messages for entry in block.entries)
+    if strangers:
+        return Contents(
+            messages, f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
+        )
+    return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
 
 
 def unpack(index: FileIndex, block: Block) -> memoryview:
