@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import recorders
 from mcap.reader import make_reader
-from mutations import Seed, cut_at, mutant, mutated_message
+from mutations import CHUNK, Seed, cut_and_flipped, cut_at, mutant, mutated_message
 from naive_logs import STAMP_NS, cloud_said, odometry, odometry_said, office, point_cloud, write
+from scenes import shared_data
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
@@ -36,7 +37,8 @@ from pipeline.logs.readers import (
 )
 from pipeline.logs.records import Channel
 
-LONGEST_S = 5.0
+LONGEST_S = 5.0  # of CPU, so that a busy machine makes no difference
+LONGEST_WAIT_S = 120.0
 MOST_BYTES = 500_000_000
 
 
@@ -62,6 +64,24 @@ def seeds(folder):
         yield seed_of(path, f"{name} {options}", has_crcs=options.get("crcs", name != "loose"))
 
 
+REAL = {
+    "2d/intel.mcap": 900_000,
+    "2d/mit_csail.mcap": 700_000,
+    "3d/kitti_0001_first54.mcap": 10_000_000,
+    "3d/kitti_0005_first60.mcap": 10_000_000,
+}  # and how many bytes of them are read
+
+
+def real_complaints(name, folder, rng, count):
+    """Real logs cut off, with bits flipped before the cut: (what was done, what is wrong)."""
+    seed = seed_of(shared_data(name), name, has_crcs=True)
+    for _ in range(count):
+        damaged = cut_and_flipped(seed.data, rng, REAL[name])
+        wrong = complaint(seed, damaged, folder / "damaged.mcap")
+        if wrong:
+            yield damaged, wrong
+
+
 def seed_of(path, name, *, has_crcs):
     log = open_log(path)
     scans = {scan.log_time_ns: _content(scan) for scan in log.scans()}
@@ -72,7 +92,7 @@ def mutants(seed, rng, count):
     """Cuts at every boundary of its records and beside them, then ``count`` random ones."""
     for record in seed.records:
         for length in (record.begin, record.begin + 1, record.begin + 9, record.end - 1):
-            yield cut_at(seed, length)
+            yield cut_at(seed.data, length)
     for _ in range(count):
         yield mutant(seed, rng)
 
@@ -80,7 +100,7 @@ def mutants(seed, rng, count):
 def complaint(seed, damaged, path):
     """What is wrong with how a damaged file is read, empty where nothing is."""
     path.write_bytes(damaged.data)
-    before = _peak_bytes()
+    before = peak_bytes()
     try:
         with at_most(LONGEST_S):
             scans, told = read(path)
@@ -88,8 +108,8 @@ def complaint(seed, damaged, path):
         return f"takes more than {LONGEST_S} s"
     except Exception:
         return traceback.format_exc()
-    if _peak_bytes() - before > MOST_BYTES:
-        return f"took {(_peak_bytes() - before) >> 20} MB more"
+    if peak_bytes() - before > MOST_BYTES:
+        return f"took {(peak_bytes() - before) >> 20} MB more"
     return _verdict(seed, damaged, scans, told)
 
 
@@ -112,10 +132,20 @@ def _verdict(seed, damaged, scans, told):
     missing = sorted(time_ns for time_ns in expected if not counted[time_ns, seed.scans[time_ns]])
     if missing:
         return f"{len(missing)} of {len(expected)} untouched scans are missing ({missing[:3]}); told: {told}"
+    invented = [time_ns for time_ns, content in counted if seed.scans.get(time_ns) != content]
+    if invented and seed.has_crcs and not _is_cut_inside_damage(seed, damaged):
+        return f"{len(invented)} scans are not those of the file ({invented[:3]}); told: {told}"
     lost = [time_ns for time_ns, content in seed.scans.items() if not counted[time_ns, content]]
     if lost and not told and seed.has_crcs and not damaged.is_seamless:
         return f"{len(lost)} scans are missing or changed and nothing is told"
     return ""
+
+
+def _is_cut_inside_damage(seed, damaged):
+    """Whether the chunk that the file ends in, whose CRC cannot be checked, was changed before its cut."""
+    end = len(damaged.data)
+    cut_chunk = next((r for r in seed.records if r.opcode == CHUNK and r.begin < end < r.end), None)
+    return cut_chunk is not None and cut_chunk.is_touched([t for t in damaged.touched if t[0] < end])
 
 
 def payload_complaints(folder, rng, count):
@@ -124,7 +154,7 @@ def payload_complaints(folder, rng, count):
     for number in range(count):
         channel, data, decode = said[number % len(said)]
         changed = mutated_message(data, rng)
-        before = _peak_bytes()
+        before = peak_bytes()
         try:
             with at_most(LONGEST_S), np.errstate(all="ignore"):
                 decode(memoryview(changed))
@@ -135,8 +165,8 @@ def payload_complaints(folder, rng, count):
             yield f"{channel.type_name}: takes more than {LONGEST_S} s: {changed!r}"
         except Exception:
             yield f"{channel.type_name} in {channel.encoding}: {changed!r}\n{traceback.format_exc()}"
-        if _peak_bytes() - before > MOST_BYTES:
-            yield f"{channel.type_name}: took {(_peak_bytes() - before) >> 20} MB: {changed!r}"
+        if peak_bytes() - before > MOST_BYTES:
+            yield f"{channel.type_name}: took {(peak_bytes() - before) >> 20} MB: {changed!r}"
 
 
 def _messages(folder):
@@ -181,25 +211,30 @@ def _recorded(folder):
 
 @contextmanager
 def at_most(seconds):
-    """Raise Hang in what takes longer."""
+    """Raise Hang in what takes more CPU time, or waits for long."""
 
     def ring(*_):
         raise Hang
 
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    timers = {
+        signal.SIGPROF: (signal.ITIMER_PROF, seconds), signal.SIGALRM: (signal.ITIMER_REAL, LONGEST_WAIT_S)
+    }  # fmt: skip
+    before = {number: signal.signal(number, ring) for number in timers}
+    for timer, limit_s in timers.values():
+        signal.setitimer(timer, limit_s)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        for number, (timer, _) in timers.items():
+            signal.setitimer(timer, 0)
+            signal.signal(number, before[number])
 
 
 def _content(scan):
     return scan.stamp_ns, scan.points.tobytes()
 
 
-def _peak_bytes():
+def peak_bytes():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 

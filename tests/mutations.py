@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass, field
 from functools import cache
@@ -13,6 +14,7 @@ import zstandard
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 3, 4, 5, 6, 11, 15
 LIES = (0, 1, 8, 2**31 - 1, 2**32 - 1, 2**40, 2**63, 2**64 - 1)
+WORDS = (b"nan", b"-inf", b"-1", b"0", b"1e400", b"9" * 30, b"", b"x", b"1_0", "\u0663".encode(), b"\0", b"1e18")
 BOMB_BYTES = 900_000_000
 
 
@@ -83,23 +85,30 @@ class Mutant:
 
 def mutant(seed, rng):
     """A file damaged in one or several ways."""
-    kinds = (flipped, overwritten, lying, lying, lying, spliced, cut, bombed)
-    return kinds[rng.integers(len(kinds))](seed, rng)
+    kinds = (flipped, overwritten, cut, lying, lying, lying, spliced, bombed)
+    kind = int(rng.integers(len(kinds)))
+    return kinds[kind](seed.data if kind < 3 else seed, rng)
 
 
-def flipped(seed, rng):
-    data = bytearray(seed.data)
-    places = rng.integers(8, len(data), rng.integers(1, 9)).tolist()
+def any_mutant(data, rng):
+    """A file of whatever format damaged in one way."""
+    kinds = (flipped, flipped, overwritten, cut, lying_anywhere, left_out, repeated, misspelt, emptied)
+    return kinds[rng.integers(len(kinds))](data, rng)
+
+
+def flipped(whole, rng):
+    data = bytearray(whole)
+    places = rng.integers(min(8, len(data) - 1), len(data), rng.integers(1, 9)).tolist()
     for at in places:
         data[at] ^= 1 << rng.integers(8)
     return Mutant(bytes(data), f"bits flipped at {places}", [(at, at + 1) for at in places])
 
 
-def overwritten(seed, rng):
-    begin = int(rng.integers(8, len(seed.data)))
+def overwritten(whole, rng):
+    begin = int(rng.integers(min(8, len(whole) - 1), len(whole)))
     filling = (bytes(64), b"\xff" * 64, rng.bytes(64), MAGIC * 8)[rng.integers(4)][: rng.integers(1, 65)]
-    end = min(begin + len(filling), len(seed.data))
-    data = seed.data[:begin] + filling[: end - begin] + seed.data[end:]
+    end = min(begin + len(filling), len(whole))
+    data = whole[:begin] + filling[: end - begin] + whole[end:]
     return Mutant(data, f"bytes {begin} to {end} overwritten with {filling[:8]!r}...", [(begin, end)])
 
 
@@ -134,19 +143,68 @@ def spliced(seed, rng):
     return Mutant(data, f"bytes {begin} to {end} written once more at {at}", [(at - 1, at + 1)])
 
 
-def cut(seed, rng):
-    return cut_at(seed, int(rng.integers(1, len(seed.data))))
+def cut(whole, rng):
+    return cut_at(whole, int(rng.integers(1, max(2, len(whole)))))
 
 
-def cut_at(seed, length):
-    return Mutant(seed.data[:length], f"cut off at byte {length}", [(length, len(seed.data))])
+def cut_at(whole, length):
+    return Mutant(whole[:length], f"cut off at byte {length}", [(length, len(whole))])
+
+
+def cut_and_flipped(whole, rng, longest):
+    """A beginning of a file, at most so long, with bits flipped in it."""
+    cut_off = cut_at(whole, int(rng.integers(longest // 4, longest)))
+    changed = flipped(cut_off.data, rng)
+    return Mutant(changed.data, f"{cut_off.what}, {changed.what}", [*cut_off.touched, *changed.touched])
+
+
+def emptied(whole, rng):
+    return cut_at(whole, 0)
+
+
+def lying_anywhere(whole, rng):
+    """A number of one to eight bytes anywhere is another."""
+    size = int(rng.choice([1, 2, 4, 8]))
+    at = int(rng.integers(0, max(1, len(whole) - size)))
+    value = LIES[rng.integers(len(LIES))] % (1 << 8 * size)
+    data = whole[:at] + value.to_bytes(size, "little") + whole[at + size :]
+    return Mutant(data, f"{size} bytes at {at} say {value}", [(at, at + size)])
+
+
+def left_out(whole, rng):
+    begin, end = _piece(whole, rng)
+    return Mutant(whole[:begin] + whole[end:], f"bytes {begin} to {end} left out", [(begin, end)])
+
+
+def repeated(whole, rng):
+    """Bytes written once more, somewhere."""
+    begin, end = _piece(whole, rng)
+    at = int(rng.integers(0, len(whole)))
+    data = whole[:at] + whole[begin:end] + whole[at:]
+    return Mutant(data, f"bytes {begin} to {end} written once more at {at}", [(at - 1, at + 1)])
+
+
+def misspelt(whole, rng):
+    """A number that is written out is another, or none."""
+    words = list(re.finditer(rb"-?\d+(\.\d+)?", whole[:200_000]))
+    if not words:
+        return flipped(whole, rng)
+    word = words[rng.integers(len(words))]
+    other = WORDS[rng.integers(len(WORDS))]
+    data = whole[: word.start()] + other + whole[word.end() :]
+    return Mutant(data, f"{other!r} instead of {word[0]!r} at {word.start()}", [word.span()])
+
+
+def _piece(whole, rng):
+    begin, end = sorted(int(at) for at in rng.integers(0, len(whole) + 1, 2))
+    return begin, min(end, begin + 500)
 
 
 def bombed(seed, rng):
     """A chunk's contents are zeros without end, and its head admits some of them."""
     chunks = [record for record in seed.records if record.opcode == CHUNK]
     if not chunks:
-        return flipped(seed, rng)
+        return flipped(seed.data, rng)
     chunk = chunks[rng.integers(len(chunks))]
     name = ("zstd", "lz4")[rng.integers(2)]
     admitted = int(rng.choice([BOMB_BYTES, 1 << 20, 1 << 25, 1 << 27, 1 << 62]))
@@ -218,5 +276,5 @@ def _unpacked(body):
     (size,) = struct.unpack_from("<I", body, 28)
     name, stored = body[32 : 32 + size], body[40 + size :]
     if name == b"zstd":
-        return zstandard.decompress(stored, max_output_size=1 << 20)
+        return zstandard.decompress(stored, max_output_size=1 << 26)
     return lz4.frame.decompress(stored) if name == b"lz4" else stored

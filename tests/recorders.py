@@ -220,10 +220,11 @@ def mcap_of(path, ros, told):
     return path
 
 
-def bag1_of(path, told, compression=None):
+def bag1_of(path, told, compression=None, *, chunk_bytes=None):
     """A ROS 1 bag."""
     ros = Ros(ROS1)
     writer = rosbag1.Writer(path)
+    writer.chunk_threshold = chunk_bytes or writer.chunk_threshold
     if compression:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
     with writer:

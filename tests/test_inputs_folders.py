@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import recorders
+from folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 from recorders import SECOND, STAMP_NS, assert_clouds
 from scenes import shared_data
 
@@ -18,40 +19,12 @@ def read(path, **config):
     return log, list(log.scans())
 
 
-def xyzi(cloud):
-    """A cloud's points without the first, which is NaN, as float32 x y z intensity."""
-    rows = cloud.rows[1:]
-    return np.column_stack([rows["x"], rows["y"], rows["z"], np.linspace(0, 1, len(rows))]).astype("<f4")
-
-
 def assert_points(scans, said):
     for scan, cloud in zip(scans, said, strict=True):
         np.testing.assert_array_equal(scan.points, xyzi(cloud)[:, :3])
 
 
 # KITTI
-
-
-def oxts_line(latitude, longitude, up_m, roll, pitch, yaw):
-    return " ".join(f"{value:.15f}" for value in (latitude, longitude, up_m, roll, pitch, yaw, *[0.0] * 24))
-
-
-def kitti_raw(folder, said, *, calibrated=True):
-    drive = folder / "2011_09_26_drive_0001_sync"
-    for name in ("velodyne_points/data", "oxts/data"):
-        (drive / name).mkdir(parents=True)
-    times = []
-    for k, cloud in enumerate(said):
-        xyzi(cloud).tofile(drive / "velodyne_points/data" / f"{k:010d}.bin")
-        line = oxts_line(49.0 + 1e-5 * k, 8.4 + 2e-5 * k, 110.0 + 0.5 * k, 0.01, -0.02, 0.3 * k)
-        (drive / "oxts/data" / f"{k:010d}.txt").write_text(line + "\n")
-        times.append(f"2011-09-26 13:02:25.{k:03d}594360\n")
-    (drive / "velodyne_points/timestamps.txt").write_text("".join(times))
-    (drive / "oxts/timestamps.txt").write_text("".join(times))
-    if calibrated:
-        numbers = "R: 0 -1 0 1 0 0 0 0 1\nT: -0.8 0.3 -0.75\ndelta_f: 0 0\n"
-        (folder / "calib_imu_to_velo.txt").write_text("calib_time: 25-May-2012 16:47:16\n" + numbers)
-    return drive
 
 
 def test_a_kitti_drive_has_its_sweeps_and_their_times(tmp_path):
@@ -108,28 +81,6 @@ def test_a_sweep_that_was_cut_off_is_left_out_and_told(tmp_path):
     log, scans = read(drive)
     assert_points(scans, [said[0], said[2]])
     assert "0000000001.bin" in log.damage[0] and "multiple of" in log.damage[0]
-
-
-def kitti_odometry(folder, said, *, poses=True):
-    sequence = folder / "sequences" / "07"
-    (sequence / "velodyne").mkdir(parents=True)
-    for k, cloud in enumerate(said):
-        xyzi(cloud).tofile(sequence / "velodyne" / f"{k:06d}.bin")
-    (sequence / "times.txt").write_text("".join(f"{0.103736 * k:.6e}\n" for k in range(len(said))))
-    row = " ".join(map(str, np.eye(4)[:3].ravel()))
-    (sequence / "calib.txt").write_text(f"P0: {row}\nTr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
-    if poses:
-        (folder / "poses").mkdir()
-        lines = [" ".join(map(str, camera(k)[:3].ravel())) for k in range(len(said))]
-        (folder / "poses" / "07.txt").write_text("\n".join(lines) + "\n")
-    return sequence
-
-
-def camera(k):
-    T = np.eye(4)
-    T[:3, :3] = [[np.cos(0.1 * k), 0, np.sin(0.1 * k)], [0, 1, 0], [-np.sin(0.1 * k), 0, np.cos(0.1 * k)]]
-    T[:3, 3] = 0.1 * k, 0.02 * k, 1.5 * k
-    return T
 
 
 def test_a_kitti_odometry_sequence_begins_at_time_zero_and_knows_its_truth(tmp_path):
@@ -222,20 +173,6 @@ def test_clouds_that_open3d_writes_are_read_to_the_last_bit(tmp_path, suffix, op
         assert_clouds(scans, said, timed=False)
 
 
-PCD = """# .PCD v0.7
-VERSION 0.7
-FIELDS x y z timestamp ring
-SIZE 4 4 4 8 2
-TYPE F F F U U
-COUNT 1 1 1 1 1
-WIDTH {count}
-HEIGHT 1
-VIEWPOINT 0 0 0 1 0 0 0
-POINTS {count}
-DATA {form}
-"""
-
-
 def test_the_times_in_a_pcd_are_those_of_its_points(tmp_path):
     dtype = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<u8"), ("ring", "<u2")]
     rows = np.zeros(11, dtype)
@@ -245,20 +182,6 @@ def test_the_times_in_a_pcd_are_those_of_its_points(tmp_path):
     _, (scan,) = read(tmp_path)
     np.testing.assert_array_equal(scan.points[:, 0], np.arange(1, 12))
     np.testing.assert_allclose(scan.times_s, np.arange(11) * 0.01, atol=1e-6)
-
-
-PLY = """ply
-format {form} 1.0
-comment made by hand
-element vertex {count}
-property double x
-property float y
-property float z
-property uchar ring
-element face 1
-property list uchar int vertex_indices
-end_header
-"""
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])

@@ -5,11 +5,14 @@ import random
 import signal
 import subprocess
 import sys
+import time
+import zlib
 from itertools import islice
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from killing import assert_readable, kill_at_random, partial, same_result, start, steps_on_disk
 from scenes import ROOT, configured, shared_data
 
 from pipeline.errors import InputError
@@ -22,7 +25,8 @@ from pipeline.slam import Slam
 from pipeline.trajectory import read_tum
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-LIVELY = ("--checkpoint", "0.2", "--rerun", "off")
+RECORDED = ("--checkpoint", "0.2")
+LIVELY = (*RECORDED, "--rerun", "off")
 
 
 @pytest.fixture(scope="module")
@@ -39,32 +43,6 @@ def whole(office, tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "run"
     assert start(office, out, *LIVELY).wait() == 0
     return out
-
-
-def start(log, out, *words, **options):
-    command = [sys.executable, "-m", "pipeline", "run", str(log), "--out", str(out), *words]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
-    return subprocess.Popen(command, cwd=ROOT, **quiet)
-
-
-def partial(out):
-    """What a killed run left, None before its directory is there."""
-    return next(out.parent.glob(f"{out.name}.partial-*"), None)
-
-
-def steps_on_disk(out):
-    try:
-        return len(read_journal(partial(out) or out)[0])
-    except FileNotFoundError:  # not there yet, or just taking another name
-        return 0
-
-
-def same_result(a, b):
-    for name in ("trajectory.tum", "odometry.tum", "graph.g2o", "map.ply"):
-        assert (a / name).read_bytes() == (b / name).read_bytes(), name
-    columns = ["index", "stamp_ns", "x", "y", "qz", "odom_x", "covariance", "state", "reason", "keyframe"]
-    tables = [pq.read_table(folder / "steps.parquet", columns=columns) for folder in (a, b)]
-    assert tables[0].equals(tables[1])
 
 
 def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(office, whole, tmp_path):
@@ -89,6 +67,16 @@ def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(offi
     same_result(out, whole)
     assert "went on after" in (out / "summary.txt").read_text()
     assert not list(out.glob("*.journal")) and not list(out.glob("*.checkpoint"))
+
+
+def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_same_result(office, whole, tmp_path):
+    began = time.perf_counter()
+    assert start(office, tmp_path / "warm", *RECORDED).wait() == 0
+    seed = random.randrange(1000)
+    print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
+    longest_s = time.perf_counter() - began
+    killed = list(kill_at_random(office, RECORDED, tmp_path, whole, kills=6, seed=seed, longest_s=longest_s))
+    assert len(killed) == 6
 
 
 @pytest.mark.parametrize(
@@ -162,6 +150,38 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path
     same_result(out, whole)
 
 
+def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
+    slow = """
+import sys, time
+from pipeline.__main__ import main
+from pipeline.slam import Slam
+process = Slam.process
+def waiting(self, scan):
+    if scan.index == 100:
+        print("there", flush=True)
+        time.sleep(60)
+    return process(self, scan)
+Slam.process = waiting
+sys.exit(main(sys.argv[1:]))
+"""
+    out = tmp_path / "run"
+    words = ["run", str(office), "--out", str(out), "--checkpoint", "0", "--rerun", "off"]
+    child = subprocess.Popen(
+        [sys.executable, "-c", slow, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert child.stdout.readline() == "there\n"
+    child.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    errors = child.communicate(timeout=20)[1]
+    assert child.returncode == 1 and errors.count("\n") == 1
+    assert "interrupted; 100 scans until then are in" in errors
+    assert assert_readable(partial(out)) == 100
+    assert start(office, out, *LIVELY, "--resume").wait() == 0
+    same_result(out, whole)
+
+
 def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
     out, other = tmp_path / "run", tmp_path / "other.mcap"
     simulate("office", other, duration_s=30.0, seed=5)
@@ -182,9 +202,13 @@ def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
     assert "another configuration" in refusal(office, "--matching.matcher", "svd")
     assert "scan 0 of the log is not the one that was run" in refusal(other)
     checkpoint = partial(out) / "state.checkpoint"
-    data = bytearray(checkpoint.read_bytes())
-    data[len(data) // 2] ^= 1
-    checkpoint.write_bytes(data)
+    data = checkpoint.read_bytes()
+    older = data[:-8].replace(b"(code ", b"(c0de ", 1)
+    checkpoint.write_bytes(older + zlib.crc32(older[:-8]).to_bytes(8, "little"))
+    assert "state.checkpoint: was made by scanchain" in refusal(office)
+    damaged = bytearray(data)
+    damaged[len(data) // 2] ^= 1
+    checkpoint.write_bytes(damaged)
     assert "is no whole snapshot" in refusal(office)
 
 
@@ -246,7 +270,7 @@ def test_a_snapshot_makes_only_what_is_listed(tmp_path):
     write_snapshot(tmp_path / "c", config, _CLASSES)
     assert read_snapshot(tmp_path / "c", _CLASSES) == config
     with pytest.raises(InputError, match="'Config', which does not belong"):
-        read_snapshot(tmp_path / "c", Classes([], {}))
+        read_snapshot(tmp_path / "c", Classes([], {}, _CLASSES.version))
 
 
 def test_arrays_come_back_with_their_order_their_type_and_their_bits(tmp_path):

@@ -2,6 +2,7 @@
 
 import re
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -61,10 +62,18 @@ def test_a_file_that_is_no_log(tmp_path, content):
     says(complaint(tmp_path / "a.mcap"), "is no log that is known", repr(content[:8]), "give MCAP")
 
 
-@pytest.mark.parametrize("content", [b"#ROSBAG V2.0\n" * 10, b"#ROSBAG V1.2\n", b"SQLite format 3\0"])
-def test_a_bag_that_is_none(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"#ROSBAG V2.0\n", "holds: none"),
+        (b"#ROSBAG V2.0\n" * 10, "damaged to its end, at byte 13"),
+        (b"#ROSBAG V1.2\n", "rosbag migrate"),
+        (b"SQLite format 3\0", "cannot be read as a ROS bag"),
+    ],
+)
+def test_a_bag_that_is_none(tmp_path, content, said):
     (tmp_path / "a.mcap").write_bytes(content)
-    says(complaint(tmp_path / "a.mcap"), "cannot be read as a ROS bag", "reindex")
+    says(complaint(tmp_path / "a.mcap"), said)
 
 
 def test_the_magic_and_nothing_else(tmp_path):
@@ -385,3 +394,22 @@ def test_a_real_cloud_log_cut_off_gives_the_sweeps_before_the_cut(tmp_path):
     scans, damage = recover(path)
     assert 6 <= len(scans) <= 9
     assert any(f"{len(scans)} scans" in line for line in damage)
+
+
+def test_malformed_messages_cost_no_more_than_good_ones(tmp_path):
+    rows = np.ones(1, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    good = point_cloud(STAMP_NS, rows)
+    paths = [
+        write(
+            tmp_path / f"{length}.mcap",
+            [cloud_said(STAMP_NS + k, good[: length if k else None]) for k in range(3000)],
+        )
+        for length in (len(good), 90)
+    ]
+    cost_s = []
+    for path in (paths[0], *paths):  # the first time to warm up
+        began = time.process_time()
+        scans, _ = recover(path, bad_scans="skip")
+        cost_s.append(time.process_time() - began)
+    assert len(scans) == 1
+    assert cost_s[2] < 2.0 * cost_s[1]

@@ -20,9 +20,10 @@ from scenes import ROOT
 from pipeline.__main__ import _record
 from pipeline.errors import InputError
 from pipeline.runs.directory import RunDirectory
+from pipeline.runs.job import Job
 from pipeline.runs.progress import Unwatched
 from pipeline.runs.rescue import PartialRunError
-from pipeline.runs.run import Job, run
+from pipeline.runs.run import run
 from pipeline.simulate import simulate
 
 

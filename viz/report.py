@@ -8,6 +8,8 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from pipeline.runs.whole_file import write_whole
+
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -111,4 +113,4 @@ def write_page(path: Path, page: Page) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    path.write_text(environment.get_template("report.html").render(page=page), encoding="utf-8")
+    write_whole(path, environment.get_template("report.html").render(page=page).encode())

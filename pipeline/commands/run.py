@@ -87,7 +87,7 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     from pipeline.commands.terminal import Terminal
-    from pipeline.runs.run import Job
+    from pipeline.runs.job import Job
     from pipeline.runs.run import run as run_log
 
     truth_file, truth_topic = ground_truth(gt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import mmap
 import struct
 import zlib
@@ -36,9 +37,9 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     """
     if index.make is not None:
         return index.make(block, wanted)
-    payload = memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
+    payload = unpack(index, block)
     messages: list[Message] = []
-    strangers = 0
+    met = strangers = 0
     try:
         for opcode, begin, end in _records(payload):
             if opcode == SCHEMA:
@@ -47,6 +48,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                 index.add_channel(payload, begin)
             elif opcode == MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
+                met += 1
                 channel = index.channels.get(number)
                 strangers += channel is None
                 if channel is not None and (wanted is None or number in wanted):
@@ -54,8 +56,17 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     except (struct.error, UnicodeDecodeError):
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
-    damage = f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
-    return Contents(messages, damage if strangers else "")
+    told = sum(entry.messages for entry in block.entries)
+    if strangers:
+        return Contents(
+            messages, f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
+        )
+    return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
+
+
+def unpack(index: FileIndex, block: Block) -> memoryview:
+    """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
+    return memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
 
 
 def release(index: FileIndex, block: Block) -> None:
@@ -88,13 +99,15 @@ def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
             payload = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
         elif block.compression == "lz4":
             payload = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+        elif block.compression == "bz2":
+            payload = bz2.BZ2Decompressor().decompress(stored, max_length=size)
         elif block.compression == "":
             payload = stored
         else:
             raise DamagedBlockError(
                 f"{_name(index, block)}: compression {block.compression!r} is not known (none, lz4 and zstd are)"
             )
-    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError) as error:
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError) as error:
         raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({_one_line(error)})") from error
     if len(payload) != size:
         raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
@@ -112,7 +125,9 @@ def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
                 return reader.read(block.uncompressed_size)
         if block.compression == "lz4":
             return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=block.uncompressed_size)
-    except (zstandard.ZstdError, RuntimeError, EOFError):
+        if block.compression == "bz2":
+            return bz2.BZ2Decompressor().decompress(stored, max_length=block.uncompressed_size)
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
         return b""
     return stored if block.compression == "" else b""
 

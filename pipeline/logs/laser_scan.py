@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -127,6 +128,10 @@ def _believed(beams: int, size: int) -> int:
 
 
 def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:
+    if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
+        raise MalformedMessageError(
+            f"its beams lie {step_rad:g} rad and {beam_s:g} s apart from {first_rad:g} rad on, which cannot be"
+        )
     angles_rad = first_rad + step_rad * np.arange(count)
     directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
     times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES

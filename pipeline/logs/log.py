@@ -191,9 +191,9 @@ class Log:
 
     def _complaint(self, message: Decoded, number: int) -> str:
         """What is wrong with a scan, empty where it is good."""
+        if isinstance(message.value, Returns) and len(message.value.points):
+            return ""
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
-        if not isinstance(message.value, Returns):
-            return f"{where} is malformed: {message.value}"
-        if not len(message.value.points):
+        if isinstance(message.value, Returns):
             return f"{where} has no valid point ({message.value.why})"
-        return ""
+        return f"{where} is malformed: {message.value}"

@@ -125,7 +125,6 @@ class FileIndex:
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
     is_trusted: bool = True
-    has_summary: bool = False
     doubted: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -63,7 +63,7 @@ def _summary(file: RemoteFile) -> bytes | None:
 
 
 def _index(file: RemoteFile, number: int, summary: bytes) -> FileIndex | None:
-    index = FileIndex(file.address, number, b"", ReadAhead(file.read), has_summary=True)
+    index = FileIndex(file.address, number, b"", ReadAhead(file.read))
     chunks_told = -1
     for opcode, body in _records(summary):
         if opcode == SCHEMA:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.logs.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, SCHEMA
 
+PRIVATE = 0x80  # opcodes from here on are those of applications
 CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC-32
 
 _LEAST_BYTES = {
@@ -31,7 +32,6 @@ _LEAST_BYTES = {
 }
 _EXACT_BYTES = {2: 20, 14: 17, 15: 4}  # footer, summary offset, end of data
 _PARTS = {1: (0, 2), 3: (2, 3), 4: (4, 3), 9: (16, 2), 12: (0, 2)}  # fixed bytes, then parts behind their length
-_PRIVATE = 0x80  # opcodes from here on are those of applications
 _COMPRESSIONS = 64  # bytes; no name of a compression is longer
 _COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
 _ANY = frozenset(_LEAST_BYTES)
@@ -47,7 +47,7 @@ def record_end(data: mmap.mmap | bytes, offset: int) -> int:
     end = offset + RECORD.size + length
     if end > len(data) or _EXACT_BYTES.get(opcode, length) != length:
         return 0
-    if opcode >= _PRIVATE:
+    if opcode >= PRIVATE:
         return end
     if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
         return 0

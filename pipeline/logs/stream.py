@@ -103,6 +103,6 @@ def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> lis
         line = f"{error}; it was left out"
         damage += [] if line in damage else [line]
         return []
-    if incomplete:
+    if incomplete and incomplete not in damage:
         damage.append(incomplete)
     return messages

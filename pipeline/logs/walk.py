@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections import Counter
 from dataclasses import replace
 
+from pipeline.logs.claims import check_claims
 from pipeline.logs.records import (
     CHANNEL,
     CHUNK,
@@ -25,7 +25,7 @@ from pipeline.logs.records import (
     FileIndex,
     read_string,
 )
-from pipeline.logs.resync import CHUNK_HEAD, is_end
+from pipeline.logs.resync import CHUNK_HEAD, PRIVATE, is_end
 
 FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
 
@@ -42,6 +42,7 @@ class Walk:
         self.index = index
         self.is_doubtful = False  # in a summary of a wrong CRC
         self.chunks_told = 0  # by the statistics
+        self.private: list[int] = []  # where records lie that only some application knows
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
         self.loose_from = -1
@@ -61,23 +62,7 @@ class Walk:
         else:
             self.close(offset, complete=False)
             self._cut(offset, size)
-        self._compare_counts()
-
-    def _compare_counts(self) -> None:
-        """Trust what blocks say about their channels where it adds up to the file's own statistics."""
-        index = self.index
-        totals: Counter[int] = Counter()
-        for entry in (entry for block in index.blocks for entry in block.entries):
-            totals[entry.channel] += entry.messages
-        told = {number: count for number, count in index.counts.items() if count}
-        chunks = sum(block.is_chunk for block in index.blocks)
-        index.is_trusted = index.is_counted and told == dict(totals) and chunks == self.chunks_told
-        is_indexed = all(block.entries for block in index.blocks)
-        if index.is_counted and not index.is_trusted and (is_indexed or chunks != self.chunks_told):
-            index.damage.append(
-                f"{index.path}: its {chunks} chunks and {totals.total()} indexed messages are not the "
-                f"{self.chunks_told} and {sum(told.values())} of its statistics"
-            )
+        check_claims(index, self.chunks_told, self.private)
 
     def _cut(self, offset: int, size: int) -> None:
         where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
@@ -137,11 +122,11 @@ class Walk:
         """The records that begin and end the file and its parts."""
         if opcode == DATA_END:
             self.is_doubtful = not _is_summary_sound(self.index, body + length)
-        elif opcode == FOOTER:
-            self.index.has_summary = FOOTER_BODY.unpack_from(self.index.data, body)[0] > 0
         elif opcode == HEADER:
             self.index.profile, body = read_string(self.index.data, body)
             self.index.library, _ = read_string(self.index.data, body)
+        elif opcode >= PRIVATE:
+            self.private.append(body - RECORD.size)
 
     def _message(self, offset: int, body: int, length: int) -> None:
         if self.chunk is not None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
+import pipeline
 from pipeline import config, data
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
@@ -38,11 +40,17 @@ POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
 
 
+def _version() -> str:
+    """That of the package and a checksum of its code: other code would not go on to the same bits."""
+    package = Path(pipeline.__file__).parent
+    code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})"
+
+
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The chain after ``scans`` scans, which took ``run_s`` seconds; ``version`` of scanchain made it."""
+    """The chain after ``scans`` scans, which took ``run_s`` seconds."""
 
-    version: str
     scans: int
     run_s: float
     slam: Slam
@@ -63,6 +71,7 @@ _CLASSES = Classes(
         (Submaps, "held"): OrderedDict(),
         (PointStore, "file"): None,
     },
+    _version(),
 )  # fmt: skip
 
 
@@ -84,12 +93,11 @@ class Checkpoints:
     def write(self, slam: Slam, scans: int) -> None:
         """Write one. Raises OSError where the disk is full; the last one stays."""
         started = perf_counter()
-        version = package_version("scanchain")
-        write_snapshot(self.path, Checkpoint(version, scans, started - self.began_s, slam), _CLASSES)
+        write_snapshot(self.path, Checkpoint(scans, started - self.began_s, slam), _CLASSES)
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """The last checkpoint of a run. Raises InputError for one that is damaged."""
+    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made."""
     return read_snapshot(folder / CHECKPOINT_FILE, _CLASSES)

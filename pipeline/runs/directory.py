@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +16,7 @@ import psutil
 from pipeline.errors import InputError
 
 RUN_FILE = "run.json"
+_UNFINISHED = "unfinished"
 
 
 class RunDirectory:
@@ -63,18 +66,31 @@ class RunDirectory:
         """Let what there is stay, marked partial, even if the run fails."""
         self.is_worth_keeping = True
 
+    @contextmanager
+    def results(self) -> Iterator[Path]:
+        """A folder for files that are in the directory only once all of them are whole."""
+        folder = self.path / _UNFINISHED
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        try:
+            yield folder
+            for file in folder.iterdir():
+                file.replace(self.path / file.name)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
     def complete(self) -> None:
         """Give the directory its name; one that had it before is removed only now.
 
         Raises InputError where one that must not be replaced has come to be in the meantime.
         """
         _check(self.destination, self.force)
-        old = self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}")
         if self.destination.exists():
-            self.destination.rename(old)
+            self.destination.rename(self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}"))
         self.path.rename(self.destination)
         self.path = self.destination
-        shutil.rmtree(old, ignore_errors=True)
+        for old in self.destination.parent.glob(f"{escape(self.destination.name)}.replaced-*"):
+            shutil.rmtree(old, ignore_errors=True)  # also one that a killed process left
 
 
 def left_behind(destination: Path, marked_by: str) -> Path | None:

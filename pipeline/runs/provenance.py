@@ -17,6 +17,7 @@ from msgspec import Struct
 from pipeline.errors import InputError
 from pipeline.logs.remote import RemoteFile
 from pipeline.logs.sizes import files_of, size_of
+from pipeline.runs.whole_file import write_whole
 from pipeline.source import Source, without_keys
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
@@ -53,13 +54,7 @@ class Provenance(Struct, frozen=True):
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
-        new = path.with_name(f"{path.name}.new")
-        try:
-            new.write_bytes(msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
-            new.replace(path)
-        except OSError:
-            new.unlink(missing_ok=True)
-            raise
+        write_whole(path, msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n")
 
     def hashed(self, hashing: Hashing) -> Provenance:
         """With the hashes of its logs, waited for."""

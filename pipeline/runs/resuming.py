@@ -9,12 +9,12 @@ from pathlib import Path
 from pipeline.data import Scan
 from pipeline.errors import InputError
 from pipeline.runs.checkpoint import CHECKPOINT_FILE, Checkpoint, read_checkpoint
-from pipeline.runs.directory import left_behind
+from pipeline.runs.directory import RUN_FILE, left_behind
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
-from pipeline.runs.provenance import package_version
 from pipeline.runs.step_table import StepRow, StepTable
 
 _REMEDY = "run without --resume"
+_NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,6 @@ def find_left(out: Path, configuration: str) -> Left | None:
     if (folder / "config.toml").read_text(encoding="utf-8") != configuration:
         raise InputError(f"{folder}: was run with another configuration; repeat its flags, or {_REMEDY}")
     checkpoint = read_checkpoint(folder)
-    if checkpoint.version != package_version("scanchain"):
-        raise InputError(f"{folder}: was made by scanchain {checkpoint.version}; {_REMEDY}")
     steps, size = read_journal(folder, checkpoint.scans)
     if len(steps) < checkpoint.scans:
         raise InputError(f"{folder / JOURNAL_FILE}: is damaged at step {len(steps)}; {_REMEDY}")
@@ -52,16 +50,22 @@ def after(rows: Sequence[StepRow], scans: Iterator[Scan], folder: Path) -> Itera
         scan = next(scans, None)
         if scan is None or _facts(scan) != (row.stamp_ns, row.log_time_ns, row.points, row.dropped):
             raise InputError(f"{folder}: scan {row.index} of the log is not the one that was run; {_REMEDY}")
-    yield from scans
+    return scans
 
 
-def set_aside_recording(folder: Path) -> str:
-    """Keep the recording up to the checkpoint under another name, which is given back; empty without one."""
-    recording = folder / "recording.rrd"
-    if not recording.is_file():
-        return ""
-    number = len(list(folder.glob("recording.part_*.rrd")))
-    return recording.rename(folder / f"recording.part_{number}.rrd").name
+def set_aside(folder: Path, scans: int) -> tuple[str, ...]:
+    """Keep the recording up to the checkpoint under another name, and nothing else that will be made anew.
+
+    What to say of a run that goes on after so many scans.
+    """
+    for path in folder.iterdir():
+        if path.name not in _NEEDED and not path.name.startswith("recording.") and not path.is_dir():
+            path.unlink()
+    recording, before = folder / "recording.rrd", ""
+    if recording.is_file():
+        number = len(list(folder.glob("recording.part_*.rrd")))
+        before = recording.rename(folder / f"recording.part_{number}.rrd").name
+    return (f"went on after {scans:,} scans" + (f"; the recording up to there is {before}" if before else ""),)
 
 
 def _facts(scan: Scan) -> tuple[int, int, int, int]:

@@ -25,11 +25,13 @@ class Classes:
     """The classes that may stand in a snapshot, by name, and the caches in them that are left out.
 
     caches : attributes with what they are set to instead
+    version : a line that tells which code the classes belong to; that of another is not read
     """
 
-    def __init__(self, kinds: Iterable[type], caches: Mapping[tuple[type, str], Any]) -> None:
+    def __init__(self, kinds: Iterable[type], caches: Mapping[tuple[type, str], Any], version: str) -> None:
         self.by_name = {kind.__name__: kind for kind in kinds}
         self.caches = caches
+        self.version = version
 
     def of(self, name: str) -> type:
         """The class of that name. Raises InputError for one that is not listed."""
@@ -57,12 +59,15 @@ def write_snapshot(path: Path, value: Any, classes: Classes) -> None:
 
 
 def read_snapshot(path: Path, classes: Classes) -> Any:
-    """The value again. Raises InputError for a file that is not whole or no snapshot."""
+    """The value again. Raises InputError for a file that is not whole, no snapshot or of other code."""
     data = path.read_bytes()
     body, end = data[:-_END], data[-_END:]
     size = int.from_bytes(end[:8], "little")
     if not data.startswith(_MAGIC) or zlib.crc32(body) != int.from_bytes(end[8:], "little") or size > len(body):
         raise InputError(f"{path}: is no whole snapshot; run again without --resume")
+    version = body[len(_MAGIC) :].split(b"\n", 1)[0].decode()
+    if version != classes.version:
+        raise InputError(f"{path}: was made by {version}, this is {classes.version}; run again without --resume")
     return _Unpacker(body, classes).unpack(msgspec.msgpack.decode(body[len(body) - size :]))
 
 
@@ -74,7 +79,7 @@ class _Packer:
         self.seen: dict[int, int] = {}
         self.made: list[np.ndarray] = []  # kept, so that nothing else comes to lie where they did
         self.offset, self.crc = 0, 0
-        self.write(_MAGIC)
+        self.write(_MAGIC + classes.version.encode() + b"\n")
 
     def write(self, data: Any) -> None:
         self.file.write(data)

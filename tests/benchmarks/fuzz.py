@@ -1,6 +1,6 @@
 """Reads damaged logs and messages, as many as wanted, and prints what is read badly.
 
-python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--keep DIR]
+python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--only formats] [--keep DIR]
 """
 
 import argparse
@@ -14,32 +14,58 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import fuzzing
+import fuzzing_formats
 
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("--cases", type=int, default=20_000)
+    parser.add_argument("--cases", type=int, default=20_000, help="of each kind")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=KINDS, help="one kind of case; else all")
     parser.add_argument("--keep", type=Path, help="folder for the files that are read badly")
     options = parser.parse_args()
-    rng = np.random.default_rng(options.seed)
-    began, bad = time.perf_counter(), 0
-    with tempfile.TemporaryDirectory() as folder:
-        seeds = list(fuzzing.seeds(Path(folder)))
-        each = options.cases // (2 * len(seeds))
-        for seed in seeds:
-            for damaged, wrong in fuzzing.file_complaints(seed, rng, each):
-                bad += 1
-                print(f"{seed.name}: {damaged.what}: {wrong}", flush=True)
-                if options.keep:
+    bad = 0
+    for name in [options.only] if options.only else KINDS:
+        began, found = time.process_time(), 0
+        with tempfile.TemporaryDirectory() as folder:
+            for wrong, data in KINDS[name](Path(folder), np.random.default_rng(options.seed), options.cases):
+                found += 1
+                print(wrong, flush=True)
+                if options.keep and data is not None:
                     options.keep.mkdir(parents=True, exist_ok=True)
-                    (options.keep / f"{bad}.mcap").write_bytes(damaged.data)
-        for wrong in fuzzing.payload_complaints(Path(folder), rng, options.cases // 2):
-            bad += 1
-            print(wrong, flush=True)
-    print(f"{options.cases} cases and every cut in {time.perf_counter() - began:.0f} s: {bad} read badly")
+                    (options.keep / f"{name}_{found}").write_bytes(data)
+        print(f"{name}: {options.cases} cases in {time.process_time() - began:.0f} s of CPU, {found} read badly")
+        bad += found
     return 1 if bad else 0
 
+
+def _mcap(folder, rng, cases):
+    """Damaged files, and every cut at a record beside them."""
+    seeds = list(fuzzing.seeds(folder))
+    for seed in seeds:
+        for damaged, wrong in fuzzing.file_complaints(seed, rng, cases // len(seeds)):
+            yield f"{seed.name}: {damaged.what}: {wrong}", damaged.data
+
+
+def _formats(folder, rng, cases):
+    seeds = list(fuzzing_formats.seeds(folder))
+    for seed in seeds:
+        for name, damaged, wrong in fuzzing_formats.complaints(seed, rng, cases // len(seeds)):
+            yield f"{seed.name}: {name}: {damaged.what}: {wrong}", damaged.data
+
+
+def _real(folder, rng, cases):
+    for log in fuzzing.REAL:
+        for damaged, wrong in fuzzing.real_complaints(log, folder, rng, cases // len(fuzzing.REAL)):
+            yield f"{log}: {damaged.what}: {wrong}", damaged.data
+
+
+def _messages(folder, rng, cases):
+    for wrong in fuzzing.payload_complaints(folder, rng, cases):
+        yield wrong, None
+
+
+KINDS = {"mcap": _mcap, "formats": _formats, "real": _real, "messages": _messages}
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -1,33 +1,37 @@
-"""ROS 1 bags, and ROS 2 bags kept in SQLite, read by rosbags; their messages stay as they are."""
+"""ROS bags: those of ROS 2 that are kept in SQLite are read by rosbags; their messages stay as they are."""
 
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
-from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import ConnectionExtRosbag1
+from rosbags import rosbag2
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from pipeline.errors import InputError
 from pipeline.logs.formats.made import made_index
+from pipeline.logs.formats.ros1_bag import index_ros1_bag
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 from pipeline.logs.ros2_definitions import schema_text
 from pipeline.logs.sizes import size_of
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
 _MOST_BLOCKS = 4096
+_MOST_TRIES = 400  # to read parts of a damaged block
+_LATEST_NS = (1 << 63) - 1
 
 
 def index_bag(path: Path, number: int) -> FileIndex:
-    """The topics of a bag: a .bag, a .db3, or the folder of a ROS 2 bag. Raises InputError where it is damaged."""
-    index = made_index(path, number)
-    bag = _Bag(index, _open(path))
+    """The topics of a bag: a .bag, a .db3, or the folder of a ROS 2 bag. Raises InputError for what is none."""
+    if _is_ros1(path):
+        return index_ros1_bag(path, number)
+    index, reader = made_index(path, number), _open(path)
+    if not all(_is_sound(connection) for connection in reader.connections):
+        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
+    bag = _Bag(index, reader)
     index.make = bag.make
     return index
 
@@ -61,32 +65,35 @@ class _Bag:
             self._cut()
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a span of time."""
+        """The messages of a span of time; one that cannot be read is halved until what is damaged stands alone."""
         chosen = [c for number, c in self.connections.items() if wanted is None or number in wanted]
         messages: list[Message] = []
-        damage = ""
-        try:
-            with self.lock:
-                found = self._between(chosen, block.start_ns, block.end_ns + 1) if chosen else ()
-                for connection, time_ns, data in found:
-                    channel = self.index.channels[self.numbers[id(connection)]]
-                    messages.append(Message(channel, time_ns, memoryview(data)))
-        except Exception as error:  # whatever a damaged file makes the libraries below raise
-            reason = " ".join(str(error).split()) or type(error).__name__
-            damage = f"{self.index.path}: from {block.start_ns * 1e-9:.1f} s on it cannot be read ({reason})"
-        return Contents(messages, damage)
+        lost, first_ns, reason = 0, 0, ""
+        spans, tries = [self._ends(block)] if chosen else [], _MOST_TRIES
+        with self.lock:
+            while spans:
+                start_ns, stop_ns = spans.pop()
+                try:
+                    found = list(self.reader.messages(chosen, start_ns, stop_ns))
+                except Exception as error:  # whatever a damaged file makes the libraries below raise
+                    middle_ns, tries = (start_ns + stop_ns) // 2, tries - 1
+                    if start_ns < middle_ns and tries > 0:
+                        spans += [(middle_ns, stop_ns), (start_ns, middle_ns)]
+                    else:
+                        first_ns, reason = first_ns or start_ns, reason or _reason(error)
+                        lost += 1
+                    continue
+                messages += [
+                    Message(self.index.channels[self.numbers[id(connection)]], time_ns, memoryview(data))
+                    for connection, time_ns, data in found
+                ]
+        what = f"at least {lost} messages from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
+        return Contents(messages, f"{self.index.path}: {what}" if lost else "")
 
-    def _between(self, chosen: Sequence[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
-        """Messages from start up to stop; the reader of ROS 1 bags would walk all that come before."""
-        if not isinstance(self.reader, rosbag1.Reader):
-            yield from self.reader.messages(chosen, start_ns, stop_ns)
-            return
-        whole = self.reader.indexes
-        try:
-            self.reader.indexes = {c.id: _slice(whole[c.id], start_ns, stop_ns) for c in chosen}
-            yield from self.reader.messages(chosen)
-        finally:
-            self.reader.indexes = whole
+    def _ends(self, block: Block) -> tuple[int, int]:
+        """From when to when a block lasts; the first and the last reach as far as time, whatever the bag says."""
+        is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
+        return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
 
     def _cut(self) -> None:
         """Spans of time of one length, so many that each holds a few megabytes on average."""
@@ -103,25 +110,28 @@ class _Bag:
 
 def _open(path: Path) -> Any:
     try:
-        reader = rosbag1.Reader(path) if _is_ros1(path) else rosbag2.Reader(path)
+        reader = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
-        reason = " ".join(str(error).split()) or type(error).__name__
-        remedy = "rosbag reindex mends a .bag, ros2 bag reindex the folder of a ROS 2 bag"
-        raise InputError(f"{path}: cannot be read as a ROS bag ({reason}); {remedy}") from error
+        raise InputError(
+            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
+            "ros2 bag reindex mends the folder of a ROS 2 bag"
+        ) from error
     return reader
 
 
-def _slice(entries: list[rosbag1.reader.IndexData], start_ns: int, stop_ns: int) -> list[rosbag1.reader.IndexData]:
-    first, last = (bisect_left(entries, time_ns, key=lambda entry: entry.time) for time_ns in (start_ns, stop_ns))
-    return entries[first:last]
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _is_sound(connection: Any) -> bool:
+    """Whether what a bag tells of a topic is of the right kind."""
+    texts = connection.topic, connection.msgtype, connection.ext.serialization_format
+    return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
 
 
 def _channel(key: tuple[int, int], connection: Any) -> Channel:
     told = connection.msgdef
-    if isinstance(connection.ext, ConnectionExtRosbag1):
-        type_name = connection.msgtype.replace("/msg/", "/")
-        return Channel(key, connection.topic, "ros1", key[1], type_name, "ros1msg", told.data.encode())
     encoding = connection.ext.serialization_format
     language = "ros2idl" if told.format.name == "IDL" else "ros2msg"
     definition = told.data.encode() or _definition(connection.msgtype)
@@ -132,7 +142,7 @@ def _definition(type_name: str) -> bytes:
     """What a type looks like that an old bag does not define, empty where nobody here knows."""
     try:
         return schema_text(type_name)
-    except KeyError:
+    except (KeyError, ValueError):
         return b""
 
 

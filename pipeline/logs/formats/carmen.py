@@ -6,18 +6,15 @@ where stamps step back. Format: https://carmen.sourceforge.net/logger_playback.h
 
 from __future__ import annotations
 
-import bz2
-import gzip
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
-from io import BufferedIOBase
 from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
 from pipeline.logs.formats.made import made_block, made_channel, made_index
+from pipeline.logs.formats.packed_text import read_text
 from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 from pipeline.source import Source
@@ -25,13 +22,11 @@ from pipeline.source import Source
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
-_MOST_TEXT_BYTES = 2 << 30  # what a packed log may unpack to
-_PIECE_BYTES = 1 << 20
 
 
 def index_carmen(path: Path, number: int) -> FileIndex:
     """Find the lines of a log. Raises InputError where the file holds none that is known."""
-    text, damage = _text(path)
+    text, damage = read_text(path)
     index = made_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
@@ -146,26 +141,3 @@ def _complaint(path: Source, malformed: list[int]) -> str:
     if not malformed:
         return ""
     return f"{path}: {len(malformed)} malformed lines were left out (the first: line {malformed[0]})"
-
-
-def _text(path: Path) -> tuple[bytes, str]:
-    """What the file unpacks to, and what is wrong with the rest of it."""
-    try:
-        head = path.open("rb").read(3)
-        unpack = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else open
-        with unpack(path, "rb") as stream:
-            return _read(path, stream)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
-
-
-def _read(path: Path, stream: BufferedIOBase) -> tuple[bytes, str]:
-    text = bytearray()
-    try:
-        while piece := stream.read(_PIECE_BYTES):
-            text += piece
-            if len(text) > _MOST_TEXT_BYTES:
-                raise InputError(f"{path}: unpacks to more than {_MOST_TEXT_BYTES:,} bytes; is it a CARMEN log?")
-    except (OSError, EOFError, zlib.error) as error:
-        return bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})"
-    return bytes(text), ""

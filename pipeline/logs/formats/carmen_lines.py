@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.logs.pack import Place, pack_laser_scan, pack_odometry
+from pipeline.logs.pack import LATEST_NS, Place, pack_laser_scan, pack_odometry
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")
@@ -37,8 +37,14 @@ class CarmenScan(NamedTuple):
 
 
 def stamp_of(words: list[bytes]) -> int:
-    """Nanoseconds of a line's own stamp, the third word from behind, held as the double that CARMEN keeps."""
-    return int(float(words[-3]) * 1e9)
+    """Nanoseconds of a line's own stamp, the third word from behind, held as the double that CARMEN keeps.
+
+    Raises ValueError or IndexError where that is none.
+    """
+    stamp_ns = int(float(words[-3]) * 1e9)
+    if not 0 <= stamp_ns < LATEST_NS:
+        raise ValueError(f"{stamp_ns} ns is no stamp")
+    return stamp_ns
 
 
 def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: float) -> CarmenScan:

@@ -11,7 +11,7 @@ from pipeline.errors import InputError
 from pipeline.logs.formats.cloud_file import SUFFIXES, read_cloud_file
 from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
 from pipeline.logs.formats.point_rows import CloudFileError
-from pipeline.logs.pack import pack_cloud
+from pipeline.logs.pack import LATEST_NS, pack_cloud
 from pipeline.logs.records import Block, Contents, FileIndex, Message
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
@@ -51,14 +51,14 @@ def stamp_of_name(stem: str) -> int | None:
     Understood are nanoseconds, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a
     fraction (``12.375``), and seconds and nanoseconds apart (``cloud_1583836591_182590976``).
     """
+    stamp_ns = LATEST_NS
     if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):
-        return int(match[1]) * _NS + int(match[2].ljust(9, "0"))
-    if match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
-        return int(match[1]) * _NS + int(match[2])
-    match = re.search(r"(?<!\d)(\d+)$", stem)
-    if match and len(match[1]) in _UNITS_NS and not match[1].startswith("0"):
-        return int(match[1]) * _UNITS_NS[len(match[1])]
-    return None
+        stamp_ns = int(match[1]) * _NS + int(match[2].ljust(9, "0"))
+    elif match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
+        stamp_ns = int(match[1]) * _NS + int(match[2])
+    elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
+        stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
+    return stamp_ns if stamp_ns < LATEST_NS else None
 
 
 def _files(folder: Path) -> list[Path]:

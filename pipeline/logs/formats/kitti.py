@@ -5,13 +5,13 @@ Geiger, Lenz, Stiller & Urtasun 2013, "Vision meets robotics: the KITTI dataset"
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
-import numpy as np
+from numpy.linalg import LinAlgError
 
-from pipeline.data import Matrix, Pose
+from pipeline.data import Pose
 from pipeline.errors import InputError
 from pipeline.logs.formats.cloud_file import read_xyzi
 from pipeline.logs.formats.kitti_truth import (
@@ -28,6 +28,7 @@ from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 
 _TRUTH = -1  # the block of the ground truth
 _POSE_BYTES = 720
+Told = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
@@ -35,18 +36,7 @@ def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     files = _sweeps(folder / "velodyne_points" / "data")
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
     index = made_index(folder, number)
-    truth_ns, truth = [], np.empty((0, 4, 4))
-    calibration = folder.parent / "calib_imu_to_velo.txt"
-    if not (folder / "oxts").is_dir():
-        index.notes.append(f"{folder}: has no oxts folder, so no ground truth")
-    elif not calibration.is_file():
-        index.notes.append(
-            f"{calibration}: is absent, so the GPS/INS poses cannot be moved to the lidar; no truth"
-        )
-    else:
-        truth_ns = read_times(folder / "oxts" / "timestamps.txt")
-        truth = read_oxts(folder / "oxts" / "data", read_calibration(calibration))
-    return _index(index, files, times_ns, truth_ns, truth)
+    return _index(index, files, times_ns, _told(index, lambda: _raw_truth(index, folder)))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
@@ -54,14 +44,42 @@ def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     files = _sweeps(folder / "velodyne")
     times_ns = read_seconds(folder / "times.txt")
     index = made_index(folder, number)
-    truth = np.empty((0, 4, 4))
+    return _index(index, files, times_ns, _told(index, lambda: _benchmark_truth(index, folder, times_ns)))
+
+
+def _raw_truth(index: FileIndex, folder: Path) -> Told:
+    calibration = folder.parent / "calib_imu_to_velo.txt"
+    if not (folder / "oxts").is_dir():
+        index.notes.append(f"{folder}: has no oxts folder, so no ground truth")
+        return []
+    if not calibration.is_file():
+        index.notes.append(
+            f"{calibration}: is absent, so the GPS/INS poses cannot be moved to the lidar; no truth"
+        )
+        return []
+    times_ns = read_times(folder / "oxts" / "timestamps.txt")
+    poses = read_oxts(folder / "oxts" / "data", read_calibration(calibration))
+    if len(poses) != len(times_ns):
+        raise InputError(f"{folder / 'oxts'}: has {len(poses)} readings and {len(times_ns)} times; fetch it again")
+    return list(zip(times_ns, poses, strict=True))
+
+
+def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) -> Told:
     name = folder.resolve().name
-    poses = folder.resolve().parent.parent / "poses" / f"{name}.txt"
-    if not poses.is_file():
-        index.notes.append(f"{poses}: is absent, so there is no ground truth")
-    else:
-        truth = read_camera_poses(poses, folder / "calib.txt")
-    return _index(index, files, times_ns, times_ns[: len(truth)], truth)
+    file = folder.resolve().parent.parent / "poses" / f"{name}.txt"
+    if not file.is_file():
+        index.notes.append(f"{file}: is absent, so there is no ground truth")
+        return []
+    return list(zip(times_ns, read_camera_poses(file, folder / "calib.txt"), strict=False))
+
+
+def _told(index: FileIndex, read: Callable[[], Told]) -> Told:
+    """The ground truth; none where its files are damaged, which the sweeps do not suffer from."""
+    try:
+        return read()
+    except (InputError, LinAlgError) as error:
+        index.note_damage(f"{error}; until then there is no ground truth")
+        return []
 
 
 def _sweeps(folder: Path) -> list[Path]:
@@ -71,9 +89,7 @@ def _sweeps(folder: Path) -> list[Path]:
     return files
 
 
-def _index(
-    index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], truth_ns: Sequence[int], truth: Matrix
-) -> FileIndex:
+def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], told: Told) -> FileIndex:
     """/velodyne_points from the files, whose names count the times, and /ground_truth."""
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
@@ -83,7 +99,6 @@ def _index(
     lidar = made_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
     for entry, file in enumerate(files):
         made_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
-    told = list(zip(truth_ns, truth, strict=False))
     if told:
         poses = made_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
         made_block(index, _TRUTH, _POSE_BYTES * len(told), [stamp_ns for stamp_ns, _ in told], {poses: len(told)})
@@ -108,7 +123,7 @@ def _sweep(channel: Channel, file: Path, stamp_ns: int) -> Contents:
     return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
 
-def _truth(channel: Channel, told: Sequence[tuple[int, Pose]]) -> Contents:
+def _truth(channel: Channel, told: Told) -> Contents:
     messages = []
     for stamp_ns, T_world_lidar in told:
         data = pack_odometry(stamp_ns, "world", "velodyne", place(T_world_lidar))

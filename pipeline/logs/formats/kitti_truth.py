@@ -10,8 +10,10 @@ import numpy as np
 from pipeline import lie
 from pipeline.data import Matrix, Pose
 from pipeline.errors import InputError
+from pipeline.logs.pack import LATEST_NS
 
 _EARTH_M = 6378137.0
+_MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
 _NS = 1_000_000_000
 
 
@@ -22,7 +24,10 @@ def read_times(file: Path) -> list[int]:
 
 def read_seconds(file: Path) -> list[int]:
     """Nanoseconds of each line that is a number of seconds."""
-    return [round(float(seconds) * _NS) for seconds in _table(file, 1)[:, 0]]
+    seconds = _table(file, 1)[:, 0].tolist()
+    if not all(0.0 <= each * _NS < LATEST_NS for each in seconds):
+        raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; fetch it again")
+    return [round(each * _NS) for each in seconds]
 
 
 def read_calibration(file: Path) -> Pose:
@@ -46,7 +51,9 @@ def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
     rows = np.vstack([_table(file, 6)[:1] for file in sorted(folder.glob("*.txt"))] or [np.empty((0, 6))])
     if not len(rows):
         return np.empty((0, 4, 4))
-    latitude, longitude, up_m, roll, pitch, yaw = rows[:, :6].T
+    if np.abs(rows[:, 0]).max() > _MOST_LATITUDE:
+        raise InputError(f"{folder}: tells a latitude beyond {_MOST_LATITUDE:g} degrees; fetch it again")
+    latitude, longitude, up_m, roll, pitch, yaw = rows.T
     scale = np.cos(np.radians(latitude[0]))
     T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
     T_world_imu[:, 0, 3] = scale * _EARTH_M * np.radians(longitude)
@@ -61,7 +68,7 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
     """T_world_lidar (N, 4, 4) of the odometry benchmark's camera poses, from the first lidar pose on."""
     rows = _table(file, 12)
     T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_camera[:, :3] = rows[:, :12].reshape(-1, 3, 4)
+    T_world_camera[:, :3] = rows.reshape(-1, 3, 4)
     told = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
     try:
         T_camera_lidar = np.vstack([np.array(told["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
@@ -85,25 +92,33 @@ def _parsed(file: Path, number: int, line: str) -> int:
     whole, _, fraction = line.strip().partition(".")
     try:
         moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-        return int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
+        stamp_ns = int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
+        if not 0 <= stamp_ns < LATEST_NS:
+            raise ValueError("before 1970 or after 2038")
+        return stamp_ns
     except ValueError as error:
         raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); fetch it again") from error
 
 
 def _table(file: Path, columns: int) -> Matrix:
+    """The first columns of a file of numbers, all of them finite."""
+    words = [line.split() for line in _lines(file)]
+    few = next((number for number, row in enumerate(words, start=1) if len(row) < columns), 0)
+    if few:
+        raise InputError(
+            f"{file}: line {few} has {len(words[few - 1])} columns, {columns} are needed; fetch it again"
+        )
     try:
-        rows = np.loadtxt(file, ndmin=2)
+        rows = np.array([row[:columns] for row in words], np.float64).reshape(-1, columns)
     except ValueError as error:
         raise InputError(f"{file}: is no table of numbers ({error}); fetch it again") from error
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error}); fetch it again") from error
-    if rows.size and rows.shape[1] < columns:
-        raise InputError(f"{file}: has {rows.shape[1]} columns, {columns} are needed; fetch it again")
+    if not len(rows) or not np.isfinite(rows).all():
+        raise InputError(f"{file}: is empty, or holds numbers that are not finite; fetch it again")
     return rows
 
 
 def _lines(file: Path) -> list[str]:
     try:
-        return [line for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); fetch it again") from error

@@ -64,7 +64,10 @@ def _unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_RATIO * len(packed):
         raise CloudFileError(f"does not unpack: {size} bytes are told for {count} points, {len(packed)} are there")
-    data = lzf.decompress(packed, size)
+    try:
+        data = lzf.decompress(packed, size)
+    except ValueError:
+        data = None
     if data is None or len(data) != size:
         raise CloudFileError("does not unpack: its bytes are damaged")
     rows = np.empty(count, point)

@@ -46,6 +46,8 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
                 raise CloudFileError(f"has the vertex property {' '.join(words[1:])!r}, which is not understood")
     if not form or not fields:
         raise CloudFileError("is no PLY with vertices")
+    if len(dict(fields)) < len(fields):
+        raise CloudFileError(f"has a vertex property twice among {' '.join(name for name, _ in fields)}")
     return np.dtype(fields), count, form
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import IO
 
 import numpy as np
@@ -14,8 +15,9 @@ class CloudFileError(Exception):
 
 def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """``count`` lines of numbers."""
+    lines = list(islice((line for line in file if line.strip()), count))
     try:
-        rows = np.loadtxt(file, point, max_rows=count, ndmin=1) if count else np.empty(0, point)
+        rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
     except ValueError as error:
         raise CloudFileError(f"is no list of {count} points ({error})") from error
     return _all_of(rows, count)

@@ -1,0 +1,198 @@
+"""ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
+
+The records are walked as those of an MCAP file are, and what is damaged is passed over in the same way.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections import Counter
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.logs.blocks import unpack
+from pipeline.logs.counting import messages_of
+from pipeline.logs.formats.ros1_bag_records import (
+    CHUNK,
+    CHUNK_INFO,
+    CONNECTION,
+    HEADER,
+    INDEX,
+    MAGIC,
+    MESSAGE,
+    Record,
+    as_ns,
+    channel_of,
+    next_record,
+    read_record,
+    whole_records,
+)
+from pipeline.logs.records import Block, Channel, Contents, Entry, FileIndex, Message
+from pipeline.logs.walk import is_believable
+
+_INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
+
+
+def index_ros1_bag(path: Path, number: int) -> FileIndex:
+    """What lies where in a bag. Raises InputError for one that is empty, encrypted or of an old version."""
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
+        index = FileIndex(path, number, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), profile="ros1")
+    bag = _Bag(index)
+    index.make = bag.make
+    bag.walk()
+    bag.finish()
+    return index
+
+
+class _Bag:
+    """Sorts the records of a bag into its index; a chunk waits for the indexes that follow it."""
+
+    def __init__(self, index: FileIndex) -> None:
+        self.index = index
+        self.chunk: Block | None = None
+        self.entries: list[Entry] = []
+        self.times_ns: list[int] = []
+        self.is_sure = True  # of the entries
+        self.told: Counter[int] = Counter()  # messages by connection, as the bag itself counts them
+
+    def walk(self) -> None:
+        """Take in one record after the other, and go on behind damage."""
+        data, offset = self.index.data, len(MAGIC)
+        while offset < len(data):
+            record = read_record(data, offset)
+            if record is not None and (record.end == len(data) or self._is_followed(record)):
+                self._take(record)
+                offset = record.end
+                continue
+            behind = next_record(data, offset, offset if record is None else record.end)
+            limit = len(data) if behind is None else behind.offset
+            if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
+                self._take(record)
+            self._close(complete=False)
+            if behind is None:
+                self.index.damage.append(f"{self.index.path}: cut off, or damaged to its end, at byte {offset}")
+                return
+            self.index.damage.append(
+                f"{self.index.path}: the record at byte {offset} is damaged; "
+                f"reading went on at byte {behind.offset}"
+            )
+            offset = behind.offset
+        self._close(complete=True)
+
+    def finish(self) -> None:
+        """Count what there is, opening the chunks that nothing tells about."""
+        index = self.index
+        is_doubtful = bool(self.told) and self.told != _counts(index.blocks)
+        index.blocks = [
+            self._looked_into(block) if is_doubtful or not block.entries else block for block in index.blocks
+        ]
+        index.counts = dict(_counts(index.blocks))
+        index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
+        index.is_counted = True
+
+    def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
+        """The messages of a chunk; connections met on the way join the index."""
+        name = f"{self.index.path}: the chunk at byte {block.offset}"
+        messages: list[Message] = []
+        strangers = 0
+        try:
+            payload = unpack(self.index, block)
+            for record in whole_records(payload):
+                if record.opcode == CONNECTION:
+                    self._define(channel_of(self.index.number, record, payload))
+                elif record.opcode == MESSAGE:
+                    number, time_ns = record.number(b"conn"), record.time_ns(b"time")
+                    channel = self.index.channels.get(number)
+                    strangers += channel is None
+                    if channel is not None and (wanted is None or number in wanted):
+                        messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
+        except struct.error:
+            damage = f"{name}: a record in it is malformed; what follows was left out"
+            return Contents(messages, "" if block.is_cut else damage)
+        return Contents(messages, f"{name}: {strangers} messages name no known connection" if strangers else "")
+
+    def _is_followed(self, record: Record) -> bool:
+        return record.end < len(self.index.data) and read_record(self.index.data, record.end) is not None
+
+    def _take(self, record: Record) -> None:
+        try:
+            self._sort(record)
+        except (struct.error, ValueError):
+            self.index.damage.append(
+                f"{self.index.path}: the record at byte {record.offset} is malformed and was left out"
+            )
+            self.is_sure = False
+
+    def _sort(self, record: Record) -> None:
+        if record.opcode == INDEX:
+            self._index(record)
+            return
+        self._close(complete=True)
+        if record.opcode == CHUNK:
+            self._chunk(record)
+        elif record.opcode == CONNECTION:
+            self._define(channel_of(self.index.number, record, memoryview(self.index.data)))
+        elif record.opcode == CHUNK_INFO:
+            pairs = np.frombuffer(self.index.data, "<u4", 2 * record.number(b"count"), record.begin)
+            for number, count in pairs.reshape(-1, 2).tolist():
+                self.told[number] += count
+        elif record.opcode == HEADER and record.text(b"encryptor"):
+            raise InputError(f"{self.index.path}: is encrypted ({record.text(b'encryptor')}); decrypt it first")
+
+    def _chunk(self, record: Record) -> None:
+        index, end = self.index, len(self.index.data)
+        size, claimed = min(record.end, end) - record.begin, record.number(b"size")
+        if not is_believable(size, claimed):
+            index.damage.append(
+                f"{index.path}: the chunk at byte {record.offset} claims to unpack from {size} to {claimed} "
+                "bytes, more than is believed, and was left out"
+            )
+            return
+        name = record.text(b"compression")
+        compression = "" if name == "none" else name
+        is_cut = record.end > end
+        self.chunk = Block(index.number, record.begin, size, compression, claimed, 0, 0, 0, is_cut=is_cut)
+
+    def _index(self, record: Record) -> None:
+        """How many messages of a connection the chunk before holds, and when they came."""
+        times = np.frombuffer(self.index.data, _INDEX_TIMES, record.number(b"count"), record.begin)
+        if len(times) and self.chunk is not None:
+            self.entries.append(Entry(record.number(b"conn"), -1, len(times)))
+            times_ns = as_ns(times["s"].astype(np.int64), times["ns"])
+            self.times_ns += [int(times_ns.min()), int(times_ns.max())]
+
+    def _define(self, channel: Channel) -> None:
+        self.index.channels.setdefault(channel.key[1], channel)
+
+    def _close(self, *, complete: bool) -> None:
+        """The chunk is over; what does not tell all of its messages is not believed."""
+        if self.chunk is not None:
+            block = self.chunk
+            if complete and self.is_sure and self.entries:
+                first_ns, last_ns = min(self.times_ns), max(self.times_ns)
+                block = replace(block, start_ns=first_ns, end_ns=last_ns, entries=tuple(self.entries))
+            self.index.blocks.append(block)
+        self.chunk, self.entries, self.times_ns, self.is_sure = None, [], [], True
+
+    def _looked_into(self, block: Block) -> Block:
+        """A chunk whose messages have been counted by unpacking it."""
+        messages = messages_of(self.index, block)
+        counts = Counter(message.channel.key[1] for message in messages)
+        times_ns = [message.log_time_ns for message in messages] or [0]
+        entries = tuple(Entry(number, -1, count) for number, count in counts.items())
+        return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
+
+
+def _counts(blocks: list[Block]) -> Counter[int]:
+    """Messages by connection."""
+    counts: Counter[int] = Counter()
+    for entry in (entry for block in blocks for entry in block.entries):
+        counts[entry.channel] += entry.messages
+    return counts

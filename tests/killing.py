@@ -1,0 +1,152 @@
+"""Killing runs at random moments, reading what is left of them, and going on."""
+
+import json
+import random
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+
+import pyarrow.parquet as pq
+from rerun.chunk import RrdReader
+from scenes import ROOT
+
+from pipeline.graph.g2o import read_g2o
+from pipeline.maps import read_map, read_ply
+from pipeline.runs.checkpoint import CHECKPOINT_FILE, read_checkpoint
+from pipeline.runs.journal import JOURNAL_FILE, read_journal
+from pipeline.trajectory import read_kitti, read_tum
+
+_KILLS_A_RUN = 3  # then it may go on to its end
+COLUMNS = ["index", "stamp_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "odom_x", "odom_qz", "covariance", "state",
+           "reason", "keyframe", "inliers", "iterations", "residual_m"]  # fmt: skip
+
+
+@dataclass
+class Killed:
+    """What a killed process left: the moment of its end, and how far the run had come."""
+
+    after_s: float
+    where: str
+    steps: int
+
+
+def start(log, out, *words, **options):
+    command = [sys.executable, "-m", "pipeline", "run", str(log), "--out", str(out), *words]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
+    return subprocess.Popen(command, cwd=ROOT, **quiet)
+
+
+def partial(out):
+    """What a killed run left, None before its directory is there."""
+    return next(out.parent.glob(f"{out.name}.partial-*"), None)
+
+
+def steps_on_disk(out):
+    try:
+        return len(read_journal(partial(out) or out)[0])
+    except FileNotFoundError:  # not there yet, or just taking another name
+        return 0
+
+
+def same_result(a, b):
+    for name in ("trajectory.tum", "trajectory.kitti.txt", "odometry.tum", "graph.g2o", "map.ply", "map.pgm"):
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+    tables = [pq.read_table(folder / "steps.parquet", columns=COLUMNS) for folder in (a, b)]
+    assert tables[0].equals(tables[1])
+    assert {path.name for path in b.iterdir()} <= {path.name for path in a.iterdir()}
+    assert not list(a.glob("*.new"))
+
+
+def assert_readable(folder):
+    """Every file of a run directory opens and is whole; how many steps it holds and how far it had come."""
+    steps = 0
+    for path in sorted(folder.iterdir()):
+        if path.suffix == ".new" or path.name == "unfinished":  # told by its name
+            continue
+        read = _READ.get(path.name) or _READ.get(path.suffix)
+        assert read is not None, f"{path.name} is of no kind that a run should leave"
+        try:
+            found = read(path)
+            steps = max(steps, found) if isinstance(found, int) else steps
+        except Exception as error:
+            raise AssertionError(f"{path} does not open: {type(error).__name__}: {error}") from error
+    return steps
+
+
+def kill_at_random(log, words, folder, whole, *, kills, seed, longest_s):
+    """Kill runs of a log at moments drawn from their whole duration, going on after each; what was left each time.
+
+    After every third kill, and wherever a run is done before it is killed, its result must equal ``whole``.
+    """
+    rng, killed, number = random.Random(seed), 0, 0
+    while killed < kills:
+        out = folder / f"run_{number}"
+        for _ in range(min(_KILLS_A_RUN, kills - killed)):
+            after_s = rng.uniform(0.0, longest_s)
+            if _is_killed(start(log, out, *words, "--resume"), after_s):
+                killed += 1
+                yield _left(out, after_s)
+            if out.exists():
+                break
+        if not out.exists():
+            assert start(log, out, *words, "--resume").wait() == 0
+        same_result(out, whole)
+        number += 1
+
+
+def _is_killed(child, after_s):
+    """Whether the process was killed after that time, not done before."""
+    try:
+        assert child.wait(after_s) == 0
+        return False
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+        return True
+
+
+def _left(out, after_s):
+    if out.exists():
+        assert_readable(out)
+        return Killed(after_s, "when it was done", len(read_tum(out / "trajectory.tum")))
+    folders = list(out.parent.glob(f"{out.name}.partial-*"))
+    steps = max((assert_readable(folder) for folder in folders), default=0)
+    names = {path.name for folder in folders for path in folder.iterdir()}
+    where = next((what for name, what in _REACHED.items() if name in names), "before its directory was there")
+    return Killed(after_s, where, steps)
+
+
+def _read_checkpoint(path):
+    steps = read_checkpoint(path.parent).scans
+    assert steps <= len(read_journal(path.parent)[0]), "the checkpoint is ahead of the journal"
+
+
+def _read_html(path):
+    assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
+
+
+def _read_text(path):
+    assert path.read_text(encoding="utf-8").endswith("\n")
+
+
+_READ = {
+    JOURNAL_FILE: lambda path: len(read_journal(path.parent)[0]),
+    CHECKPOINT_FILE: _read_checkpoint,
+    ".tum": lambda path: len(read_tum(path)),
+    "trajectory.kitti.txt": lambda path: len(read_kitti(path)),
+    "summary.txt": _read_text,
+    ".g2o": read_g2o,
+    ".parquet": pq.read_table,
+    ".ply": read_ply,
+    ".pgm": lambda path: read_map(path.parent),
+    ".yaml": lambda path: read_map(path.parent),
+    ".json": lambda path: json.loads(path.read_text(encoding="utf-8")),
+    ".toml": lambda path: tomllib.loads(path.read_text(encoding="utf-8")),
+    ".rrd": lambda path: list(RrdReader(path).stream()),
+    ".html": _read_html,
+}
+_REACHED = {
+    "report.html": "completing", "metrics.json": "writing its report", "trajectory.tum": "writing results",
+    CHECKPOINT_FILE: "after a checkpoint", JOURNAL_FILE: "before the first checkpoint", "run.json": "opening",
+}  # fmt: skip
