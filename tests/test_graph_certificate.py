@@ -227,3 +227,22 @@ def test_what_the_bound_cannot_do_is_said():
     graph.add_edge(0, 2, lie.pose_2d(0.0, 0.0, 3.0), 1e-6 * np.eye(3))
     graph.optimise(PLAIN)
     assert graph.certify().reason == "1 edges are too far from their measurements to be bounded, first 0-2"
+
+
+def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
+    rng = np.random.default_rng(0)
+    graph = PoseGraph(2)
+    truth = [lie.pose_2d(4.0 * np.cos(a), 4.0 * np.sin(a), a + np.pi / 2) for a in np.linspace(0.0, 6.0, 40)]
+    for k, pose in enumerate(truth):
+        graph.add_pose(pose, k)
+    for reach in (1, 2, 5):
+        for i in range(40 - reach):
+            off = lie.exp(0.05 * rng.normal(size=3))
+            graph.add_edge(i, i + reach, lie.inverse(truth[i]) @ truth[i + reach] @ off, 400.0 * np.eye(3))
+    contrary = lie.inverse(truth[3]) @ truth[30] @ lie.pose_2d(0.0, 0.0, 2.0)
+    graph.add_edge(3, 30, contrary, 0.1 * np.eye(3))
+    graph.optimise(GraphConfig(robust="none"))
+    certificate = graph.certify()
+    price = graph.state().edge_chi2[-1]
+    assert certificate.certified
+    assert 0.9 * price < certificate.gap < 0.01 * certificate.chi2

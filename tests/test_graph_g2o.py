@@ -9,6 +9,7 @@ from pipeline.errors import InputError
 from pipeline.graph.g2o import read_g2o
 from pipeline.graph.g2o_write import write_g2o, write_toro
 from pipeline.graph.pose_graph import PoseGraph
+from pipeline.graph.soundness import check_connected
 
 SQUARE = """\
 # a comment
@@ -209,3 +210,9 @@ def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
     for path in (tmp_path / "none.g2o", tmp_path, tmp_path / "bytes.g2o"):
         with pytest.raises(InputError, match="cannot be read as g2o"):
             read_g2o(path)
+
+
+def test_poses_that_nothing_holds_are_called_by_their_ids():
+    held = np.array([True, False, False, False])
+    with pytest.raises(InputError, match="not joined to a fixed one: 30, 40"):
+        check_connected(np.array([[0, 1], [2, 3]]), held, np.array([10, 20, 30, 40]))

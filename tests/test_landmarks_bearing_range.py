@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import naive_landmarks
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements, 
 from pipeline.landmarks.minimise import QUADRATIC, minimise
 from pipeline.landmarks.npz import read_landmark_data
 from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import METHODS, create_solver
+from pipeline.landmarks.solvers import METHODS, UndeterminedError, create_solver
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -93,7 +95,7 @@ def nonlinear():
 
 
 @pytest.mark.parametrize("guess", ["disturbed", "origin", "turned the other way"])
-@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "gauss-newton"])
+@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "gauss-newton", "dogleg"])
 def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, optimiser):
     data, problem, good, best = nonlinear
     assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
@@ -106,6 +108,27 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
     minimum = minimise(problem, start, create_solver("schur"), optimiser=optimiser)
     assert minimum.converged
     assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < 1e-5
+
+
+def test_gradient_descent_goes_downhill_and_says_that_it_did_not_arrive(nonlinear):
+    _, problem, guess, best = nonlinear
+    few, many = (
+        minimise(problem, guess, create_solver("schur"), optimiser="gradient-descent", max_iterations=steps)
+        for steps in (10, 100)
+    )
+    assert best.cost < many.cost < few.cost
+    assert not many.converged and many.reason == "100 iterations reached"
+
+
+def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
+    _, problem, guess, _ = nonlinear
+    given = problem.measurements
+    blind = BearingRangeProblem(replace(given, **{
+        name: getattr(given, name)[given.observed[:, 1] != 4] for name in ("observed", "measured")
+    }))  # fmt: skip
+    for optimiser in ("gauss-newton", "dogleg"):
+        with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
+            minimise(blind, guess, create_solver("schur"), optimiser=optimiser)
 
 
 def test_all_methods_reach_the_same_minimum(nonlinear):

@@ -11,6 +11,8 @@ from scenes import shared_data
 from pipeline.__main__ import main
 from pipeline.trajectory import read_tum
 
+RrdReader = pytest.importorskip("rerun.chunk").RrdReader
+
 image = pytest.importorskip("matplotlib.image")
 
 
@@ -55,6 +57,36 @@ def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path)
     pixels = image.imread(out / "a_b_c.png")
     assert np.mean(np.all(np.abs(pixels[..., :3] - [0.25, 0.47, 0.84]) < 0.1, axis=-1)) > 0.001
     assert json.loads((out / "run.json").read_text())["complete"]
+
+
+def test_a_recording_holds_truth_before_and_after_and_is_not_overwritten(call, small, tmp_path):
+    path = tmp_path / "landmarks.rrd"
+    words = ["landmarks", small, "--method", "schur", "--repeat", "1", "--recording", path]
+    assert call(*words, "--out", tmp_path / "out")[0] == 0
+    entities = {chunk.entity_path.lstrip("/"): chunk for chunk in RrdReader(path).stream()}
+    for name in ("truth/trajectory", "truth/landmarks", "trajectory", "landmarks", "ellipses"):
+        assert f"world/a_b_c/{name}" in entities
+    code, _, errors = call(*words, "--out", tmp_path / "again")
+    assert code == 2 and "exists; choose another name" in errors and not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize("optimiser", ["dogleg", "gauss-newton", "gradient-descent"])
+def test_every_optimiser_tells_how_it_ended(call, tmp_path, optimiser):
+    problem = shared_data("landmarks/2d_nonlinear.npz")
+    code, output, _ = call(
+        "landmarks",
+        problem,
+        "--out",
+        tmp_path / "out",
+        "--optimiser",
+        optimiser,
+        "--method",
+        "schur",
+        "--repeat",
+        "1",
+    )
+    ended = "DID NOT CONVERGE after 100 steps" if optimiser == "gradient-descent" else "converged after"
+    assert code == 0 and f"{optimiser} {ended}" in output
 
 
 def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, small, tmp_path):

@@ -157,6 +157,14 @@ def test_a_robot_that_is_not_there_and_a_folder_that_is_none_are_refused(folder,
         read_mrclam(tmp_path, 1)
 
 
+@pytest.mark.parametrize("content", [b"hello", b"\x93NUMPY"])
+def test_a_file_that_is_no_npz_is_said_to_be_none(tmp_path, content):
+    path = tmp_path / "problem.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is no npz file"):
+        read_landmark_data(path)
+
+
 def test_a_log_too_short_to_tell_its_noise_is_refused(folder):
     (folder / "Robot1_Measurement.dat").write_text("11.0 63 2.06 1.3\n")
     with pytest.raises(InputError, match="too seldom"):

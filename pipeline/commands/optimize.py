@@ -144,8 +144,10 @@ def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_su
     """Read, optimise, certify."""
     from pipeline.graph.g2o import read_g2o
     from pipeline.graph.optimisation import GraphChange
+    from pipeline.graph.soundness import check_connected
 
     file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
+    check_connected(file.graph.edges, file.graph.fixed, file.ids)
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
     change = GraphChange(source.name, before, done.state, done.rejected)

@@ -66,7 +66,8 @@ def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]
     """
     begin = time.perf_counter()
     kept = weights > 0.0
-    chi2 = float((weights * problem.chi2(problem.errors(poses))).sum())
+    of_edges = weights * problem.chi2(problem.errors(poses))
+    chi2 = float(of_edges.sum())
     if len(poses) - len(problem.free) > 1:
         reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
         return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
@@ -75,7 +76,7 @@ def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]
     minorants = minorise(problem, centred, weights)
     turning = ~problem.is_point[problem.edges].any(axis=1)
     loose = kept & turning & ~(minorants.kappa > 0.0)
-    given_up = float((weights * problem.chi2(problem.errors(poses)))[loose].sum())
+    given_up = float(of_edges[loose].sum())
     rest = problem.edges[kept & ~loose]
     if loose.any() and (given_up > _SHARES[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
         i, j = problem.edges[loose][0]

@@ -40,15 +40,18 @@ def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     return result
 
 
-def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> None:
-    """Refuse a graph with poses that no chain of edges joins to a fixed one."""
+def check_connected(
+    edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64] | None = None
+) -> None:
+    """Refuse a graph with poses that no chain of edges joins to a fixed one; ``names`` (K,) are the poses'."""
     if not len(fixed):
         raise InputError("the pose graph has no poses; add some before optimising")
     n, loose = len(fixed), _loose(edges, fixed)
     if len(loose):
-        names = ", ".join(str(v) for v in loose[:8]) + (", ..." if len(loose) > 8 else "")
+        called = loose if names is None else names[loose]
+        listed = ", ".join(map(str, called[:8].tolist())) + (", ..." if len(loose) > 8 else "")
         raise InputError(
-            f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {names};"
+            f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {listed};"
             " add edges to them or fix one of them"
         )
 

@@ -53,9 +53,10 @@ def read_landmark_data(path: Path) -> LandmarkData:
 def _read(path: Path) -> dict[str, Matrix]:
     """Every array by name, (·, c) float64 and finite."""
     try:
+        with path.open("rb") as file:
+            if file.read(2) != b"PK":
+                raise InputError(f"{path}: is no npz file; a problem is one with {', '.join(_SHAPES)}")
         with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: is a single array; expected an npz with {', '.join(_SHAPES)}")
             missing = [name for name in _SHAPES if name not in file]
             if missing:
                 raise InputError(f"{path}: has no array {missing[0]}; a problem has {', '.join(_SHAPES)}")

@@ -24,7 +24,7 @@ _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
 _LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
 _LEAST_FREEDOM = 1e-3  # observations beyond what the state takes up
-_TURNS, _CHANGE = 20, 0.05  # estimates of the noise, and the relative change that ends them
+_TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
 _RECKONED = 2  # of them begin with dead reckoning anew, by the robot as it is known then
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
 

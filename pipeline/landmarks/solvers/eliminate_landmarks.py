@@ -24,7 +24,10 @@ class _Reduced:
 
 
 class LandmarkElimination:
-    """S = P − Bᵀ C⁻¹ B with C in blocks of 2 × 2, one a landmark; S is factored in a fill-reducing order."""
+    """S = P − Bᵀ C⁻¹ B with C in blocks of 2 × 2, one a landmark; S is factored in a fill-reducing order.
+
+    A calibration of the robot, where there is one, stays in P with the poses.
+    """
 
     def __init__(self) -> None:
         self._known: _Reduced | None = None
