@@ -33,6 +33,7 @@ from pipeline.slam import SlamResult
 from pipeline.trajectory import read_tum, write_tum
 
 TRUTH_FILE = "ground_truth.tum"
+_FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 
 def _no_report(folder: Path) -> None:
@@ -147,11 +148,7 @@ def _complete(
     replaced.write(directory.path / RUN_FILE)
     warnings = _report(directory.path, report)
     directory.complete()
-    for file in (
-        JOURNAL_FILE,
-        CHECKPOINT_FILE,
-        POINTS_FILE,
-    ):  # only now: until then a kill leaves what --resume needs
+    for file in _FOR_RESUMING:  # only now: until then a kill leaves what --resume needs
         (directory.path / file).unlink(missing_ok=True)
     return warnings
 
