@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.compare.columns import Column, columns_of
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.figures import Column, columns_of
 from pipeline.compare.outcome import CLOSURES_FILE, Status
 from pipeline.compare.table import Row as TableRow
 from pipeline.compare.table import Table, read_table
@@ -71,6 +71,8 @@ def _facts(table: Table) -> tuple[tuple[str, str], ...]:
 
 
 def _warnings(table: Table) -> Iterator[str]:
+    if table.provenance.stopped:
+        yield table.provenance.stopped
     for row in table.rows:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
