@@ -181,9 +181,10 @@ def _disagreement(table: Table) -> Section:
 
 def _folds(directory: Path, table: Table) -> Iterator[Fold]:
     yield from provenance_folds(table.provenance, table.baselines)
-    for row in table.rows:
-        definitions = "".join(f"\n\n{definition}" for definition in row.definitions)
-        yield Fold(row.name, f"{row.description or row.reason}{definitions}")
+    yield Fold("Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows))
+    definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
+    if definitions:
+        yield Fold("What errors are", "\n\n".join(definitions))
     yield Fold(
         "Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"), is_long=True
     )
