@@ -1,6 +1,7 @@
 """A comparison: the same scans for all, one bad method never touches another, figures that can be checked."""
 
 import csv
+import itertools
 import json
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from scenes import shared_data
 
 from pipeline import lie
 from pipeline.__main__ import main
+from pipeline.compare.columns import COLUMNS
 from pipeline.compare.compare import Contest, compare
 from pipeline.compare.evidence import method_folder
-from pipeline.compare.figures import COLUMNS, Figures
+from pipeline.compare.figures import Figures
 from pipeline.compare.methods import OURS, default_names, resolve
 from pipeline.compare.outcome import EndReport, Outcome, Status
 from pipeline.compare.race import race
@@ -196,6 +198,20 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
 
 
 # the same scans for all
+
+
+class StopsAtOnce(Unwatched):
+    stopped = True
+
+    def track(self, scans, count):
+        return itertools.islice(scans, 5)
+
+
+def test_a_reading_that_the_user_stopped_is_told(office, tmp_path):
+    settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
+    contest = Contest(logs=(office,), out=tmp_path / "out", methods=("mine",), settings_file=settings)
+    table = compare(contest, lambda _: None, StopsAtOnce()).table
+    assert table.scans == 5 and "the user stopped the reading: 5 scans are compared" in text(table)
 
 
 def test_stored_scans_are_the_decoded_ones_bit_by_bit(office, tmp_path):

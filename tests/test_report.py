@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from pipeline.__main__ import main
-from pipeline.compare.figures import COLUMNS
+from pipeline.compare.columns import COLUMNS
 from pipeline.compare.table import read_table
 from pipeline.logs.write import LogWriter
 from pipeline.simulate import simulate

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.compare.columns import Column, columns_of
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.figures import Column, columns_of
+from pipeline.compare.methods import OURS
 from pipeline.compare.outcome import CLOSURES_FILE, Status
 from pipeline.compare.table import Row as TableRow
 from pipeline.compare.table import Table, read_table
@@ -71,6 +72,8 @@ def _facts(table: Table) -> tuple[tuple[str, str], ...]:
 
 
 def _warnings(table: Table) -> Iterator[str]:
+    if table.provenance.stopped:
+        yield table.provenance.stopped
     for row in table.rows:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
@@ -121,7 +124,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         yield from error_section(drawn, table.truth)
         yield from relation_section(drawn)
         yield from time_section(drawn)
-        yield from knowledge_section(drawn, MatchingConfig().min_information, is_planar=is_planar)
+        yield from knowledge_section(drawn, _least_information(table), is_planar=is_planar)
         yield from _map_section(directory, drawn, figures.frame(framing, truth), table.dimension)
     for course in courses:
         yield from loop_section(
@@ -129,6 +132,12 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         )
     if len(table.rows) > 1:
         yield _disagreement(table)
+
+
+def _least_information(table: Table) -> float:
+    """Below which ours call a scan degenerate; no other method tells."""
+    limits = [row.settings["matching"]["min_information"] for row in table.rows if row.base in OURS]
+    return limits[0] if limits else MatchingConfig().min_information
 
 
 def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
@@ -172,9 +181,10 @@ def _disagreement(table: Table) -> Section:
 
 def _folds(directory: Path, table: Table) -> Iterator[Fold]:
     yield from provenance_folds(table.provenance, table.baselines)
-    for row in table.rows:
-        definitions = "".join(f"\n\n{definition}" for definition in row.definitions)
-        yield Fold(row.name, f"{row.description or row.reason}{definitions}")
+    yield Fold("Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows))
+    definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
+    if definitions:
+        yield Fold("What errors are", "\n\n".join(definitions))
     yield Fold(
         "Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"), is_long=True
     )

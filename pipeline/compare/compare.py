@@ -89,6 +89,7 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
     provenance = describe_start(contest.command, contest.logs, ", ".join(names))
     with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
         scans = store(progress.track(log.scans(), log.scan_count), log.T_base_lidar, Path(shared))
+        stopped = f"the user stopped the reading: {len(scans):,} scans are compared" if progress.stopped else ""
         reference = _reference(contest, log, scans)
         limits = limits_for(len(scans), contest.time_s, contest.memory_mib)
         outcomes = race(methods, scans, Path(shared), repeat=contest.repeat, limits=limits, progress=progress)
@@ -99,8 +100,9 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
         }
         evidence = Evidence(methods, scans, outcomes, judged, maps_of(scans, outcomes), reference)
         write_evidence(directory.path, evidence)
-        provenance = msgspec.structs.replace(provenance.hashed(hashing), complete=True)
-        provenance = msgspec.structs.replace(provenance, duration_s=perf_counter() - began)
+        provenance = msgspec.structs.replace(
+            provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=perf_counter() - began
+        )
         provenance.write(directory.path / RUN_FILE)
         table = summarise(evidence, log, limits, provenance)
         write_table(directory.path, table)

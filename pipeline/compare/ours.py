@@ -85,8 +85,9 @@ class OurChain:
 def _description(config: Config) -> str:
     wheels = "wheels where the log has them" if config.odometry.prior != "constant-velocity" else "no wheels"
     deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
+    steps = f" by {config.matching.optimiser}" if config.matching.matcher == "plicp" else ""
     size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
     return (
-        f"ours, {config.matching.matcher}, {config.matching.optimiser}, scan to map, voxels of {size_m} m, "
+        f"ours, {config.matching.matcher}{steps}, scan to map, voxels of {size_m} m, "
         f"one thread, {wheels}, {deskewing}"
     )

@@ -10,7 +10,8 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from pipeline.compare.figures import COLUMNS, Figures, columns_of
+from pipeline.compare.columns import COLUMNS, columns_of
+from pipeline.compare.figures import Figures
 from pipeline.compare.outcome import Status
 from pipeline.runs.provenance import Provenance
 
@@ -114,9 +115,9 @@ def text(table: Table) -> str:
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
-    return (
-        "\n".join([*(line.rstrip() for line in lines), f"* best of its column. {table.against}", *endings]) + "\n"
-    )
+    endings += [table.provenance.stopped] if table.provenance.stopped else []
+    known = [line.rstrip() for line in lines]
+    return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
 
 
 def _csv(table: Table) -> str:
