@@ -147,6 +147,9 @@ def _by_chunk(path):
     def untouched(_, damaged):
         if any(begin < 13 or end > topics_at for begin, end in damaged.touched if end < len(data)):
             return set()
+        told = (begins[0], ends[0]), (begins[-1], len(data))  # the topics: in the first chunk and behind the last
+        if all(any(first < end and last > begin for first, last in damaged.touched) for begin, end in told):
+            return set()
         return {
             time_ns
             for begin, end, times in zip(begins, ends, times_ns, strict=True)

@@ -67,7 +67,7 @@ class _Bag:
         data, offset = self.index.data, len(MAGIC)
         while offset < len(data):
             record = read_record(data, offset)
-            if record is not None and (record.end == len(data) or self._is_followed(record)):
+            if record is not None and (record.end == len(data) or read_record(data, record.end) is not None):
                 self._take(record)
                 offset = record.end
                 continue
@@ -91,7 +91,8 @@ class _Bag:
         index = self.index
         is_doubtful = bool(self.told) and self.told != _counts(index.blocks)
         index.blocks = [
-            self._looked_into(block) if is_doubtful or not block.entries else block for block in index.blocks
+            self._looked_into(block) if is_doubtful or not self._is_known(block) else block
+            for block in index.blocks
         ]
         index.counts = dict(_counts(index.blocks))
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
@@ -118,8 +119,9 @@ class _Bag:
             return Contents(messages, "" if block.is_cut else damage)
         return Contents(messages, f"{name}: {strangers} messages name no known connection" if strangers else "")
 
-    def _is_followed(self, record: Record) -> bool:
-        return record.end < len(self.index.data) and read_record(self.index.data, record.end) is not None
+    def _is_known(self, block: Block) -> bool:
+        """Whether it is known what a chunk holds, and all its connections are."""
+        return bool(block.entries) and all(entry.channel in self.index.channels for entry in block.entries)
 
     def _take(self, record: Record) -> None:
         try:
