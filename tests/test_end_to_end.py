@@ -172,7 +172,8 @@ def test_the_graph_holds_the_keyframes_and_what_ties_them(drive):
     scans = np.flatnonzero(steps["keyframe"] >= 0)
     assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(vertices)
     expected = matrices(drive.tum()[scans, 1:])
-    np.testing.assert_allclose(np.array(list(vertices.values())), expected, atol=1e-7)
+    refined_m = 0.03 if drive.dimension == 2 else 1e-7  # planar scans are aligned once more, after the graph
+    np.testing.assert_allclose(np.array(list(vertices.values())), expected, atol=refined_m)
     pairs = [(i, j) for i, j, _, _ in edges]
     chain = [(i, i + 1) for i in range(len(scans) - 1)]
     loops = drive.table("loops").to_pylist()

@@ -27,6 +27,7 @@ class AnywhereCloser:
         self.near = near
         self.pieces = pieces
         self.next_m = 0.0
+        self.turn = 0
         self.found: list[Closure] = []
 
     def close(
@@ -42,7 +43,7 @@ class AnywhereCloser:
             return ()
         self.next_m = keyframes[-1].travelled_m + max(_PATIENCE * way_m, _APART_M)
         found = self.near.search.find_anywhere(
-            keyframes, graph.poses, np.flatnonzero(~joined), len(keyframes) - begun
+            keyframes, graph.poses, self._sought(joined), len(keyframes) - begun
         )
         if found is None:
             return ()
@@ -54,14 +55,22 @@ class AnywhereCloser:
             return (closure,)
         return self._vouched(closure, keyframes, graph.poses)
 
+    def _sought(self, joined: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Keyframes of one of the pieces that are not joined, each in its turn: they may show the same place."""
+        old = np.flatnonzero(~joined)
+        piece = self.pieces.of(old)
+        numbers = np.unique(piece)
+        self.turn += 1
+        return old[piece == numbers[self.turn % len(numbers)]]
+
     def _vouched(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
         """The closure and the older ones that agree with it; rejected where there are none, until others come."""
         old = [other for other in self.found if other.source >= self.pieces.beginnings[-1]]
         agreeing = [other for other in old if _agree(closure, other, keyframes, T_world)]
-        self.found = [other for other in old if other not in agreeing]
         if agreeing:
+            self.found = []
             return (*agreeing, closure)
-        self.found.append(closure)
+        self.found = [*old, closure]
         return (replace(closure, verdict=Verdict.REJECTED, reason="found anywhere, and no other find agrees yet"),)
 
 

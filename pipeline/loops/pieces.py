@@ -21,7 +21,7 @@ class Pieces:
         self.beginnings.append(keyframe)
 
     def of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Number of the piece of each keyframe (...)."""
+        """Number of the piece of each keyframe."""
         return np.searchsorted(self.beginnings, keyframes, side="right") - 1
 
     def span(self, keyframe: int, count: int) -> tuple[int, int]:

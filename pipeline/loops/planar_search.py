@@ -20,7 +20,7 @@ _RADIANS_A_METRE = 0.2  # of doubt: who is off by a metre after five looks that 
 _LEAST_RAD = 0.1
 _SPACING_M = 4.0  # between the submaps that are searched
 _SUBMAPS = 6  # of them at most
-_SUBMAPS_ANYWHERE = 400
+_SUBMAPS_ANYWHERE = 400  # at most where nothing is known
 _MEMBERS_ANYWHERE = 12  # keyframes whose points are sought together
 _LEAST_SHARE = 0.55  # of the highest score, below which nothing was found
 _SAME_M = 2.0  # within which two submaps tell the same place
@@ -77,8 +77,11 @@ class PlanarSearch:
     ) -> Found | None:
         """Where the newest keyframe fits best among older ones that tell nothing of where it may be.
 
-        old : these keyframes; known : how many of the last ones odometry joins to the newest
+        old : these keyframes, of one piece; known : how many of the last ones odometry joins to the newest
         """
+        old = old[old % self.submaps.half_width == 0]
+        if not len(old):
+            return None
         anchors = self._anchors(old, T_world, most=_SUBMAPS_ANYWHERE)
         points = self._surroundings(keyframes, min(known, _MEMBERS_ANYWHERE))
         newest = len(keyframes) - 1
