@@ -47,7 +47,7 @@ def _gaps(seen: Survey) -> Finding:
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
     longest = gaps[np.argmax(steps_s[gaps])]
-    at_s = seen.into_log_s(seen.log_ns[longest])
+    at_s = seen.into_log_s(int(seen.log_ns[longest]))
     found = (
         f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
         f"{at_s:.1f} s into the log"
