@@ -193,11 +193,14 @@ def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_
             f"{site.url}/far.mcap?key=secret",
             str(drawers / "log_05.mcap"),
             str(bad),
+            "--memory-limit",
+            "2",
             "--out",
             str(out),
         ]
         monkeypatch.setattr(sys, "argv", ["scanchain", *words])
         assert main(words) == 1
+        assert table(out)["far.mcap"]["reason"] == table(out)["log_05.mcap"]["reason"] == ""
         first = made(out)
         assert main(words) == 1 and made(out) == first
         site.etag = '"two"'

@@ -31,6 +31,7 @@ def convert(source: Source, destination: Path, rate: float, force: bool, as_json
       split files         the folder of .mcap, .bag or .db3 files that are parts of one log
       a KITTI raw drive   ..._sync, calib_imu_to_velo.txt beside it for the ground truth
       KITTI odometry      sequences/00, poses/00.txt beside sequences for the ground truth
+      an address          https:// or s3://, of any of the files above
       a folder of clouds  PCD, PLY, or .bin of float32 x y z intensity, named by their stamps, or with --rate
 
     \b

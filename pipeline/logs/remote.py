@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from time import sleep
 from typing import Any, TypeVar
 
@@ -24,7 +25,6 @@ class RemoteFile:
     ----------
     size : bytes, 0 where the server does not say
     version : its ETag or when it was last changed, empty where the server does not say
-    has_ranges : whether parts of it can be asked for
     """
 
     def __init__(self, address: Address) -> None:
@@ -39,7 +39,12 @@ class RemoteFile:
         self.size = int(facts.get("size") or 0)
         told = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
         self.version = str(next(filter(None, told), ""))
-        self.has_ranges = self.size > 0 and facts.get("partial", True) and self._tries_range()
+        self._may_have_ranges = self.size > 0 and facts.get("partial", True)
+
+    @cached_property
+    def has_ranges(self) -> bool:
+        """Whether parts of it can be asked for."""
+        return self._may_have_ranges and self._tries_range()
 
     def read(self, offset: int, size: int) -> bytes:
         """So many bytes from the offset on. Raises InputError where they do not come, asked several times."""
