@@ -7,13 +7,14 @@ import sys
 import tomllib
 from dataclasses import dataclass
 
+import numpy as np
 import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 from scenes import ROOT
 
 from pipeline.graph.g2o import read_g2o
 from pipeline.maps import read_map, read_ply
-from pipeline.runs.checkpoint import CHECKPOINT_FILE, read_checkpoint
+from pipeline.runs.checkpoint import CHECKPOINT_FILE, POINTS_FILE, read_checkpoint
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.trajectory import read_kitti, read_tum
 
@@ -133,6 +134,7 @@ def _read_text(path):
 _READ = {
     JOURNAL_FILE: lambda path: len(read_journal(path.parent)[0]),
     CHECKPOINT_FILE: _read_checkpoint,
+    POINTS_FILE: lambda path: np.fromfile(path, np.float32),
     ".tum": lambda path: len(read_tum(path)),
     "trajectory.kitti.txt": lambda path: len(read_kitti(path)),
     "summary.txt": _read_text,
