@@ -28,18 +28,24 @@ def graph_of(count, loops=()):
     return graph
 
 
+def joined(pieces, graph):
+    """Which keyframes lie where the newest one knows them to be."""
+    groups = pieces.groups(graph)
+    return groups == groups[-1]
+
+
 def test_without_a_gap_everything_is_one_piece():
-    assert Pieces().joined_to_newest(graph_of(5)).all()
+    assert joined(Pieces(), graph_of(5)).all()
 
 
 def test_a_new_piece_is_joined_to_nothing_until_a_loop_does_it():
     pieces = Pieces()
     pieces.begin(3)
     pieces.begin(6)
-    assert pieces.joined_to_newest(graph_of(9)).tolist() == [False] * 6 + [True] * 3
-    assert pieces.joined_to_newest(graph_of(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
-    assert pieces.joined_to_newest(graph_of(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
-    assert pieces.joined_to_newest(graph_of(9, [(4, 7), (1, 4)])).all()
+    assert joined(pieces, graph_of(9)).tolist() == [False] * 6 + [True] * 3
+    assert joined(pieces, graph_of(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
+    assert joined(pieces, graph_of(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
+    assert joined(pieces, graph_of(9, [(4, 7), (1, 4)])).all()
 
 
 def test_a_span_ends_where_the_next_piece_begins():

@@ -31,19 +31,21 @@ class AnywhereCloser:
         self.found: list[Closure] = []
 
     def close(
-        self, keyframes: Sequence[Keyframe], graph: PoseGraph, joined: NDArray[np.bool_]
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, groups: NDArray[np.int64]
     ) -> tuple[Closure, ...]:
         """Closures that say where the newest keyframe lies in older pieces; the first that agree are accepted.
 
-        joined : (K,) keyframes whose place is known from here
+        groups : (K,) numbers of ``Pieces.groups``
         """
         begun = self.pieces.beginnings[-1]
         way_m = keyframes[-1].travelled_m - keyframes[begun].travelled_m
-        if joined.all() or way_m < _FIRST_M or keyframes[-1].travelled_m < self.next_m or self.near.search is None:
+        unknown = np.flatnonzero(groups != groups[-1])
+        is_time = way_m >= _FIRST_M and keyframes[-1].travelled_m >= self.next_m
+        if not len(unknown) or not is_time or self.near.search is None:
             return ()
         self.next_m = keyframes[-1].travelled_m + max(_PATIENCE * way_m, _APART_M)
         found = self.near.search.find_anywhere(
-            keyframes, graph.poses, self._sought(joined), len(keyframes) - begun
+            keyframes, graph.poses, self._sought(unknown, groups), len(keyframes) - begun
         )
         if found is None:
             return ()
@@ -55,13 +57,11 @@ class AnywhereCloser:
             return (closure,)
         return self._vouched(closure, keyframes, graph.poses)
 
-    def _sought(self, joined: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Keyframes of one of the pieces that are not joined, each in its turn: they may show the same place."""
-        old = np.flatnonzero(~joined)
-        piece = self.pieces.of(old)
-        numbers = np.unique(piece)
+    def _sought(self, unknown: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of one group, each in its turn: two groups may show the same place."""
+        numbers = np.unique(groups[unknown])
         self.turn += 1
-        return old[piece == numbers[self.turn % len(numbers)]]
+        return unknown[groups[unknown] == numbers[self.turn % len(numbers)]]
 
     def _vouched(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
         """The closure and the older ones that agree with it; rejected where there are none, until others come."""

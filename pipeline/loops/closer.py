@@ -33,14 +33,16 @@ class LoopCloser:
 
         keyframes : all so far; graph : their best known poses, and how they are joined
         """
-        joined = self.pieces.joined_to_newest(graph)
+        groups = self.pieces.groups(graph)
+        joined = groups == groups[-1]
         near = self.near.close(keyframes, graph, joined)
         if self.anywhere is not None:
-            return near + self.anywhere.close(keyframes, graph, joined)
+            return near + self.anywhere.close(keyframes, graph, groups)
         return near if self.places is None else near + self.places.close(keyframes, graph.poses, joined)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the places that waited for more of their surroundings to be seen."""
         if self.places is None:
             return ()
-        return self.places.close(keyframes, graph.poses, self.pieces.joined_to_newest(graph), finish=True)
+        groups = self.pieces.groups(graph)
+        return self.places.close(keyframes, graph.poses, groups == groups[-1], finish=True)

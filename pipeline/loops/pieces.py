@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.graph.pose_graph import PoseGraph
 
@@ -29,14 +31,12 @@ class Pieces:
         number = int(self.of(np.array(keyframe)))
         return self.beginnings[number], [*self.beginnings[1:], count][number]
 
-    def joined_to_newest(self, graph: PoseGraph) -> NDArray[np.bool_]:
-        """Which keyframes (K,) of the graph are of the newest one's piece, or of one that loops join to it."""
+    def groups(self, graph: PoseGraph) -> NDArray[np.int64]:
+        """Number of the group of each keyframe (K,) of the graph: of pieces that loops join to each other."""
         piece = self.of(np.arange(len(graph)))
-        joined = np.zeros(len(self.beginnings), np.bool_)
-        joined[-1] = True
-        if len(joined) == 1:
-            return joined[piece]
         ends = piece[graph.edges[graph.is_loop & (graph.weight > _CLOSED)]]
-        for _ in joined:
-            joined[ends[joined[ends].any(axis=1)]] = True
-        return joined[piece]
+        count = len(self.beginnings)
+        if count == 1:
+            return piece
+        links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        return connected_components(links, directed=False)[1].astype(np.int64)[piece]

@@ -77,7 +77,7 @@ class PlanarSearch:
     ) -> Found | None:
         """Where the newest keyframe fits best among older ones that tell nothing of where it may be.
 
-        old : these keyframes, of one piece; known : how many of the last ones odometry joins to the newest
+        old : these keyframes, of one group; known : how many of the last ones odometry joins to the newest
         """
         old = old[old % self.submaps.half_width == 0]
         if not len(old):

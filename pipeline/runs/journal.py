@@ -26,7 +26,7 @@ class Journal:
 
     def __init__(self, path: Path, *, after_bytes: int = 0) -> None:
         """after_bytes : of an existing journal that are kept."""
-        self.file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0))
+        self.file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         os.ftruncate(self.file, after_bytes)
         os.lseek(self.file, after_bytes, os.SEEK_SET)
         self.encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
