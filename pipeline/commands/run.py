@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from pipeline.runs.recorder import SinkName, Viewing
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
+_GARBAGE_EVERY = 100_000  # new objects; most stay to the end, and to look through them often costs a twentieth
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
@@ -86,6 +88,7 @@ def run(
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
+    gc.set_threshold(_GARBAGE_EVERY)
     from pipeline.commands.terminal import Terminal
     from pipeline.runs.job import Job
     from pipeline.runs.run import run as run_log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline import lie
 from pipeline.data import Points, Pose
 from pipeline.kernels.free_space import nearest_ranges, weigh_points
 
+_THREADS = 2
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels, up to which a scan is a witness
 _WINDOW = 0.6  # of a scan's spacing, within which a surface has a point
@@ -46,17 +48,24 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
     index = _Cells(_in_space(voxels), _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi))
     seen, looked_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
-    for view in views:
-        nearest_ranges(_in_space(view.points), ranges_m)
-        T_world_lidar = lie.lift(view.T_world_lidar)
-        limits = np.array([
-            index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
-            _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
-        ])  # fmt: skip
-        spans = index.within_reach(T_world_lidar[:3, 3])
-        weigh_points(
-            index.points, spans, lie.inverse(T_world_lidar), ranges_m, limits, _ENOUGH, seen, looked_through
-        )
+    with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
+        for view in views:
+            nearest_ranges(_in_space(view.points), ranges_m)
+            T_world_lidar = lie.lift(view.T_world_lidar)
+            T_lidar_world, spans = lie.inverse(T_world_lidar), index.within_reach(T_world_lidar[:3, 3])
+            limits = np.array([
+                index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
+                _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
+            ])  # fmt: skip
+            parts = [
+                pool.submit(
+                    weigh_points, index.points, np.ascontiguousarray(spans[k::_THREADS]), T_lidar_world, ranges_m,
+                    limits, _ENOUGH, seen, looked_through,
+                )
+                for k in range(_THREADS)
+            ]  # fmt: skip
+            for part in parts:
+                part.result()
     result = np.zeros(len(voxels), bool)
     clearly = (looked_through >= _LEAST_THROUGH) & (looked_through > _MAJORITY * seen)
     result[index.order] = clearly & (seen < _ENOUGH)
