@@ -328,6 +328,7 @@ try:
     print("SAID", any("the viewer at" in line for line in recording.warnings))
 finally:
     os.killpg(server.pid, signal.SIGKILL)
+    time.sleep(1.0)  # the thread that this frees must end before Python does
 """
     answer = run_script(script, tmp_path / "a.rrd")
     assert answer.returncode == 0, answer.stderr
