@@ -173,7 +173,7 @@ class Slam:
             self.graph.add_edge(
                 last.index,
                 keyframe.index,
-                lie.inverse(last.T_odom_lidar) @ keyframe.T_odom_lidar,
+                lie.between(last.T_odom_lidar, keyframe.T_odom_lidar),
                 edge_information(tracked.match, *sigmas),
             )
             self.lost_scans = 0
@@ -201,20 +201,12 @@ class Slam:
         config = self.config.loops
         information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
         Z_ij = closure.match.T_target_source
-        error = lie.log(
-            lie.inverse(Z_ij) @ lie.inverse(self.graph.poses[closure.target]) @ self.graph.poses[closure.source]
-        )
+        expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
+        error = lie.log(lie.between(Z_ij, expected))
         self.waiting_closures += 1
-        self.surprising |= self._moves_the_map(closure)
+        self.surprising |= lie.apart(expected, Z_ij)[0] > _SURPRISE * config.edge_sigma_m
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         return replace(closure, chi2_before=float(error @ information @ error))
-
-    def _moves_the_map(self, closure: Closure) -> bool:
-        """Whether the closure is further from what the graph says than its own error explains."""
-        expected = lie.inverse(self.graph.poses[closure.target]) @ self.graph.poses[closure.source]
-        moved = lie.inverse(expected) @ closure.match.T_target_source
-        sigma_m = self.config.loops.edge_sigma_m
-        return float(np.linalg.norm(moved[:-1, -1])) > _SURPRISE * sigma_m
 
     def _optimise_when_due(self) -> GraphState | None:
         """Optimise when closures wait: soon if one of them moves the map, else once the graph has grown enough.

@@ -1,6 +1,20 @@
-"""Kernels are compiled when they are first called, which is no reason for a property test to fail."""
+"""What every test may use. Kernels compile when first called, which is no reason for a property test to fail."""
 
+import pytest
 from hypothesis import settings
+
+from pipeline.__main__ import main
 
 settings.register_profile("compiling", deadline=None)
 settings.load_profile("compiling")
+
+
+@pytest.fixture
+def call(capfd):
+    """Run a command; its exit code, its output, and what it said on stderr, libraries included."""
+
+    def run(*words):
+        code = main([str(word) for word in words])
+        return code, *capfd.readouterr()
+
+    return run

@@ -8,6 +8,7 @@ import tempfile
 import traceback
 from collections import Counter
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -100,17 +101,22 @@ def mutants(seed, rng, count):
 def complaint(seed, damaged, path):
     """What is wrong with how a damaged file is read, empty where nothing is."""
     path.write_bytes(damaged.data)
+    problem, answer = within_bounds(lambda: read(path))
+    return problem or _verdict(seed, damaged, *answer)
+
+
+def within_bounds(act):
+    """What was wrong with how something was done, empty where nothing was, and what came of it."""
     before = peak_bytes()
     try:
         with at_most(LONGEST_S):
-            scans, told = read(path)
+            answer = act()
     except Hang:
-        return f"takes more than {LONGEST_S} s"
+        return f"takes more than {LONGEST_S} s", None
     except Exception:
-        return traceback.format_exc()
-    if peak_bytes() - before > MOST_BYTES:
-        return f"took {(peak_bytes() - before) >> 20} MB more"
-    return _verdict(seed, damaged, scans, told)
+        return traceback.format_exc(), None
+    more = peak_bytes() - before
+    return (f"took {more >> 20} MB more" if more > MOST_BYTES else ""), answer
 
 
 def read(path):
@@ -154,19 +160,19 @@ def payload_complaints(folder, rng, count):
     for number in range(count):
         channel, data, decode = said[number % len(said)]
         changed = mutated_message(data, rng)
-        before = peak_bytes()
-        try:
-            with at_most(LONGEST_S), np.errstate(all="ignore"):
-                decode(memoryview(changed))
-        except MalformedMessageError as error:
-            if "\n" in str(error):
-                yield f"{channel.type_name}: more than a line: {error}"
-        except Hang:
-            yield f"{channel.type_name}: takes more than {LONGEST_S} s: {changed!r}"
-        except Exception:
-            yield f"{channel.type_name} in {channel.encoding}: {changed!r}\n{traceback.format_exc()}"
-        if peak_bytes() - before > MOST_BYTES:
-            yield f"{channel.type_name}: took {(peak_bytes() - before) >> 20} MB: {changed!r}"
+        problem, told = within_bounds(partial(_decode, decode, changed))
+        if problem or told:
+            yield f"{channel.type_name} in {channel.encoding}: {problem or told}: {changed!r}"
+
+
+def _decode(decode, data):
+    """What is wrong with how a message is called malformed, empty where it is not or that is one line."""
+    try:
+        with np.errstate(all="ignore"):
+            decode(memoryview(data))
+    except MalformedMessageError as error:
+        return f"more than a line: {error}" if "\n" in str(error) else ""
+    return ""
 
 
 def _messages(folder):

@@ -25,7 +25,7 @@ from naive_logs import (
 )
 from scenes import ROOT, configured
 
-from pipeline.__main__ import main, scanchain
+from pipeline.__main__ import scanchain
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
 
@@ -36,17 +36,6 @@ def office(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "office.mcap"
     simulate("office", path, duration_s=6.0)
     return path
-
-
-@pytest.fixture
-def call(capfd):
-    """Run a command; its exit code, its output, and what it said on stderr, libraries included."""
-
-    def run(*words):
-        code = main([str(word) for word in words])
-        return code, *capfd.readouterr()
-
-    return run
 
 
 @pytest.fixture

@@ -111,23 +111,29 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
     assert a.state.weight.tobytes() == b.state.weight.tobytes()
 
 
-def test_every_step_is_on_disk_within_a_second(office, tmp_path):
-    slow = """
+def waiting_at(scan):
+    """The command line as a script that says "there" before it takes that scan, and then waits."""
+    return f"""
 import sys, time
 from pipeline.__main__ import main
 from pipeline.slam import Slam
 process = Slam.process
 def waiting(self, scan):
-    if scan.index == 40:
+    if scan.index == {scan}:
         print("there", flush=True)
         time.sleep(60)
     return process(self, scan)
 Slam.process = waiting
 sys.exit(main(sys.argv[1:]))
 """
+
+
+def test_every_step_is_on_disk_within_a_second(office, tmp_path):
     out = tmp_path / "run"
     child = subprocess.Popen(
-        [sys.executable, "-c", slow, "run", str(office), "--out", str(out)], cwd=ROOT, stdout=subprocess.PIPE
+        [sys.executable, "-c", waiting_at(40), "run", str(office), "--out", str(out)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
     )
     assert child.stdout.readline() == b"there\n"
     child.kill()
@@ -151,23 +157,14 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path
 
 
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
-    slow = """
-import sys, time
-from pipeline.__main__ import main
-from pipeline.slam import Slam
-process = Slam.process
-def waiting(self, scan):
-    if scan.index == 100:
-        print("there", flush=True)
-        time.sleep(60)
-    return process(self, scan)
-Slam.process = waiting
-sys.exit(main(sys.argv[1:]))
-"""
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), "--checkpoint", "0", "--rerun", "off"]
     child = subprocess.Popen(
-        [sys.executable, "-c", slow, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", waiting_at(100), *words],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert child.stdout.readline() == "there\n"
     child.send_signal(signal.SIGINT)

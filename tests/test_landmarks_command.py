@@ -8,21 +8,11 @@ import numpy as np
 import pytest
 from scenes import shared_data
 
-from pipeline.__main__ import main
 from pipeline.trajectory import read_tum
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
 image = pytest.importorskip("matplotlib.image")
-
-
-@pytest.fixture
-def call(capfd):
-    def run(*words):
-        code = main([str(word) for word in words])
-        return code, *capfd.readouterr()
-
-    return run
 
 
 @pytest.fixture

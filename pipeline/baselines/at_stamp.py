@@ -28,7 +28,7 @@ class AtStamp:
         self.last_stamp_ns, self.last_held_s = stamp_ns, held_s
         if T_theirs_last is None:
             return np.eye(4)
-        motion = lie.log(lie.inverse(T_theirs_last) @ T_theirs_held)
+        motion = lie.log(lie.between(T_theirs_last, T_theirs_held))
         velocity = motion / interval_s if interval_s > 0.0 else np.zeros(6)
         if self.T_odom_theirs is None:
             self.T_odom_theirs = lie.inverse(T_theirs_last @ lie.exp(-last_held_s * velocity))

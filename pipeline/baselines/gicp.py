@@ -80,7 +80,7 @@ class SmallGicpModel:
             guess = self.T_odom_lidar @ self.T_previous_current
             answer = self.library.align(self.map, cloud, guess, num_threads=self.threads)
             T_odom_lidar = lie.normalise(np.array(answer.T_target_source))
-            self.T_previous_current = lie.inverse(self.T_odom_lidar) @ T_odom_lidar
+            self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
             self.T_odom_lidar = T_odom_lidar
         self.map.insert(cloud, self.T_odom_lidar)
         self.started = True

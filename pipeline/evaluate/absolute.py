@@ -64,7 +64,7 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
     if alignment is Alignment.RIGID:
         aligned = _turned(aligned, pairs.reference)
         rotations += " turned by the best common rotation"
-    errors_rad = lie.rotation_angle(lie.inverse(pairs.reference) @ aligned)
+    errors_rad = lie.rotation_angle(lie.between(pairs.reference, aligned))
     return AbsoluteError(
         definition=(
             f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({alignment.description}) and the angle of "

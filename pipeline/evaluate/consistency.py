@@ -16,9 +16,9 @@ def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArra
     covariances : (N, k, k) of each pose by itself, of a twist in its own frame, T exp(ξ); where one is NaN so is
         the answer. With M the motion, Σ = Σ_i+1 + Ad(M⁻¹) Σ_i Ad(M⁻¹)ᵀ, because both poses err independently.
     """
-    motion = lie.inverse(poses[:-1]) @ poses[1:]
-    true_motion = lie.inverse(reference[:-1]) @ reference[1:]
-    error = lie.log(lie.inverse(true_motion) @ motion)
+    motion = lie.between(poses[:-1], poses[1:])
+    true_motion = lie.between(reference[:-1], reference[1:])
+    error = lie.log(lie.between(true_motion, motion))
     Ad = lie.adjoint(lie.inverse(motion))
     covariance = covariances[1:] + Ad @ covariances[:-1] @ np.swapaxes(Ad, 1, 2)
     result = np.full(len(motion), np.nan)

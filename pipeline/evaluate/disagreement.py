@@ -17,11 +17,11 @@ def disagreement(trajectories: Sequence[Matrix]) -> NDArray[np.float64]:
     trajectories : M times poses (N, d+1, d+1) of the same scans, (0, d+1, d+1) of a method that has failed
     NaN where one of the two has failed.
     """
-    motions = [lie.inverse(poses[:-1]) @ poses[1:] for poses in trajectories]
+    motions = [lie.between(poses[:-1], poses[1:]) for poses in trajectories]
     result = np.full((len(motions), len(motions)), np.nan)
     for row, first in enumerate(motions):
         for column, second in enumerate(motions):
             if len(first) and len(second):
-                error = lie.inverse(first) @ second
+                error = lie.between(first, second)
                 result[row, column] = float(np.median(np.linalg.norm(error[:, :-1, -1], axis=1)))
     return result

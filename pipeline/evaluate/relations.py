@@ -106,8 +106,8 @@ def relation_error(
         )
     first, second = index.reshape(-1, 2)[used].T
     poses = lie.lift(trajectory.poses)
-    estimated = lie.inverse(poses[first]) @ poses[second]
-    error = lie.inverse(relations.T_first_second[used]) @ estimated
+    estimated = lie.between(poses[first], poses[second])
+    error = lie.between(relations.T_first_second[used], estimated)
     errors_m, errors_rad = np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
     return RelationError(
         definition=(

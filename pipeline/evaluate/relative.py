@@ -78,9 +78,9 @@ def first_after(travelled_m: NDArray[np.float64], distance_m: float) -> NDArray[
 def motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> Matrix:
     """E (M, 4, 4) = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each stretch (i, j)."""
     i, j = stretches[:, 0], stretches[:, 1]
-    reference = lie.inverse(pairs.reference[i]) @ pairs.reference[j]
-    estimate = lie.inverse(pairs.estimate[i]) @ pairs.estimate[j]
-    return lie.inverse(reference) @ estimate
+    reference = lie.between(pairs.reference[i], pairs.reference[j])
+    estimate = lie.between(pairs.estimate[i], pairs.estimate[j])
+    return lie.between(reference, estimate)
 
 
 def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> RelativeError:

@@ -60,7 +60,7 @@ def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Poi
     scans : one a pose of the trajectory
     """
     seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
-    motions = lie.log(lie.inverse(trajectory.poses[:-1]) @ trajectory.poses[1:])
+    motions = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
     velocities = np.divide(motions, seconds, out=np.zeros_like(motions), where=seconds > 0.0)
     rest = np.zeros((1, lie.twist_size(trajectory.poses[0])))
     before = np.vstack([velocities[:1] if len(velocities) else rest, velocities])

@@ -23,7 +23,7 @@ def free_space_agreement(surroundings: LocalMap, points: Points, T_target_source
     agreeing = contradicting = 0
     for T_target_lidar, seen in surroundings.views(_VIEWS):
         nearest_ranges(seen, ranges_m)
-        T_lidar_source = lie.inverse(T_target_lidar) @ T_target_source
+        T_lidar_source = lie.between(T_target_lidar, T_target_source)
         yes, no = compare_ranges(points, T_lidar_source, ranges_m, margin_m, _MARGIN_SHARE)
         agreeing, contradicting = agreeing + yes, contradicting + no
     return agreeing / max(agreeing + contradicting, 1) if agreeing + contradicting else 1.0

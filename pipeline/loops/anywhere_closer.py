@@ -76,11 +76,11 @@ class AnywhereCloser:
 
 def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
     """Whether two closures put the newest keyframe in one place."""
-    off = lie.inverse(_place(a, a.source, keyframes, T_world)) @ _place(b, a.source, keyframes, T_world)
-    return float(np.linalg.norm(off[:2, 2])) < _SAME_M and float(lie.rotation_angle(off)) < _SAME_RAD
+    off_m, off_rad = lie.apart(_place(a, a.source, keyframes, T_world), _place(b, a.source, keyframes, T_world))
+    return off_m < _SAME_M and off_rad < _SAME_RAD
 
 
 def _place(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
     """Where a closure and odometry put a keyframe in the world of the closure's target."""
-    T_source_keyframe = lie.inverse(keyframes[closure.source].T_odom_lidar) @ keyframes[keyframe].T_odom_lidar
+    T_source_keyframe = lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)
     return T_world[closure.target] @ closure.match.T_target_source @ T_source_keyframe

@@ -52,7 +52,7 @@ class NearCloser:
         if not len(near):
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(away_m[near])]))
-        closure = self.measured(keyframes, old - 1, target, lie.inverse(T_world[target]) @ T_world[-1])
+        closure = self.measured(keyframes, old - 1, target, lie.between(T_world[target], T_world[-1]))
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)
         found = self.search.find(keyframes, T_world, near, doubts_m)
@@ -81,7 +81,7 @@ class NearCloser:
         points = downsample(keyframes[-1].points, submap.scale * self.match_voxel_m)
         match = self.matcher.align(points, submap, T_first, wide=True)
         overlap = overlap_of(points, match.T_target_source, submap)
-        moved_m = float(np.linalg.norm((lie.inverse(T_first) @ match.T_target_source)[:-1, -1]))
+        moved_m = lie.apart(T_first, match.T_target_source)[0]
         problem = self._problem(match, overlap, moved_m, _SURE_OVERLAP if surely else self.config.min_overlap)
         verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
         return Closure(target, keyframes[-1].index, match, overlap, verdict, problem or "verified by matching")

@@ -98,7 +98,7 @@ class PlaceCloser:
         """T_world_lidar by odometry since the last closure; that one may not have moved the map yet."""
         if self.last is None:
             return T_world[anchor.index]
-        T_last_anchor = lie.inverse(keyframes[self.last.source].T_odom_lidar) @ anchor.T_odom_lidar
+        T_last_anchor = lie.between(keyframes[self.last.source].T_odom_lidar, anchor.T_odom_lidar)
         return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
 
     def _radius_m(self, anchor: Keyframe) -> float:

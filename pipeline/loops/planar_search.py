@@ -59,7 +59,7 @@ class PlanarSearch:
         self.next_m = source.travelled_m + _SHARE_OF_DOUBT * float(doubts_m[near].max())
         anchors = self._anchors(near, T_world)
         points = self._surroundings(keyframes, self.submaps.half_width)
-        T_first = lie.inverse(T_world[anchors]) @ T_world[-1]
+        T_first = lie.between(T_world[anchors], T_world[-1])
         seeds = [
             _seed(
                 points,

@@ -15,11 +15,11 @@ def spread(T_world_keyframes: Matrix, numbers: NDArray[np.int64], odometry: Matr
     numbers : (K,) of the scans that are keyframes, the first of them 0; odometry : (N, d+1, d+1) T_odom_lidar
     """
     following = np.append(np.arange(1, len(numbers)), -1)
-    relative = lie.inverse(odometry[numbers]) @ odometry[numbers[following]]
-    target = lie.inverse(T_world_keyframes) @ T_world_keyframes[following]
+    relative = lie.between(odometry[numbers], odometry[numbers[following]])
+    target = lie.between(T_world_keyframes, T_world_keyframes[following])
     correction = lie.log(target @ lie.inverse(relative))
     before = np.searchsorted(numbers, np.arange(len(odometry)), side="right") - 1
     span = np.append(np.diff(numbers), 1)[before]
     share = np.clip((np.arange(len(odometry)) - numbers[before]) / span, 0.0, 1.0)
-    within = lie.inverse(odometry[numbers[before]]) @ odometry
+    within = lie.between(odometry[numbers[before]], odometry)
     return T_world_keyframes[before] @ lie.exp(share[:, None] * correction[before]) @ within

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
@@ -31,12 +33,8 @@ class PinvSolver:
         watch = Stopwatch()
         H, g = _normal_equations(system)
         build_s = watch.lap()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", MatrixRankWarning)
-                inverse = csc_matrix(inv(H))
-        except (RuntimeError, MatrixRankWarning) as error:
-            raise undetermined(system) from error
+        with _naming_the_undetermined(system):
+            inverse = csc_matrix(inv(H))
         factor_s = watch.lap()
         # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
         _check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), H, system)
@@ -57,12 +55,8 @@ class DefaultSolver:
         watch = Stopwatch()
         H, g = _normal_equations(system)
         build_s = watch.lap()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", MatrixRankWarning)
-                x = spsolve(H, g)
-        except (RuntimeError, MatrixRankWarning) as error:
-            raise undetermined(system) from error
+        with _naming_the_undetermined(system):
+            x = spsolve(H, g)
         factor_s = watch.lap()
         return Solution(np.asarray(x), build_s, factor_s, 0.0, lambda: _upper(_factorise(H, "COLAMD", system)))
 
@@ -83,6 +77,17 @@ class LuSolver:
         x = lu.solve(g)
         solve_s = watch.lap()
         return Solution(x, build_s, factor_s, solve_s, lambda: _upper(lu))
+
+
+@contextmanager
+def _naming_the_undetermined(system: LinearSystem) -> Iterator[None]:
+    """What scipy says of a singular matrix becomes the error that names its unknowns."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", MatrixRankWarning)
+            yield
+    except (RuntimeError, MatrixRankWarning) as error:
+        raise undetermined(system) from error
 
 
 def _normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.float64]]:
