@@ -84,7 +84,8 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     tolerance_rad: Positive = 1e-4
     sensor_noise_m: Positive = 0.03
     min_inlier_share: Share = 0.3
-    min_information: NonNegative = 1e-3
+    min_information: NonNegative = 1e-6
+    min_signal: NonNegative = 3.0
 
 
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -95,7 +95,9 @@ class Match:
     reason : why the iteration stopped, in words
     degeneracy_eigenvalue : smallest eigenvalue of the information per inlier, lengths scaled so that
         translation and rotation compare; 0 is blind, 1 is a direction that every residual sees
-    degeneracy_direction : (k,) unit eigenvector that belongs to it, twist order, source's frame
+    observability : of the worst direction, how many times as much is known of it as it takes to be determined, by
+        ``matching.min_information`` and ``matching.min_signal``; below 1 the scan is degenerate
+    degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame
     """
 
     T_target_source: Pose
@@ -108,6 +110,7 @@ class Match:
     converged: bool
     reason: str
     degeneracy_eigenvalue: float
+    observability: float
     degeneracy_direction: NDArray[np.float64]
 
     @property

@@ -3,6 +3,17 @@
 import numpy as np
 
 from pipeline import lie
+from pipeline.kernels.hashing import unpack
+from pipeline.kernels.voxels import (
+    ACROSS,
+    DIRECTION,
+    MEAN_TERM,
+    PLANE,
+    SHAPE,
+    SLOPE_ACROSS,
+    SLOPE_ALONG,
+    THICKNESS,
+)
 
 
 def spectrum(H, weights, range_m):
@@ -12,14 +23,16 @@ def spectrum(H, weights, range_m):
     return scale, values, vectors
 
 
-def hold(H, weights, range_m, expected, min_information):
+def hold(H, weights, range_m, expected, signals, limits):
+    """limits : the least information and the least signal"""
     scale, values, vectors = spectrum(H, weights, range_m)
     total = np.zeros(H.shape)
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value < 10.0 * min_information:
+    for value, signal, vector in zip(values, signals, vectors.T, strict=True):
+        times = min(value / limits[0], signal / limits[1])
+        if times < 10.0:
             twist = vector * scale
-            strength = twist @ expected @ twist if value >= min_information else 1e3 * weights
-            total += strength * np.outer(vector / scale, vector / scale)
+            strength = 1e3 * weights if times < 1.0 else twist @ expected @ twist / (1.0 - 1.0 / signal)
+            total += min(strength, 1e3 * weights) * np.outer(vector / scale, vector / scale)
     return total
 
 
@@ -30,3 +43,29 @@ def seen_from_source(T, T_first, H, worst, variance):
     turned = centred.copy()
     turned[:-1, -1] = 0.0
     return lie.adjoint(centred).T @ H @ lie.adjoint(centred) / variance, lie.adjoint(turned).T @ worst
+
+
+def signal_along(voxel_map, points, T, outcome, twist):
+    """What pairs tell along a twist over what errors of normals feign, but for one surface and young ones."""
+    voxels = voxel_map.voxels
+    youngest = voxel_map.insertions - min(2, voxel_map.insertions - 1)
+    told, places, feigned = [], [], 0.0
+    for point, j, weight in zip(points, outcome.partner, outcome.trust, strict=True):
+        if j < 0 or weight == 0.0:
+            continue
+        cell = voxels.cells[j]
+        n, u, is_plane = cell[DIRECTION : DIRECTION + 3], cell[ACROSS : ACROSS + 3], cell[SHAPE] == PLANE
+        p = lie.transform(T, point[None])[0] - outcome.origin
+        d = twist[:3] + np.cross(twist[3:], p)
+        if is_plane:
+            m = 1.0 / cell[MEAN_TERM]
+            spread = cell[SLOPE_ACROSS] * np.outer(u, u) + cell[SLOPE_ALONG] * np.outer(
+                np.cross(n, u), np.cross(n, u)
+            )
+            feigned += weight * cell[THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
+        if voxels.born[j] <= youngest:
+            told.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
+            places.append(unpack(voxels.voxel_keys[j]))
+    loudest = np.array(places[int(np.argmax(told))])
+    is_away = np.abs(np.array(places) - loudest).max(axis=1) > 1
+    return np.array(told)[is_away].sum() / feigned

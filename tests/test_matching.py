@@ -170,7 +170,7 @@ def test_a_sure_prediction_outweighs_weak_data_and_no_others(dents, is_believed)
     target.insert(dented_corridor(400), lie.identity(2))
     expected = lie.pose_2d(0.05, 0.0, 0.0)
     prior = Prior(expected, np.diag([0.002, 0.002, 0.001]) ** 2, np.array([0.5, 0.5, 0.2]))
-    match = create_matcher(MatchingConfig(max_distance_m=0.8)).align(
+    match = create_matcher(MatchingConfig(max_distance_m=0.8, min_information=1e-3)).align(
         dented_corridor(dents, seed=1), target, expected, prior
     )
     assert match.degeneracy_eigenvalue > 1e-3

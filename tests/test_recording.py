@@ -20,7 +20,7 @@ from viz.recording import Recording
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
     entities.LIDAR, entities.SCAN, entities.COVARIANCE, entities.ODOMETRY, entities.TRAJECTORY,
-    entities.TIME, entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.DEGENERACY,
+    entities.TIME, entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.OBSERVABILITY,
     entities.ITERATIONS, entities.OPTIMISED_LIDAR,
 )  # fmt: skip
 NOW_AND_THEN = (
@@ -49,7 +49,8 @@ def drive(count, dimension, points=180, seed=1):
             T_target_source=T_odom_lidar,
             information=np.diag([1e6] * dimension + [1e8] * (k - dimension)), cost=0.5,
             inliers=points - 7, points=points, iterations=4, residual_m=np.inf if state is State.LOST else 0.02,
-            converged=True, reason="converged", degeneracy_eigenvalue=0.3, degeneracy_direction=np.eye(k)[0],
+            converged=True, reason="converged", degeneracy_eigenvalue=0.3, observability=9.0,
+            degeneracy_direction=np.eye(k)[0],
         )  # fmt: skip
         keyframe = i // 5 if i % 5 == 0 else -1
         closures, graph = (), None

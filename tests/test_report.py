@@ -93,7 +93,7 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
     for title in (
         "Summary", "More on accuracy", "More on time",
         "Trajectories", "Plan", "Error", "Over the distance", "Distribution", "Time per scan", "Along the log",
-        "Covariance consistency", "Degeneracy along the way", "Maps", "Loop closures of plicp+loops",
+        "Covariance consistency", "Observability along the way", "Maps", "Loop closures of plicp+loops",
         "Disagreement", "Command", "Versions", "Settings",
     ):  # fmt: skip
         assert title in seen["text"], title
@@ -112,7 +112,7 @@ def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_pat
         "Trajectory and map",
         "Error",
         "Time per scan",
-        "Degeneracy",
+        "Observability",
         "Loop closures",
         "Versions",
         "ATE",
@@ -181,7 +181,7 @@ def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparis
 
 def course(positions, **known):
     count = len(positions)
-    unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "eigenvalue")}
+    unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "observability")}
     unknown["relation_error_m"] = np.empty(0)
     return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
 

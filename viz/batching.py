@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from time import perf_counter
 
 import numpy as np
@@ -15,6 +16,7 @@ from viz.messages import Message, Times
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
+_BLIND = 1e-3  # observability; less is drawn as that
 _WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
 
 
@@ -134,17 +136,23 @@ def _scans(steps: list[Step]) -> rr.ComponentColumnList:
 
 
 def _matches(matches: list[Match], times: Times) -> list[Message]:
-    """Plots and covariance of the registrations; an infinite residual is a gap."""
+    """Plots and covariance of the registrations; what is infinite is a gap."""
     numbers = np.array(
         [
-            (match.inliers, match.inlier_share, match.residual_m, match.degeneracy_eigenvalue, match.iterations)
+            (
+                match.inliers,
+                match.inlier_share,
+                match.residual_m,
+                math.log10(max(match.observability, _BLIND)),
+                match.iterations,
+            )
             for match in matches
         ],
         np.float64,
     )
     numbers[~np.isfinite(numbers)] = np.nan
     series = (
-        entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.DEGENERACY, entities.ITERATIONS,
+        entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.OBSERVABILITY, entities.ITERATIONS,
     )  # fmt: skip
     informations = np.array([match.information for match in matches])
     return [

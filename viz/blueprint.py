@@ -15,7 +15,7 @@ _PLOTS = {
     "inliers": entities.INLIERS,
     "inlier share": entities.INLIER_SHARE,
     "residual": entities.RESIDUAL,
-    "degeneracy": entities.DEGENERACY,
+    "observability": entities.OBSERVABILITY,
     "iterations": entities.ITERATIONS,
 }
 

@@ -10,11 +10,9 @@ import numpy as np
 
 from pipeline.compare.columns import Column, columns_of
 from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.methods import OURS
 from pipeline.compare.outcome import CLOSURES_FILE, Status
 from pipeline.compare.table import Row as TableRow
 from pipeline.compare.table import Table, read_table
-from pipeline.config import MatchingConfig
 from pipeline.maps import read_ply
 from pipeline.trajectory import read_tum
 from viz import course_figures as figures
@@ -124,7 +122,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         yield from error_section(drawn, table.truth)
         yield from relation_section(drawn)
         yield from time_section(drawn)
-        yield from knowledge_section(drawn, _least_information(table), is_planar=is_planar)
+        yield from knowledge_section(drawn, is_planar=is_planar)
         yield from _map_section(directory, drawn, figures.frame(framing, truth), table.dimension)
     for course in courses:
         yield from loop_section(
@@ -132,12 +130,6 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         )
     if len(table.rows) > 1:
         yield _disagreement(table)
-
-
-def _least_information(table: Table) -> float:
-    """Below which ours call a scan degenerate; no other method tells."""
-    limits = [row.settings["matching"]["min_information"] for row in table.rows if row.base in OURS]
-    return limits[0] if limits else MatchingConfig().min_information
 
 
 def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:

@@ -37,7 +37,7 @@ def _course(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -
         relation_error_m=errors_m,
         seconds=_column(chosen, "seconds"),
         nees=_column(chosen, "nees"),
-        eigenvalue=_column(chosen, "degeneracy_eigenvalue"),
+        observability=_column(chosen, "observability"),
     )
 
 

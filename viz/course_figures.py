@@ -21,7 +21,7 @@ _MARGIN = 0.25
 _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
-_BLIND = 0.01  # of the limit; less is drawn as that
+_BLIND, _PLAIN = 0.01, 1000.0  # times the least that must be known; less and more are drawn as that
 _BAR_INCHES = 0.65  # of a colour bar and its numbers
 
 
@@ -105,30 +105,31 @@ def consistency(name: str, courses: Sequence[Course], degrees_of_freedom: int) -
         return sheet.svg()
 
 
-def degeneracy(name: str, courses: Sequence[Course], limit: float) -> Markup:
-    """Information along the worst direction, scan by scan; below the limit (dotted) a scan is degenerate."""
+def observability(name: str, courses: Sequence[Course]) -> Markup:
+    """What is known of the worst direction, scan by scan; below 1 (dotted) a scan is degenerate."""
     with Sheet(name) as sheet:
-        for course in _known(courses, "eigenvalue"):
-            x = np.arange(len(course.eigenvalue), dtype=np.float64)
-            sheet.axes.plot(*_windowed(x, np.maximum(course.eigenvalue, _BLIND * limit), np.min), **course.style)
-        sheet.axes.axhline(limit, **_DOTTED)
+        for course in _known(courses, "observability"):
+            x = np.arange(len(course.observability), dtype=np.float64)
+            known = np.clip(course.observability, _BLIND, _PLAIN)
+            sheet.axes.plot(*_windowed(x, known, np.min), **course.style)
+        sheet.axes.axhline(1.0, **_DOTTED)
         _logarithmic(sheet.axes, "y")
-        _label(sheet.axes, "scan", "information per inlier")
+        _label(sheet.axes, "scan", "times the least")
         return sheet.svg()
 
 
-def degeneracy_plan(name: str, course: Course, limit: float) -> Markup:
-    """The same on the way itself, from the limit to 1, the worst scans on top."""
+def observability_plan(name: str, course: Course) -> Markup:
+    """The same on the way itself, the worst scans on top."""
     from matplotlib.colors import LogNorm
 
     low, high = frame([course], None)
-    order = np.argsort(-course.eigenvalue)
+    order = np.argsort(-course.observability)
     with Sheet.of_plan(name, low, high, spare=_BAR_INCHES) as sheet:
         x, y = course.positions[order, :2].T
         size = float(np.clip(3000.0 / len(order), 4.0, 30.0))
         dots = sheet.axes.scatter(
-            x, y, c=np.clip(course.eigenvalue[order], limit, 1.0), s=size, cmap="cool_r", linewidths=0,
-            norm=LogNorm(limit, 1.0), rasterized=True,
+            x, y, c=np.clip(course.observability[order], 1.0, _PLAIN), s=size, cmap="cool_r", linewidths=0,
+            norm=LogNorm(1.0, _PLAIN), rasterized=True,
         )  # fmt: skip
         bar = sheet.figure.colorbar(dots, ax=sheet.axes, pad=0.02, aspect=15, format=_plain)
         bar.ax.minorticks_off()

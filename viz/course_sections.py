@@ -103,24 +103,24 @@ def time_section(courses: Sequence[Course]) -> Iterator[Section]:
         )
 
 
-def knowledge_section(courses: Sequence[Course], limit: float, *, is_planar: bool) -> Iterator[Section]:
+def knowledge_section(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Section]:
     """What they knew of themselves: covariances against errors, and directions that nothing determined."""
-    told = _with(courses, "eigenvalue")
+    told = _with(courses, "observability")
     if not told:
         return
-    degeneracy = Drawing(
-        "Degeneracy along the way",
-        "Smallest eigenvalue of the information per inlier, worst of neighbouring scans: 0 is blind, 1 seen "
-        "by every residual. Below the dotted line a scan is called degenerate.",
-        figures.degeneracy("degeneracy", told, limit),
+    along = Drawing(
+        "Observability along the way",
+        "How many times the least that it takes is known of the worst direction, worst of neighbouring scans. "
+        "Below the dotted line a scan is called degenerate.",
+        figures.observability("observability", told),
     )
     whose = f" of {told[0].name}" if len(told) > 1 else ""
     where = Drawing(
         "Where little was seen",
-        f"The same information on the way{whose}.",
-        figures.degeneracy_plan("blind", told[0], limit),
+        f"The same on the way{whose}.",
+        figures.observability_plan("blind", told[0]),
     )
-    drawings = (*_consistency(courses, is_planar=is_planar), degeneracy, where)
+    drawings = (*_consistency(courses, is_planar=is_planar), along, where)
     yield Section("Certainty", "", _legend(told), drawings)
 
 

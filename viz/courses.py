@@ -31,7 +31,7 @@ class Course:
     relation_error_m : (K,) the same of K relations, none where there are no relations
     seconds : (N,) what each scan took
     nees : (N,) squared error over covariance, 1 on average if exact
-    eigenvalue : (N,) information per inlier along the worst direction
+    observability : (N,) how many times the least that must be known is known of the worst direction
     """
 
     name: str
@@ -43,7 +43,7 @@ class Course:
     relation_error_m: Floats
     seconds: Floats
     nees: Floats
-    eigenvalue: Floats
+    observability: Floats
 
     @property
     def style(self) -> dict[str, Any]:

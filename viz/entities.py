@@ -33,7 +33,7 @@ TIME = "plots/time"
 INLIERS = "plots/inliers"
 INLIER_SHARE = "plots/inlier_share"
 RESIDUAL = "plots/residual"
-DEGENERACY = "plots/degeneracy"
+OBSERVABILITY = "plots/observability"
 ITERATIONS = "plots/iterations"
 STATE = "state"
 EVENTS = "events"
@@ -64,7 +64,8 @@ _LEGEND = f"""
 | violet ellipsoid | standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large |
 
 Timelines: `scan` counts the scans in the order of the log, `sensor_time` is the header stamp, which may step back.
-Degeneracy is the smallest eigenvalue of the information per inlier: 0 is blind, 1 is seen by every residual.
+Observability is how many times the least that it takes is known of the worst direction; below 1 (log10 below 0)
+a scan is degenerate.
 """
 
 
@@ -104,7 +105,7 @@ def _series() -> list[Message]:
         INLIERS: "inliers",
         INLIER_SHARE: "inlier share",
         RESIDUAL: "residual [m]",
-        DEGENERACY: "degeneracy eigenvalue",
+        OBSERVABILITY: "log10 observability",
         ITERATIONS: "iterations",
     }
     states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, ORANGE, RED])

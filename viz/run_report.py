@@ -96,7 +96,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
         yield from error_section(courses, metrics.ground_truth.source)
     yield from time_section(courses[:1])
     config = read_layer(directory / "config.toml")
-    yield from knowledge_section(courses[:1], float(config["matching.min_information"]), is_planar=is_planar)
+    yield from knowledge_section(courses[:1], is_planar=is_planar)
     if config["loops.enabled"]:
         yield from loop_section(courses[0], directory / "loops.parquet", "Loop closures")
 
@@ -135,7 +135,7 @@ def _course(
         relation_error_m=np.empty(0),
         seconds=unknown if steps is None else _seconds(steps),
         nees=unknown if steps is None or truth is None else _nees(steps, truth),
-        eigenvalue=unknown if steps is None else steps["degeneracy_eigenvalue"].to_numpy(),
+        observability=unknown if steps is None else steps["observability"].to_numpy(),
     )
 
 

@@ -82,12 +82,12 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
     return next((outcome for outcome in outcomes if outcome.is_whole), outcomes[0])
 
 
-def degeneracy(outcome: Outcome) -> NDArray[np.float64]:
-    """(N,) smallest eigenvalue of the information per inlier; empty where the method does not tell."""
+def observability(outcome: Outcome) -> NDArray[np.float64]:
+    """(N,) as in ``Match``; empty where the method does not tell."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return np.empty(0)
-    return pq.read_table(path, columns=["degeneracy_eigenvalue"])["degeneracy_eigenvalue"].to_numpy()
+    return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

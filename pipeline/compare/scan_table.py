@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.compare.judging import Judged, degeneracy
+from pipeline.compare.judging import Judged, observability
 from pipeline.compare.outcome import Outcome
 from pipeline.data import Matrix
 from pipeline.evaluate.absolute import path_length
@@ -79,8 +79,8 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
     poses = final_poses(run.outcome)
     count = len(poses)
     aligned = (run.judged.T_reference_estimate @ poses)[:, :3, 3]
-    eigenvalues = degeneracy(run.outcome)
-    eigenvalues = eigenvalues[:count] if len(eigenvalues) else np.full(count, np.nan)
+    known = observability(run.outcome)
+    known = known[:count] if len(known) else np.full(count, np.nan)
     travelled_m = path_length(poses) if count else np.empty(0)
     numbers = {
         "seconds": run.outcome.seconds[:count],
@@ -91,7 +91,7 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
         "error_m": run.judged.errors_m[:count],
         "error_rad": run.judged.errors_rad[:count],
         "nees": run.judged.nees[:count],
-        "degeneracy_eigenvalue": eigenvalues,
+        "observability": known,
     }
     return {
         "method": pa.array([run.name] * count, pa.string()),

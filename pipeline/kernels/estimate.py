@@ -19,7 +19,9 @@ class Terms(NamedTuple):
     first_scale_m, widest_scale_m, scale_m : of the kernel, at first unless the prediction is in doubt, at the
         most, and at last
     variance : of a range, σ² in m²
-    min_information : per weight, below which a direction is not determined
+    min_information, min_signal : per weight, and times what noise would feign, below which a direction is not
+        determined
+    insertions : into the map so far
     """
 
     optimiser: int
@@ -31,6 +33,8 @@ class Terms(NamedTuple):
     scale_m: float
     variance: float
     min_information: float
+    min_signal: float
+    insertions: int
     tolerance_m: float
     tolerance_rad: float
 

@@ -10,7 +10,7 @@ from pipeline.kernels.descent import solve
 from pipeline.kernels.eigen import eigensystem
 from pipeline.kernels.poses import adjoint, centred
 
-WEAK = 10.0  # times the least information, below which the data alone are not believed
+WEAK = 10.0  # times the limits, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction
 
 
@@ -21,11 +21,13 @@ class Spectrum(NamedTuple):
         square range
     values : (k,) eigenvalues, ascending, of the information per weight; 1 is a direction that every residual sees
     vectors : (k, k) unit eigenvectors, a column each, in evened units
+    signals : (k,) what is told along each over what errors of the normals would feign; infinite where unknown
     """
 
     scale: NDArray[np.float64]
     values: NDArray[np.float64]
     vectors: NDArray[np.float64]
+    signals: NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
@@ -40,59 +42,68 @@ def spectrum_of(H, weights: float, range_m: float):
         for j in range(k):
             evened[i, j] = H[i, j] * scale[i] * scale[j] / max(weights, 1e-300)
     eigensystem(evened, values, vectors)
-    return Spectrum(scale, values, vectors)
+    return Spectrum(scale, values, vectors, np.full(k, np.inf))
 
 
 @njit(cache=True, nogil=True)
-def hold(spectrum, weights: float, expected, min_information: float):
+def worst(spectrum) -> int:
+    """The direction that the data tell least of, above what would be feigned."""
+    m = 0
+    for other in range(1, spectrum.values.shape[0]):
+        if spectrum.signals[other] < spectrum.signals[m]:
+            m = other
+    return m
+
+
+@njit(cache=True, nogil=True)
+def is_below(spectrum, m: int, times: float, terms) -> bool:
+    """Whether the data tell less along a direction than so many times the least."""
+    return spectrum.values[m] < times * terms.min_information or spectrum.signals[m] < times * terms.min_signal
+
+
+@njit(cache=True, nogil=True)
+def hold(spectrum, weights: float, expected, terms):
     """Information (k, k), in the kernel's units, that keeps a pose near the prediction where the data tell little.
 
-    Along directions whose eigenvalue is below ``min_information`` the pose does not move at all (Zhang, Kaess &
-    Singh 2016). Up to WEAK times that the data may be mistaken about themselves, and the information ``expected``
-    (k, k) of the prediction is taken as it is; beyond, a vehicle that brakes may contradict any experience.
+    Along directions of which the data tell nothing the pose does not move at all (Zhang, Kaess & Singh 2016). Up
+    to WEAK times the limits the information ``expected`` (k, k) of the prediction counts, against that of the data
+    without what is feigned: the share 1 − 1/signal; beyond, a vehicle that brakes may contradict any experience.
     """
     k = expected.shape[0]
     anchor, twist = np.zeros((k, k)), np.empty(k)
     for m in range(k):
-        if spectrum.values[m] >= WEAK * min_information:
-            break
+        if not is_below(spectrum, m, WEAK, terms):
+            continue
         strength = 0.0
         for i in range(k):
             twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
         for i in range(k):
             for j in range(k):
                 strength += twist[i] * expected[i, j] * twist[j]
-        if spectrum.values[m] < min_information:
-            strength = _FIRM * weights
+        real = 1.0 - 1.0 / max(spectrum.signals[m], 1e-300)
+        if is_below(spectrum, m, 1.0, terms) or strength > real * _FIRM * weights:
+            strength, real = _FIRM * weights, 1.0
         for i in range(k):
             for j in range(k):
                 along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                anchor[i, j] += strength * along / (spectrum.scale[i] * spectrum.scale[j])
+                anchor[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
     return anchor
 
 
 @njit(cache=True, nogil=True)
-def seen_from_source(T, T_first, H, spectrum, variance: float):
-    """Information (k, k) and worst direction (k,) of twists in the source's own frame.
+def seen_from_source(T, T_first, H, direction, variance: float):
+    """Information (k, k) and a direction (k,) of twists, in the source's own frame.
 
-    H (k, k), of residuals with this variance, and the spectrum are about the position of T_first, in map axes.
+    H (k, k), of residuals with this variance, and the direction are about the position of T_first, in map axes.
     """
     k = H.shape[0]
-    information, direction = congruent(adjoint(centred(T, T_first)), H), np.zeros(k)
+    information, turned = congruent(adjoint(centred(T, T_first)), H), np.zeros(k)
     Ad = adjoint(centred(T, T))
     for i in range(k):
         for j in range(k):
             information[i, j] /= variance
-            direction[j] += Ad[i, j] * spectrum.vectors[i, 0]
-    return information, direction
-
-
-@njit(cache=True, nogil=True)
-def informed(covariance, information):
-    """Covariance (k, k) after information Λ (k, k) has come in: (P⁻¹ + Λ)⁻¹."""
-    total = definite_inverse(covariance)
-    add(total, information)
-    return definite_inverse(total)
+            turned[j] += Ad[i, j] * direction[i]
+    return information, turned
 
 
 @njit(cache=True, nogil=True)

@@ -7,10 +7,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.evidence import WEAK, add, congruent, definite_inverse, hold, seen_from_source, spectrum_of
+from pipeline.kernels.evidence import (
+    WEAK,
+    add,
+    congruent,
+    definite_inverse,
+    hold,
+    is_below,
+    seen_from_source,
+    spectrum_of,
+    worst,
+)
 from pipeline.kernels.pose_log import twist_3d
 from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
 from pipeline.kernels.registration import align
+from pipeline.kernels.signal import signal_along
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
@@ -31,6 +42,7 @@ class Answer(NamedTuple):
     information: NDArray[np.float64]
     direction: NDArray[np.float64]
     eigenvalue: float
+    signal: float
     residual_m: float
     cost: float
     pairs: int
@@ -57,16 +69,31 @@ def match(voxels, points, T_first, expected, terms):
     first_scale_m = min(max(terms.first_scale_m, _DOUBTS * doubt_m), terms.widest_scale_m)
     T = T_first.copy()
     outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
-    spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
-    if spectrum.values[0] < WEAK * terms.min_information:
+    spectrum = _heard(voxels, points, T, outcome, range_m, terms)
+    if is_below(spectrum, 0, WEAK, terms):
         believed = information
         if expected.is_known:
             believed = _turned(definite_inverse(expected.covariance), T_first, terms.variance)
-        add(information, hold(spectrum, outcome.weights, believed, terms.min_information))
+        add(information, hold(spectrum, outcome.weights, believed, terms))
         T = T_first.copy()
         outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
-        spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+        spectrum = _heard(voxels, points, T, outcome, range_m, terms)
     return answer_of(T, T_first, outcome, spectrum, terms.variance)
+
+
+@njit(cache=True, nogil=True)
+def _heard(voxels, points, T, outcome, range_m: float, terms):
+    """The spectrum of an outcome; in space with signals, from the weakest direction on to the first sound one."""
+    spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+    k = spectrum.values.shape[0]
+    twist = np.empty(k)
+    for m in range(k if points.shape[1] == 3 else 0):
+        for i in range(k):
+            twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
+        spectrum.signals[m] = signal_along(voxels, points, T, outcome, twist, terms.insertions)
+        if not is_below(spectrum, m, WEAK, terms):
+            break
+    return spectrum
 
 
 @njit(cache=True, nogil=True)
@@ -81,13 +108,17 @@ def answer_of(T, T_first, outcome, spectrum, variance: float):
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
     """
+    m = worst(spectrum)
     residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
-    information, direction = seen_from_source(T, T_first, outcome.H, spectrum, max(variance, residual_m**2))
+    information, direction = seen_from_source(
+        T, T_first, outcome.H, spectrum.vectors[:, m], max(variance, residual_m**2)
+    )
     return Answer(
         T,
         information,
         direction,
         max(spectrum.values[0], 0.0),
+        spectrum.signals[m],
         residual_m,
         outcome.cost,
         outcome.pairs,

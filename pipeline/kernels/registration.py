@@ -41,6 +41,8 @@ class Outcome(NamedTuple):
     cost : robust cost in m², every unpaired point at its limit ½s²
     weights, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : points with a partner, linearisations, one of the codes above
+    origin (3,), partner (N,), trust (N,) : what twists turn about, and the last pairs, points without a shape
+        out of trust
     """
 
     H: NDArray[np.float64]
@@ -50,6 +52,9 @@ class Outcome(NamedTuple):
     pairs: int
     iterations: int
     ending: int
+    origin: NDArray[np.float64]
+    partner: NDArray[np.int32]
+    trust: NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
@@ -103,7 +108,9 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
     cost = now.sums[COST] - pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
     leave_out_points(problem)
     normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, 0.0, now.H, now.b)
-    return Outcome(now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending)
+    return Outcome(
+        now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending, origin, partner, trust
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -4,8 +4,8 @@ A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σy
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
 (3), direction (3), shape, tick of the last insertion; of a line or plane in space the variance across it; and
 of a plane there its second direction (3), and how that variance carries over to the fit: at the mean, and by
-squared distance along both directions; and the number of points when all this was fitted. A 2D map is the plane
-z = 0 of the same layout.
+squared distance along both directions; and the number of points when all this was fitted. ``born`` is the tick
+of the first insertion. A 2D map is the plane z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -27,13 +27,14 @@ MANY = 30.0  # points, beyond which more of them tell nothing new, because their
 
 
 class Voxels(NamedTuple):
-    """The arrays of a voxel map: ``keys`` (S,), ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 16)."""
+    """The arrays of a voxel map: ``keys``, ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 16), ``born`` (V,)."""
 
     keys: NDArray[np.int64]
     row: NDArray[np.int32]
     voxel_keys: NDArray[np.int64]
     moments: NDArray[np.float64]
     cells: NDArray[np.float64]
+    born: NDArray[np.int64]
     used: NDArray[np.int64]
     size_m: float
 
@@ -50,7 +51,7 @@ def insert(voxels, points, T, tick: float, alone: float):
     touches = 0
     for i in range(points.shape[0]):
         x, y, z = move(T, points, i)
-        voxel = _voxel_at(voxels, x, y, z)
+        voxel = _voxel_at(voxels, x, y, z, tick)
         if voxels.cells[voxel, TICK] != tick:
             voxels.cells[voxel, TICK] = tick
             touched[touches] = voxel
@@ -93,6 +94,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
         kept.keys[slot] = key
         kept.row[slot] = new
         kept.voxel_keys[new] = key
+        kept.born[new] = voxels.born[voxel]
         for k in range(voxels.moments.shape[1]):
             kept.moments[new, k] = voxels.moments[voxel, k]
         for k in range(CELL):
@@ -100,7 +102,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
 
 
 @njit(cache=True, inline="always")
-def _voxel_at(voxels, x: float, y: float, z: float) -> int:
+def _voxel_at(voxels, x: float, y: float, z: float, tick: float) -> int:
     """Row of the voxel that holds the point; a new one is empty."""
     scale = 1.0 / voxels.size_m
     key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
@@ -112,6 +114,7 @@ def _voxel_at(voxels, x: float, y: float, z: float) -> int:
     voxels.keys[~slot] = key
     voxels.row[~slot] = voxel
     voxels.voxel_keys[voxel] = key
+    voxels.born[voxel] = int(tick)
     voxels.moments[voxel].fill(0.0)
     voxels.cells[voxel].fill(0.0)
     voxels.cells[voxel, TICK] = -1.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline import lie
@@ -55,7 +57,7 @@ class PointToShapeMatcher:
             expected,
             terms_of(self.config, target, wide=wide),
         )
-        return match_of(answer, len(points))
+        return match_of(answer, len(points), self.config)
 
 
 def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
@@ -70,12 +72,14 @@ def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
         scale_m=config.kernel_scale_m,
         variance=config.sensor_noise_m**2,
         min_information=config.min_information,
+        min_signal=config.min_signal,
+        insertions=target.insertions,
         tolerance_m=config.tolerance_m,
         tolerance_rad=config.tolerance_rad,
     )
 
 
-def match_of(answer: Answer, points: int) -> Match:
+def match_of(answer: Answer, points: int, config: MatchingConfig) -> Match:
     """The match that a kernel's answer for so many points amounts to."""
     return Match(
         T_target_source=answer.T,
@@ -88,8 +92,15 @@ def match_of(answer: Answer, points: int) -> Match:
         converged=answer.ending == registration.CONVERGED,
         reason=_ENDINGS[answer.ending],
         degeneracy_eigenvalue=answer.eigenvalue,
+        observability=min(
+            _times(answer.eigenvalue, config.min_information), _times(answer.signal, config.min_signal)
+        ),
         degeneracy_direction=answer.direction,
     )
+
+
+def _times(known: float, least: float) -> float:
+    return known / least if least else math.inf
 
 
 def _expectation(prior: Prior | None, T_first: Pose) -> Expectation:

@@ -54,7 +54,8 @@ class SvdMatcher:
         outcome = self._outcome(
             T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
         )
-        return match_of(judge(T, outcome, root_mean_square_range(points), terms.variance), len(points))
+        answer = judge(T, outcome, root_mean_square_range(points), terms.variance)
+        return match_of(answer, len(points), self.config)
 
     def _stands_still(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]
@@ -85,6 +86,9 @@ class SvdMatcher:
             pairs=len(source),
             iterations=iterations,
             ending=ending,
+            origin=np.zeros(3),
+            partner=np.empty(0, np.int32),
+            trust=np.empty(0),
         )
 
 

@@ -62,6 +62,7 @@ def _empty(room: int, voxel_size_m: float) -> Voxels:
         voxel_keys=np.zeros(capacity, np.int64),
         moments=np.zeros((capacity, 10)),
         cells=cells,
+        born=np.zeros(capacity, np.int64),
         used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )

@@ -24,11 +24,14 @@ class Experience:
         self.squares = np.zeros(len(first_sigma))
         self.count = 0
 
-    def learn(self, error: NDArray[np.float64]) -> None:
-        """Take the error (k,) of a prediction."""
+    def learn(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+        """Take the error (k,) of a prediction, as far as it is more than that of the match it is seen from.
+
+        variance : (k,) of the match
+        """
         self.count += 1
         gain = max(1.0 - _MEMORY, 1.0 / self.count)
-        square = error * error
+        square = np.maximum(error * error - variance, 0.0)
         self.squares = np.maximum(self.squares + gain * (square - self.squares), _SUDDEN * square)
 
     @property

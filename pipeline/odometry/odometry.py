@@ -130,7 +130,7 @@ class Odometry:
 
         Scans are matched as seen from their middle; the stamp lies between two middles, or just beyond.
         """
-        interval_s = self.predictor.interval_to(scan)
+        interval_s = self.predictor.intervals.to(scan)
         if sweep.middle_s == 0.0 or interval_s <= 0.0:
             return None
         motion = lie.between(self.predictor.T_odom_lidar, T_odom_middle)
@@ -197,11 +197,12 @@ class Odometry:
             )
         if not np.isfinite(match.T_target_source).all():
             return State.LOST, match.reason
-        if match.degeneracy_eigenvalue < config.min_information:
+        if match.observability < 1.0:
             direction = " ".join(f"{value:.2f}" for value in match.degeneracy_direction)
             return State.DEGENERATE, (
-                f"motion along [{direction}] is undetermined: information "
-                f"{match.degeneracy_eigenvalue:.1e} < matching.min_information ({config.min_information:g})"
+                f"motion along [{direction}] is undetermined: observability {match.observability:.1e} < 1, by "
+                f"matching.min_signal ({config.min_signal:g}) or matching.min_information "
+                f"({config.min_information:g})"
             )
         return State.OK, match.reason
 

@@ -49,6 +49,7 @@ def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> M
         converged=True,
         reason="first scan: the frame starts here",
         degeneracy_eigenvalue=1.0,
+        observability=np.inf,
         degeneracy_direction=np.eye(k)[0],
     )
 
@@ -69,6 +70,7 @@ def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
             f"preprocess.max_range_m ({config.max_range_m:g})"
         ),
         degeneracy_eigenvalue=0.0,
+        observability=0.0,
         degeneracy_direction=np.eye(len(prediction.prior.information))[0],
     )
 

@@ -28,6 +28,8 @@ from pipeline.loops.verification import Verifier
 from pipeline.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
 from pipeline.odometry import Odometry
 from pipeline.odometry.experience import Experience
+from pipeline.odometry.intervals import Intervals
+from pipeline.odometry.motion_filter import MotionFilter
 from pipeline.odometry.prediction import Predictor
 from pipeline.point_store import PointStore, StoredPoints
 from pipeline.preprocess import Resolution, Sweep
@@ -58,8 +60,8 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, Odometry, Predictor, Experience, Resolution, Sweep, VoxelMap, Voxels,
-        PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
+        Checkpoint, Slam, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep, VoxelMap,
+        Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
         Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
         PointStore, StoredPoints, Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,

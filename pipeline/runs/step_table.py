@@ -114,6 +114,7 @@ class StepTable:
             "converged": [match.converged for match in matches],
             "match_reason": pa.array([match.reason for match in matches]).dictionary_encode(),
             "degeneracy_eigenvalue": [match.degeneracy_eigenvalue for match in matches],
+            "observability": [match.observability for match in matches],
             "degeneracy_direction": pa.array(
                 [match.degeneracy_direction.tolist() for match in matches], pa.list_(pa.float64(), k)
             ),
