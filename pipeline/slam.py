@@ -16,7 +16,6 @@ from pipeline.data import (
     Keyframe,
     Match,
     Matrix,
-    Points,
     Pose,
     Scan,
     State,
@@ -29,7 +28,7 @@ from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser, refined, spread
-from pipeline.odometry import Odometry, Tracked
+from pipeline.odometry import FrontEnd, Located
 from pipeline.point_store import PointStore
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
@@ -68,7 +67,7 @@ class Slam:
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
-        self.odometry = Odometry(config, T_base_lidar)
+        self.front_end = FrontEnd(config, T_base_lidar)
         self.closer = LoopCloser(config, self.dimension)
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
@@ -84,9 +83,14 @@ class Slam:
 
     def process(self, scan: Scan) -> Step:
         """Place one scan, and whatever it closes."""
-        tracked = self.odometry.track(scan)
+        return self.place(self.front_end.locate(scan))
+
+    def place(self, located: Located) -> Step:
+        """Place one scan that ``front_end`` located, which may be some scans ahead by now."""
+        tracked = located.tracked
+        scan = tracked.scan
         started = perf_counter()
-        keyframe = self._keyframe(tracked)
+        keyframe = self._keyframe(located)
         closures: tuple[Closure, ...] = ()
         state = None
         if keyframe >= 0 and self.config.loops.enabled:
@@ -104,7 +108,7 @@ class Slam:
             state=tracked.state,
             reason=tracked.reason,
             keyframe=keyframe,
-            local_map=self._local_map(keyframe),
+            local_map=located.local_map,
             closures=closures,
             graph=state,
             timing=timing,
@@ -130,26 +134,21 @@ class Slam:
             state=state,
         )
 
-    def _keyframe(self, tracked: Tracked) -> int:
+    def _keyframe(self, located: Located) -> int:
         """Make a keyframe of a scan that moved far enough; its index, or −1."""
+        tracked = located.tracked
         if self.odometry_poses:
             self.travelled_m += lie.apart(self.odometry_poses[-1], tracked.T_odom_lidar)[0]
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
-            self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(self.odometry.first_points))
+            self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(located.first_points))
         self.lost_scans += tracked.state is State.LOST
-        is_elsewhere = tracked.elsewhere_m > 0.0
-        is_keyframe = (
-            not self.keyframes
-            or is_elsewhere
-            or (tracked.state is not State.LOST and self._moved_enough(tracked.T_odom_lidar))
-        )
-        if not is_keyframe and not self.keeps_scans:
+        if not located.is_keyframe and not self.keeps_scans:
             return -1
         stored = self.points.add(tracked.points)
         self.spans.append((stored.first, stored.count))
-        if not is_keyframe:
+        if not located.is_keyframe:
             return -1
         keyframe = Keyframe(
             index=len(self.keyframes),
@@ -158,7 +157,7 @@ class Slam:
             stored=stored,
             T_odom_lidar=tracked.T_odom_lidar,
             travelled_m=self.travelled_m,
-            scale=self.odometry.local_map.scale,
+            scale=located.scale,
         )
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
         if self.keyframes:
@@ -167,7 +166,7 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
-            if is_elsewhere:
+            if tracked.elsewhere_m > 0.0:
                 sigmas = (tracked.elsewhere_m, np.pi)
                 self.closer.begin_piece(keyframe.index)
             self.graph.add_edge(
@@ -179,11 +178,6 @@ class Slam:
             self.lost_scans = 0
         self.keyframes.append(keyframe)
         return keyframe.index
-
-    def _moved_enough(self, T_odom_lidar: Pose) -> bool:
-        config = self.config.odometry
-        distance_m, angle_rad = lie.apart(self.keyframes[-1].T_odom_lidar, T_odom_lidar)
-        return distance_m > config.keyframe_distance_m or angle_rad > config.keyframe_angle_rad
 
     def _close_loops(self) -> tuple[Closure, ...]:
         return self._take(self.closer.close(self.keyframes, self.graph))
@@ -227,9 +221,6 @@ class Slam:
         self.waiting_closures, self.surprising, self.optimised_at = 0, False, len(self.keyframes)
         self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
-
-    def _local_map(self, keyframe: int) -> Points:
-        return self.odometry.local_map.points() if keyframe >= 0 else np.empty((0, self.dimension))
 
 
 def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:

@@ -26,7 +26,7 @@ from pipeline.loops.recognition import Recognition
 from pipeline.loops.submaps import Submaps
 from pipeline.loops.verification import Verifier
 from pipeline.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
-from pipeline.odometry import Odometry
+from pipeline.odometry import FrontEnd, Odometry
 from pipeline.odometry.experience import Experience
 from pipeline.odometry.intervals import Intervals
 from pipeline.odometry.motion_filter import MotionFilter
@@ -60,8 +60,9 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep, VoxelMap,
-        Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt,
+        Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep,
+        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps,
+        Doubt,
         Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
         PointStore, StoredPoints, Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
@@ -87,13 +88,14 @@ class Checkpoints:
         self.began_s = perf_counter() - run_s
         self.next_s = perf_counter() + every_s
 
-    def look(self, slam: Slam, scans: int) -> None:
-        """Write one if it is time."""
-        if perf_counter() >= self.next_s:
-            self.write(slam, scans)
+    def are_due(self) -> bool:
+        """Whether it is time for the next."""
+        return perf_counter() >= self.next_s
 
-    def write(self, slam: Slam, scans: int) -> None:
-        """Write one. Raises OSError where the disk is full; the last one stays."""
+    def write(self, slam: Slam) -> None:
+        """Write one, of a chain that is not ahead of itself. Raises OSError where the disk is full; the last stays."""
+        scans = slam.front_end.scans
+        assert scans == len(slam.stamps_ns)
         started = perf_counter()
         write_snapshot(self.path, Checkpoint(scans, started - self.began_s, slam), _CLASSES)
         now = perf_counter()

@@ -20,6 +20,7 @@ from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
 from pipeline.runs.resuming import Left, after, set_aside
+from pipeline.runs.running_ahead import located_ahead
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
@@ -60,12 +61,12 @@ def process(
     with recorder as recording, journal:
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
-        for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
+        for located in located_ahead(slam, progress.track(scans, log.scan_count - len(steps)), checkpoints):
+            step = slam.place(located)
             recording.log(step)
             journal.append(steps.append(step))
-            checkpoints.look(slam, len(steps))
         if progress.stopped:
-            checkpoints.write(slam, len(steps))
+            checkpoints.write(slam)
         progress.say("optimising and writing")
         result = slam.finish()
         judged = final_verdicts(result.closures, result.state)
