@@ -16,6 +16,7 @@ from pipeline.kernels.free_space import nearest_ranges, weigh_points
 _THREADS = 2
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels, up to which a scan is a witness
+_CUBES_TO_REACH = 8.0  # that points are sorted by
 _WINDOW = 0.6  # of a scan's spacing, within which a surface has a point
 _RANGE_MARGIN_SHARE = 0.03  # beside one voxel
 _LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # how level the ground is, and how exact an elevation
@@ -78,18 +79,20 @@ def _in_space(points: Points) -> Points:
 
 
 class _Cells:
-    """Points sorted by coarse cubes, so that a scan looks at those within reach alone."""
+    """Points sorted by cubes, so that a scan looks at those within reach alone, and at neighbours in turn."""
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m
-        cubes, cube_of_point = np.unique(np.floor(points / reach_m), axis=0, return_inverse=True)
-        self.middles_m = (cubes + 0.5) * reach_m
-        self.order = np.argsort(cube_of_point, kind="stable")
-        self.points = np.ascontiguousarray(points[self.order])
-        ends = np.cumsum(np.bincount(cube_of_point, minlength=len(cubes)))
-        self.spans = np.column_stack([np.append(0, ends[:-1]), ends]) if len(cubes) else np.empty((0, 2), np.int64)
+        self.edge_m = reach_m / _CUBES_TO_REACH
+        cubes = np.floor(points / self.edge_m)
+        self.order = np.lexsort(cubes.T)
+        self.points, cubes = points[self.order], cubes[self.order]
+        is_first = np.append(True, (cubes[1:] != cubes[:-1]).any(axis=1))[: len(points)]
+        first = np.flatnonzero(is_first)
+        self.middles_m = (cubes[first] + 0.5) * self.edge_m
+        self.spans = np.column_stack([first, np.append(first, len(points))[1:]])
 
     def within_reach(self, place_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(S, 2) spans of the points in cubes that are, in part, within reach of a place."""
-        outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.reach_m, 0.0)
+        outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.edge_m, 0.0)
         return self.spans[np.einsum("ij,ij->i", outside_m, outside_m) <= self.reach_m**2]
