@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from pipeline.data import Points
 from viz.courses import Course, Floats
@@ -14,6 +15,8 @@ from viz.sheet import INK, Sheet
 _ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
+_PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
+_OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
 AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around a way, at most
 _SHOWN_SHARES, _MARGIN_M = (0.2, 99.8), 1.0  # per cent of the points
 
@@ -37,17 +40,32 @@ def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     shown = shown[inside]
     with Sheet.of_plan(name, low, high) as sheet:
-        size = float(np.clip(12_000.0 / max(len(shown), 1), 0.08, 1.5))
-        if not len(shown) or not np.ptp(shown[:, 2]):
-            sheet.axes.scatter(shown[:, 0], shown[:, 1], s=size, c=_POINTS, linewidths=0, rasterized=True)
-        else:
-            shown = shown[np.argsort(shown[:, 2])]
-            bottom, top = np.percentile(shown[:, 2], (2.0, 98.0))
-            sheet.axes.scatter(
-                shown[:, 0], shown[:, 1], s=size, c=shown[:, 2], cmap="viridis", vmin=bottom, vmax=top,
-                linewidths=0, rasterized=True,
-            )  # fmt: skip
+        if len(shown):
+            corners = (low[0], high[0], low[1], high[1])
+            sheet.axes.imshow(_image(shown, low, high), extent=corners, origin="lower", interpolation="none")
         return sheet.svg()
+
+
+def _image(points: Floats, low: Floats, high: Floats) -> NDArray[np.uint8]:
+    """(H, W, 4), clear where nothing is, the fuller the more points there are, coloured as the highest of them."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgba
+
+    width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
+    edge_m = (high[0] - low[0]) / width
+    columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
+    points = points[np.argsort(points[:, 2])]
+    column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
+    colours = np.array([to_rgba(_POINTS)])
+    if np.ptp(points[:, 2]):
+        bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
+        colours = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
+    image = np.zeros((rows, columns, 4))
+    image[row, column] = colours
+    opacity = float(np.clip(_OPAQUE / len(points), *_OPACITIES))
+    counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    image[:, :, 3] = 1.0 - (1.0 - opacity) ** counts
+    return np.rint(255.0 * image).astype(np.uint8)
 
 
 def loops_picture(

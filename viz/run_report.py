@@ -31,6 +31,7 @@ from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
 from viz.report import REPORT_FILE, Drawing, Fold, Page, Section, write_page
 from viz.run_tables import accuracy_section, stages_section
+from viz.sheet import Sheet
 
 
 def write_run_report(directory: Path) -> None:
@@ -51,6 +52,12 @@ def write_run_report(directory: Path) -> None:
         ),
     )
     write_page(directory / REPORT_FILE, page)
+
+
+def prepare() -> None:
+    """Load what pages are drawn with; the first drawing takes several times as long as any other."""
+    with Sheet("first") as sheet:
+        sheet.svg()
 
 
 def _summary_lines(directory: Path) -> list[str]:
@@ -74,7 +81,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
-    steps = pq.read_table(directory / "steps.parquet")
+    steps = pq.ParquetFile(directory / "steps.parquet").read()
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None

@@ -93,7 +93,7 @@ class Checkpoints:
         return perf_counter() >= self.next_s
 
     def write(self, slam: Slam) -> None:
-        """Write one, of a chain that is not ahead of itself. Raises OSError where the disk is full; the last stays."""
+        """Write one of a chain that is not ahead of itself. Raises OSError where the disk is full; the last stays."""
         scans = slam.front_end.scans
         assert scans == len(slam.stamps_ns)
         started = perf_counter()

@@ -20,7 +20,7 @@ from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
 from pipeline.runs.resuming import Left, after, set_aside
-from pipeline.runs.running_ahead import located_ahead
+from pipeline.runs.running_ahead import RunningAhead
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
@@ -51,18 +51,21 @@ def process(
     slam, scans, notes = _begin(log, config, directory.path, steps, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     checkpoints = Checkpoints(directory.path, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
-    recorder = record(
-        directory.path / "recording.rrd",
-        dimension=log.dimension,
-        name=job.out.resolve().name,
-        sinks=job.sinks,
-        config=config.recording,
-    )
-    with recorder as recording, journal:
+    awaited = progress.track(scans, log.scan_count - len(steps))
+    with (
+        RunningAhead(slam, awaited, checkpoints) as located,
+        record(
+            directory.path / "recording.rrd",
+            dimension=log.dimension,
+            name=job.out.resolve().name,
+            sinks=job.sinks,
+            config=config.recording,
+        ) as recording,
+        journal,
+    ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
-        for located in located_ahead(slam, progress.track(scans, log.scan_count - len(steps)), checkpoints):
-            step = slam.place(located)
+        for step in map(slam.place, located):
             recording.log(step)
             journal.append(steps.append(step))
         if progress.stopped:

@@ -3,11 +3,10 @@
     python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5]
 
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process that
-reads the same log and tracks its scans with the same configuration, and nothing else; both by the clock, from the
-start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
-``Odometry.track`` in that process: without interpreter, imports, reading. Each is the least of several repeats, which
-take turns. Stages are those of one more run; what is done beside the odometry, in other threads, costs the clock
-little, so that they do not add up to the whole.
+reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock from
+the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
+``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
+which take turns. The stages are those of one more run: in the thread that ends with the run, and beside it.
 """
 
 from __future__ import annotations
@@ -17,11 +16,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections import defaultdict
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from threading import local
+from queue import SimpleQueue
 from time import perf_counter, time
 from typing import Any
 
@@ -30,18 +26,20 @@ from pipeline.odometry import Odometry
 from pipeline.settings import load_settings
 from tests.benchmarks.odometry3d import DATA, DEFAULT_LOGS
 from tests.benchmarks.peak_memory import ROOT
+from tests.benchmarks.stopwatch import Stopwatch
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_LOGS])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--child", choices=("odometry", "stages"), help=argparse.SUPPRESS)
+    parser.add_argument("--track", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--stages", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.child == "odometry":
+    if arguments.track:
         print(track(arguments.logs[0]))
-    elif arguments.child == "stages":
-        print(json.dumps(seconds_by_stage(arguments.logs[0])))
+    elif arguments.stages:
+        print(json.dumps(seconds_by_stage(arguments.logs[0], arguments.stages)))
     else:
         for path in arguments.logs:
             show(path.resolve(), arguments.repeats)
@@ -49,23 +47,33 @@ def main() -> None:
 
 def show(path: Path, repeats: int) -> None:
     """Measure one log and print what it took."""
-    runs: list[float] = []
-    alone: list[float] = []
-    tracking: list[float] = []
-    for repeat in range(repeats + 1):
-        run_s, _ = _timed("pipeline", "run", str(path), "--out", "run")
-        alone_s, answer = _timed("tests.benchmarks.whole_run", str(path), "--child", "odometry")
-        if repeat:  # the first compiles, and brings files into memory
-            runs.append(run_s)
-            alone.append(alone_s)
+    runs, alone, tracking = [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(repeats + 1):
+            runs.append(timed("pipeline", "run", str(path), "--out", f"{folder}/run", "--force")[0])
+            seconds, answer = timed("tests.benchmarks.whole_run", str(path), "--track")
+            alone.append(seconds)
             tracking.append(float(answer))
+    run_s, alone_s, tracking_s = (min(each[1:]) for each in (runs, alone, tracking))  # the first may compile
     print(f"\n{path.name}, least of {repeats}")
-    print(f"  run {min(runs):.2f} s, odometry {min(alone):.2f} s, tracking {min(tracking):.2f} s")
-    print(f"  run / odometry {min(runs) / min(alone):.2f}, run / tracking {min(runs) / min(tracking):.2f}")
-    whole_s, answer = _timed("tests.benchmarks.whole_run", str(path), "--child", "stages")
-    for name, seconds in json.loads(answer.splitlines()[-1]).items():
-        print(f"    {name:28}{seconds:6.2f} s{100.0 * seconds / whole_s:6.1f} %")
-    print(f"    {'whole':28}{whole_s:6.2f} s", flush=True)
+    print(f"  run {run_s:.2f} s, odometry {alone_s:.2f} s, tracking {tracking_s:.2f} s")
+    print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}")
+    whole_s, answer = timed("tests.benchmarks.whole_run", str(path), "--stages", repr(time()))
+    stages = json.loads(answer.splitlines()[-1])
+    print(f"  {'stage':26}{'in turn':>10}{'beside':>10}")
+    for name, (main_s, beside_s) in stages.items():
+        print(f"  {name:26}{main_s:8.2f} s{beside_s:8.2f} s")
+    rest_s = whole_s - sum(main_s for main_s, _ in stages.values())
+    print(f"  {'the rest':26}{rest_s:8.2f} s\n  {'whole':26}{whole_s:8.2f} s", flush=True)
+
+
+def timed(*module_and_words: str) -> tuple[float, str]:
+    """How long ``python -m`` takes, and what it prints."""
+    started = perf_counter()
+    answer = subprocess.run(
+        [sys.executable, "-m", *module_and_words], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return perf_counter() - started, answer.stdout
 
 
 def track(path: Path) -> float:
@@ -80,35 +88,49 @@ def track(path: Path) -> float:
     return seconds
 
 
-def seconds_by_stage(path: Path) -> dict[str, float]:
-    """A run in this process with a clock around each stage."""
-    from pipeline.__main__ import main as scanchain
+class Queue(SimpleQueue):
+    """That of ``RunningAhead``, to be watched."""
 
-    clock = Clock()
-    clock.watch_all()
+
+def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
+    """A run in this process, which was begun at that time, with a watch over what it consists of."""
+    from pipeline import __main__ as command
+    from pipeline.graph.pose_graph import PoseGraph
+    from pipeline.loops import LoopCloser
+    from pipeline.point_store import PointStore
+    from pipeline.runs import processing, results, run, running_ahead
+    from pipeline.runs.journal import Journal
+    from pipeline.runs.step_table import StepTable
+
+    watch = Stopwatch()
+    watch.add("start and imports", time() - began)
+    watch.over("opening the log", run, "open_log")
+    watch.over("odometry", Odometry, "track")
+    watch.over("waiting for odometry", Queue, "get")
+    running_ahead.SimpleQueue = Queue  # whose own class takes no watch
+    watch.over("loops", LoopCloser, "close", "finish")
+    watch.over("optimising", PoseGraph, "optimise")
+    watch.over("points kept", PointStore, "add", "read")
+    watch.over("journal", Journal, "append")
+    watch.over("map", results, "build_point_map", "write_ply", "draw_grid", "write_map")
+    watch.over("what moved", results, "moved")
+    watch.over("other results", processing, "write_results", "write_closures")
+    watch.over("other results", StepTable, "write")
+    watch.over("other results", run, "_judge", "measure")
+    watch.over("report", command, "_drawing_room", "_report")
+    open_recording = command._record
+
+    def record(*arguments: Any, **options: Any) -> Any:
+        recording = open_recording(*arguments, **options)
+        watch.over("recording", type(recording), "__enter__", "close", "log", "log_trajectory", "log_map")
+        watch.over("recording", sys.modules["viz.messages"].Message, "send")
+        return recording
+
+    command._record = watch.timed("recording", record)
     with tempfile.TemporaryDirectory() as folder:
-        assert scanchain(["run", str(path), "--out", str(Path(folder) / "run"), "--json"]) == 0
-    return dict(clock.seconds)
+        assert command.main(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
+    return watch.seconds
 
 
-class Clock:
-    """Adds up what passes inside functions, of each thread by itself and without what other stages take inside."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-        self.inner = local()
-
-    def watch_all(self) -> None:
-        """Put the clock into the functions that make up a run."""
-        from pipeline.graph.pose_graph import PoseGraph
-        from pipeline.logs import Log
-        from pipeline.loops import LoopCloser
-        from pipeline.point_store import PointStore
-        from pipeline.runs import processing, results, run
-        from pipeline.runs.checkpoint import Checkpoints
-        from pipeline.runs.journal import Journal
-        from pipeline.runs.step_table import StepTable
-        from viz.recording import Recording
-
-        self.watch("opening", run, "open_log")
-        self.watch("odometry", Odometry, "track")
+if __name__ == "__main__":
+    main()
