@@ -75,7 +75,7 @@ def carried(slam, scans, first, last):
 
 def test_a_robot_that_was_carried_elsewhere_is_found_again():
     log = open_log(shared_data("2d/intel.mcap"))
-    scans = list(islice(log.scans(), 6000))
+    scans = list(islice(log.scans(), 8000))
     whole = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
     slam = Slam(configured(2), log.T_base_lidar)
     holed = carried(slam, scans, 4000, 4600)

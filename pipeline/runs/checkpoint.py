@@ -61,10 +61,9 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep,
-        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch, Submaps,
-        Doubt,
-        Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray,
-        PointStore, StoredPoints, Pieces, AnywhereCloser,
+        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch,
+        Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray, PointStore, StoredPoints,
+        Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
@@ -93,7 +92,7 @@ class Checkpoints:
         return perf_counter() >= self.next_s
 
     def write(self, slam: Slam) -> None:
-        """Write one of a chain that is not ahead of itself. Raises OSError where the disk is full; the last stays."""
+        """Write one, of a chain that is not ahead of itself. Raises OSError on a full disk; the last one stays."""
         scans = slam.front_end.scans
         assert scans == len(slam.stamps_ns)
         started = perf_counter()

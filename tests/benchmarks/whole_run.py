@@ -3,10 +3,10 @@
     python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5]
 
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process that
-reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock from
-the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
-``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
-which take turns. The stages are those of one more run: in the thread that ends with the run, and beside it.
+reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock
+from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
+``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several
+repeats, which take turns. The stages are those of one more run: in the thread that ends with the run, and beside.
 """
 
 from __future__ import annotations
