@@ -70,7 +70,7 @@ def trust(path: Path, drive: Drive) -> Trust:
     judged = np.arange(len(steps)) >= WARM_UP_SCANS
     blind, sound = judged & (shares < BLIND_SHARE), judged & (shares > SOUND_SHARE)
     covariances = np.linalg.pinv(np.array([step.match.information for step in steps]), hermitian=True)
-    nees = motion_nees(np.array([step.T_odom_lidar for step in steps]), covariances, truth.poses)
+    nees = motion_nees(np.array([step.T_odom_lidar for step in steps]), covariances, truth.poses[: len(steps)])
     sure = judged[1:] & ~flags[1:] & ~flags[:-1]
     return Trust(6.0 * nees[sure], angles[blind & flags], flags[blind], flags[sound])
 
