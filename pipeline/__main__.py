@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -64,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _present_landmarks, _record_landmarks,
     )  # fmt: skip
     words = list(sys.argv[1:] if arguments is None else arguments)
+    atexit.register(gc.freeze)  # else garbage is sought once more, for half a second, before the interpreter goes
     try:
         return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
