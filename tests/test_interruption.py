@@ -101,7 +101,7 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         assert a.match.information.tobytes() == b.match.information.tobytes()
         if scan.index in breaks:
-            Checkpoints(tmp_path, 10.0, 0.0).write(broken, scan.index + 1)
+            Checkpoints(tmp_path, 10.0, 0.0).write(broken)
             broken = read_checkpoint(tmp_path).slam
             broken.points.reopen(points_file)
     a, b = straight.finish(), broken.finish()
@@ -112,18 +112,18 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
 
 
 def waiting_at(scan):
-    """The command line as a script that says "there" before it takes that scan, and then waits."""
+    """The command line as a script that says "there" before it places that scan, and then waits."""
     return f"""
 import sys, time
 from pipeline.__main__ import main
 from pipeline.slam import Slam
-process = Slam.process
-def waiting(self, scan):
-    if scan.index == {scan}:
+place = Slam.place
+def waiting(self, located):
+    if located.tracked.scan.index == {scan}:
         print("there", flush=True)
         time.sleep(60)
-    return process(self, scan)
-Slam.process = waiting
+    return place(self, located)
+Slam.place = waiting
 sys.exit(main(sys.argv[1:]))
 """
 
