@@ -14,7 +14,8 @@ from scenes import ROOT
 
 from pipeline.graph.g2o import read_g2o
 from pipeline.maps import read_map, read_ply
-from pipeline.runs.checkpoint import CHECKPOINT_FILE, POINTS_FILE, read_checkpoint
+from pipeline.runs.checkpoint import read_checkpoint
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.trajectory import read_kitti, read_tum
 

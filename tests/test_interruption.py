@@ -17,7 +17,8 @@ from scenes import ROOT, configured, shared_data
 
 from pipeline.errors import InputError
 from pipeline.logs import open_log
-from pipeline.runs.checkpoint import _CLASSES, CHECKPOINT_FILE, POINTS_FILE, Checkpoints, read_checkpoint
+from pipeline.runs.checkpoint import _CLASSES, Checkpoints, read_checkpoint
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
 from pipeline.simulate import simulate

@@ -33,12 +33,11 @@ from pipeline.odometry.motion_filter import MotionFilter
 from pipeline.odometry.prediction import Predictor
 from pipeline.point_store import PointStore, StoredPoints
 from pipeline.preprocess import Resolution, Sweep
+from pipeline.runs.directory import CHECKPOINT_FILE
 from pipeline.runs.provenance import package_version
 from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
 from pipeline.slam import Slam
 
-CHECKPOINT_FILE = "state.checkpoint"
-POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
 
 

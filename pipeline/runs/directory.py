@@ -16,6 +16,8 @@ import psutil
 from pipeline.errors import InputError
 
 RUN_FILE = "run.json"
+CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
+POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _UNFINISHED = "unfinished"
 
 

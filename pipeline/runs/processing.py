@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 from pipeline.config import Config
-from pipeline.data import Scan
 from pipeline.logs import Log
-from pipeline.runs.checkpoint import POINTS_FILE, Checkpoints
+from pipeline.odometry import FrontEnd
+from pipeline.runs.checkpoint import Checkpoints
 from pipeline.runs.closure_table import write_closures
-from pipeline.runs.directory import RunDirectory
+from pipeline.runs.directory import POINTS_FILE, RunDirectory
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE, Journal
 from pipeline.runs.progress import Progress
 from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
-from pipeline.runs.resuming import Left, after, set_aside
+from pipeline.runs.resuming import Left, set_aside
 from pipeline.runs.running_ahead import RunningAhead
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
@@ -46,14 +45,14 @@ def process(
     progress: Progress,
     steps: StepTable,
     left: Left | None,
+    located: RunningAhead,
 ) -> Processed:
-    """Place every scan, from the first on or from where the run left off, and write the results."""
-    slam, scans, notes = _begin(log, config, directory.path, steps, left)
+    """Place every scan that the odometry locates, and write the results."""
+    slam, notes = _begin(log, config, directory.path, located.front_end, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     checkpoints = Checkpoints(directory.path, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
-    awaited = progress.track(scans, log.scan_count - len(steps))
+    located.at_rest(lambda: checkpoints.write(slam), when=checkpoints.are_due)
     with (
-        RunningAhead(slam, awaited, checkpoints) as located,
         record(
             directory.path / "recording.rrd",
             dimension=log.dimension,
@@ -85,14 +84,14 @@ def process(
 
 
 def _begin(
-    log: Log, config: Config, folder: Path, steps: StepTable, left: Left | None
-) -> tuple[Slam, Iterator[Scan], tuple[str, ...]]:
-    """The chain, new or as it was left, the scans that it has not seen, and what to say of that."""
+    log: Log, config: Config, folder: Path, front_end: FrontEnd, left: Left | None
+) -> tuple[Slam, tuple[str, ...]]:
+    """The chain, new or as it was left, and what to say of that."""
     if left is None:
-        return Slam(config, log.T_base_lidar, folder / POINTS_FILE), log.scans(), ()
+        return Slam(config, log.T_base_lidar, folder / POINTS_FILE, front_end), ()
     slam = left.checkpoint.slam
     slam.points.reopen(folder / POINTS_FILE)
-    return slam, after(tuple(steps.rows), log.scans(), left.folder), set_aside(folder, len(steps))
+    return slam, set_aside(folder, left.checkpoint.scans)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pipeline.data import Scan
 from pipeline.errors import InputError
-from pipeline.runs.checkpoint import CHECKPOINT_FILE, POINTS_FILE, Checkpoint, read_checkpoint
-from pipeline.runs.directory import RUN_FILE, left_behind
+from pipeline.runs.checkpoint import Checkpoint, read_checkpoint
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, left_behind
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.step_table import StepRow, StepTable
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from queue import SimpleQueue
 from threading import Semaphore, Thread
 from types import TracebackType
 from typing import Self
 
 from pipeline.data import Scan
-from pipeline.odometry import Located
-from pipeline.runs.checkpoint import Checkpoints
-from pipeline.slam import Slam
+from pipeline.odometry import FrontEnd, Located
 
 _AHEAD = 32  # scans at most that are located and not yet placed
 
@@ -19,16 +17,16 @@ _AHEAD = 32  # scans at most that are located and not yet placed
 class RunningAhead:
     """Gives out scans as the front end leaves them, in their order; a context that is left when they are placed.
 
-    The thread starts at once. When a checkpoint is due it waits until all that it located is placed, and writes
-    it. Errors, also those of the log, are raised after what came before them.
+    The thread starts at once. Errors, also those of the log, are raised after what came before them.
     """
 
-    def __init__(self, slam: Slam, scans: Iterable[Scan], checkpoints: Checkpoints) -> None:
-        self.slam = slam
+    def __init__(self, front_end: FrontEnd, scans: Iterable[Scan]) -> None:
+        self.front_end = front_end
         self.scans = scans
-        self.checkpoints = checkpoints
-        self.located: SimpleQueue[Located | Exception | None] = SimpleQueue()
+        self.located: SimpleQueue[Located | BaseException | None] = SimpleQueue()
         self.room = Semaphore(_AHEAD)
+        self.is_due: Callable[[], bool] = lambda: False
+        self.act: Callable[[], None] = lambda: None
         self.is_left = False
         self.thread = Thread(target=self._work, name="scanchain-odometry", daemon=True)
 
@@ -43,9 +41,13 @@ class RunningAhead:
         self.room.release(_AHEAD)
         self.thread.join()
 
+    def at_rest(self, act: Callable[[], None], *, when: Callable[[], bool]) -> None:
+        """Have something done, when it is due, while all that was located is placed."""
+        self.act, self.is_due = act, when
+
     def __iter__(self) -> Iterator[Located]:
         while (item := self.located.get()) is not None:
-            if isinstance(item, Exception):
+            if isinstance(item, BaseException):
                 raise item
             yield item
             self.room.release()  # whoever asks for the next is done with this one
@@ -56,17 +58,16 @@ class RunningAhead:
                 self.room.acquire()
                 if self.is_left:
                     return
-                self.located.put(self.slam.front_end.locate(scan))
-                if self.checkpoints.are_due():
-                    self._put_down()
+                self.located.put(self.front_end.locate(scan))
+                if self.is_due():
+                    self._rest()
             self.located.put(None)
-        except Exception as error:
+        except BaseException as error:  # whatever it is, it is for who waits for the next scan
             self.located.put(error)
 
-    def _put_down(self) -> None:
-        """Write a checkpoint once there is nothing ahead."""
+    def _rest(self) -> None:
         for _ in range(_AHEAD):
             self.room.acquire()
         if not self.is_left:
-            self.checkpoints.write(self.slam)
+            self.act()
         self.room.release(_AHEAD)
