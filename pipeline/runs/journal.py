@@ -19,7 +19,7 @@ _HEAD = struct.Struct("<II")  # bytes of the record that follows, and their CRC-
 
 
 class Journal:
-    """Appends a record a step; a context. Each is handed to the system before the next scan is looked at.
+    """Appends a record a step; a context. Each is handed to the system before the next scan is placed.
 
     A record is its length and CRC-32 (both uint32, little-endian), then a StepRow in MessagePack.
     """
