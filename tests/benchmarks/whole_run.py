@@ -3,10 +3,11 @@
     python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5]
 
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process that
-reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock
+reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock,
 from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
-``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several
-repeats, which take turns. The stages are those of one more run: in the thread that ends with the run, and beside.
+``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
+which take turns. The stages are those of one more run, in the thread that ends with it and beside it; it imports
+at its start what others import while the odometry is at work.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("other results", processing, "write_results", "write_closures")
     watch.over("other results", StepTable, "write")
     watch.over("other results", run, "_judge", "measure")
-    watch.over("report", command, "_drawing_room", "_report")
+    watch.over("report", command, "_report")
     open_recording = command._record
 
     def record(*arguments: Any, **options: Any) -> Any:
