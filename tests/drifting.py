@@ -35,7 +35,7 @@ class DriftingOdometry:
 def drifting_slam(config, T_base_lidar, drifted):
     """A chain whose odometry drifts."""
     slam = Slam(config, T_base_lidar)
-    slam.odometry = DriftingOdometry(slam.odometry, drifted)
+    slam.front_end.odometry = DriftingOdometry(slam.front_end.odometry, drifted)
     return slam
 
 
