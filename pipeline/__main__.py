@@ -7,8 +7,6 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,7 +100,6 @@ def _record(
 ) -> Recorder:
     from viz.recording import Recording
 
-    _drawing_room()
     return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
 
 
@@ -130,23 +127,7 @@ def _record_graph(change: GraphChange, path: Path) -> None:
     record_graph(change, path)
 
 
-@cache
-def _drawing_room() -> Future[None]:
-    """What reports are drawn with, brought in by a thread while scans are tracked."""
-
-    def enter() -> None:
-        from viz.run_report import prepare
-
-        prepare()
-
-    pool = ThreadPoolExecutor(1)
-    entered = pool.submit(enter)
-    pool.shutdown(wait=False)
-    return entered
-
-
 def _report(directory: Path) -> None:
-    _drawing_room().result()
     from viz.run_report import write_run_report
 
     write_run_report(directory)

@@ -31,7 +31,6 @@ from viz.map_figures import map_picture, surroundings
 from viz.provenance_folds import provenance_folds
 from viz.report import REPORT_FILE, Drawing, Fold, Page, Section, write_page
 from viz.run_tables import accuracy_section, stages_section
-from viz.sheet import Sheet
 
 
 def write_run_report(directory: Path) -> None:
@@ -52,12 +51,6 @@ def write_run_report(directory: Path) -> None:
         ),
     )
     write_page(directory / REPORT_FILE, page)
-
-
-def prepare() -> None:
-    """Load what pages are drawn with; the first drawing takes several times as long as any other."""
-    with Sheet("first") as sheet:
-        sheet.svg()
 
 
 def _summary_lines(directory: Path) -> list[str]:
