@@ -30,7 +30,7 @@ class Spectrum(NamedTuple):
     signals: NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def spectrum_of(H, weights: float, range_m: float):
     """The spectrum of the information H (k, k) that residuals of these weights amount to."""
     k = H.shape[0]
@@ -45,7 +45,7 @@ def spectrum_of(H, weights: float, range_m: float):
     return Spectrum(scale, values, vectors, np.full(k, np.inf))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def worst(spectrum) -> int:
     """The direction that the data tell least of, above what would be feigned."""
     m = 0
@@ -55,7 +55,7 @@ def worst(spectrum) -> int:
     return m
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def is_below(spectrum, m: int, times: float, terms) -> bool:
     """Whether the data tell less along a direction than so many times the least."""
     return spectrum.values[m] < times * terms.min_information or spectrum.signals[m] < times * terms.min_signal

@@ -21,7 +21,7 @@ from pipeline.kernels.evidence import (
 from pipeline.kernels.pose_log import twist_3d
 from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
 from pipeline.kernels.registration import align
-from pipeline.kernels.signal import signal_along
+from pipeline.kernels.signal import listen
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
@@ -68,32 +68,21 @@ def match(voxels, points, T_first, expected, terms):
         doubt_m = _doubt_of(expected, range_m)
     first_scale_m = min(max(terms.first_scale_m, _DOUBTS * doubt_m), terms.widest_scale_m)
     T = T_first.copy()
-    outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
-    spectrum = _heard(voxels, points, T, outcome, range_m, terms)
-    if is_below(spectrum, 0, WEAK, terms):
+    is_held = False
+    while True:
+        outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
+        spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+        if points.shape[1] == 3:
+            listen(voxels, points, T, outcome, spectrum, terms)
+        if is_held or not is_below(spectrum, 0, WEAK, terms):
+            break
+        is_held = True
         believed = information
         if expected.is_known:
             believed = _turned(definite_inverse(expected.covariance), T_first, terms.variance)
         add(information, hold(spectrum, outcome.weights, believed, terms))
         T = T_first.copy()
-        outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
-        spectrum = _heard(voxels, points, T, outcome, range_m, terms)
     return answer_of(T, T_first, outcome, spectrum, terms.variance)
-
-
-@njit(cache=True, nogil=True)
-def _heard(voxels, points, T, outcome, range_m: float, terms):
-    """The spectrum of an outcome; in space with signals, from the weakest direction on to the first sound one."""
-    spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
-    k = spectrum.values.shape[0]
-    twist = np.empty(k)
-    for m in range(k if points.shape[1] == 3 else 0):
-        for i in range(k):
-            twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
-        spectrum.signals[m] = signal_along(voxels, points, T, outcome, twist, terms.insertions)
-        if not is_below(spectrum, m, WEAK, terms):
-            break
-    return spectrum
 
 
 @njit(cache=True, nogil=True)
@@ -102,7 +91,7 @@ def judge(T, outcome, range_m: float, variance: float):
     return answer_of(T, T, outcome, spectrum_of(outcome.H, outcome.weights, range_m), variance)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def answer_of(T, T_first, outcome, spectrum, variance: float):
     """The ``Answer`` that an outcome amounts to, turned into the source's own frame.
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from pipeline.kernels.evidence import WEAK, is_below
 from pipeline.kernels.hashing import unpack
 from pipeline.kernels.voxels import (
     ACROSS,
@@ -17,6 +18,19 @@ from pipeline.kernels.voxels import (
 )
 
 _OLD = 2  # insertions after its first, from which on a voxel bears witness
+
+
+@njit(cache=True, inline="always")
+def listen(voxels, points, T, outcome, spectrum, terms):
+    """Fill the spectrum's signals, from the weakest direction on to the first that the data are believed about."""
+    k = spectrum.values.shape[0]
+    twist = np.empty(k)
+    for m in range(k):
+        for i in range(k):
+            twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
+        spectrum.signals[m] = signal_along(voxels, points, T, outcome, twist, terms.insertions)
+        if not is_below(spectrum, m, WEAK, terms):
+            break
 
 
 @njit(cache=True, nogil=True)
