@@ -46,11 +46,23 @@ def whole(office, tmp_path_factory):
     return out
 
 
-def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(office, whole, tmp_path):
+@pytest.fixture(scope="module", params=["2D", "3D"])
+def undisturbed(request, office, whole, tmp_path_factory):
+    """A log and its run, with scans located one by one (2D) and ahead (3D)."""
+    if request.param == "2D":
+        return office, whole
+    log, out = (tmp_path_factory.mktemp("town") / name for name in ("town.mcap", "run"))
+    simulate("town", log, duration_s=18.0, sensor="vlp-16")
+    assert start(log, out, *LIVELY).wait() == 0
+    return log, out
+
+
+def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(undisturbed, tmp_path):
+    log, whole = undisturbed
     rng, out = random.Random(1), tmp_path / "run"
     reached = []
     for _ in range(3):
-        child = start(office, out, *LIVELY, "--resume")
+        child = start(log, out, *LIVELY, "--resume")
         enough = steps_on_disk(out) + rng.randrange(20, 60)
         while steps_on_disk(out) < enough or not (partial(out) / CHECKPOINT_FILE).exists():
             assert child.poll() is None
@@ -63,20 +75,21 @@ def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(offi
         )
         table.write(tmp_path / "steps.parquet", table.best_known)
         assert pq.read_metadata(tmp_path / "steps.parquet").num_rows == len(table)
-    assert start(office, out, *LIVELY, "--resume").wait() == 0
+    assert start(log, out, *LIVELY, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
     same_result(out, whole)
     assert "went on after" in (out / "summary.txt").read_text()
     assert not list(out.glob("*.journal")) and not list(out.glob("*.checkpoint"))
 
 
-def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_same_result(office, whole, tmp_path):
+def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_same_result(undisturbed, tmp_path):
+    log, whole = undisturbed
     began = time.perf_counter()
-    assert start(office, tmp_path / "warm", *RECORDED).wait() == 0
+    assert start(log, tmp_path / "warm", *RECORDED).wait() == 0
     seed = random.randrange(1000)
     print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
     longest_s = time.perf_counter() - began
-    killed = list(kill_at_random(office, RECORDED, tmp_path, whole, kills=6, seed=seed, longest_s=longest_s))
+    killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=6, seed=seed, longest_s=longest_s))
     assert len(killed) == 6
 
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from pipeline.runs.running_ahead import _AHEAD, RunningAhead
+from pipeline.runs.running_ahead import _AHEAD, InTurn, RunningAhead
 
 
 class FrontEnd:
@@ -21,29 +21,35 @@ class FrontEnd:
         return scan
 
 
+both = pytest.mark.parametrize("locating", [InTurn, RunningAhead])
+
+
 def failing_after(count, error):
     yield from range(count)
     raise error
 
 
-def test_scans_come_in_their_order():
-    with RunningAhead(FrontEnd(), range(200)) as located:
+@both
+def test_scans_come_in_their_order(locating):
+    with locating(FrontEnd(), range(200)) as located:
         assert list(located) == list(range(200))
 
 
+@both
 @pytest.mark.parametrize("error", [ValueError("the log"), KeyboardInterrupt()])
-def test_an_error_of_the_log_comes_after_what_came_before_it(error):
+def test_an_error_of_the_log_comes_after_what_came_before_it(error, locating):
     placed = []
-    with pytest.raises(type(error)), RunningAhead(FrontEnd(), failing_after(20, error)) as located:
+    with pytest.raises(type(error)), locating(FrontEnd(), failing_after(20, error)) as located:
         for scan in located:
             time.sleep(0.001)
             placed.append(scan)
     assert placed == list(range(20))
 
 
-def test_an_error_of_the_front_end_ends_it_after_what_came_before():
+@both
+def test_an_error_of_the_front_end_ends_it_after_what_came_before(locating):
     front_end, placed = FrontEnd(chokes_on=7), []
-    with pytest.raises(ValueError, match="choked"), RunningAhead(front_end, range(20)) as located:
+    with pytest.raises(ValueError, match="choked"), locating(front_end, range(20)) as located:
         for scan in located:
             placed.append(scan)
     assert placed == front_end.seen == list(range(7))
@@ -57,9 +63,10 @@ def test_it_is_so_far_ahead_and_no_further():
         assert len(front_end.seen) == _AHEAD
 
 
-def test_at_rest_all_that_was_located_is_placed():
+@both
+def test_at_rest_all_that_was_located_is_placed(locating):
     front_end, placed, rests = FrontEnd(), [], []
-    with RunningAhead(front_end, range(300)) as located:
+    with locating(front_end, range(300)) as located:
         located.at_rest(
             lambda: rests.append((len(front_end.seen), len(placed))), when=lambda: len(placed) % 50 > 40
         )

@@ -19,7 +19,7 @@ from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
 from pipeline.runs.resuming import Left, set_aside
-from pipeline.runs.running_ahead import RunningAhead
+from pipeline.runs.running_ahead import InTurn
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
@@ -45,7 +45,7 @@ def process(
     progress: Progress,
     steps: StepTable,
     left: Left | None,
-    located: RunningAhead,
+    located: InTurn,
 ) -> Processed:
     """Place every scan that the odometry locates, and write the results."""
     slam, notes = _begin(log, config, directory.path, located.front_end, left)

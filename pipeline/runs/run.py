@@ -24,7 +24,7 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder
 from pipeline.runs.rescue import rescued
-from pipeline.runs.running_ahead import RunningAhead
+from pipeline.runs.running_ahead import InTurn, RunningAhead
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings
@@ -110,7 +110,7 @@ def _left(job: Job, config: Config) -> Left | None:
     return find_left(job.out, dump(config))
 
 
-def _located(log: Log, config: Config, progress: Progress, steps: StepTable, left: Left | None) -> RunningAhead:
+def _located(log: Log, config: Config, progress: Progress, steps: StepTable, left: Left | None) -> InTurn:
     """The odometry at work on the scans, those left out that an earlier run has seen."""
     if left is None:
         front_end, scans = FrontEnd(config, log.T_base_lidar), log.scans()
@@ -118,7 +118,8 @@ def _located(log: Log, config: Config, progress: Progress, steps: StepTable, lef
         from pipeline.runs.resuming import after
 
         front_end, scans = left.checkpoint.slam.front_end, after(tuple(steps.rows), log.scans(), left.folder)
-    return RunningAhead(front_end, progress.track(scans, log.scan_count - len(steps)))
+    locating = RunningAhead if log.dimension == 3 else InTurn
+    return locating(front_end, progress.track(scans, log.scan_count - len(steps)))
 
 
 def _check_prior(log: Log, config: Config) -> None:
