@@ -6,6 +6,7 @@ from pipeline import lie
 from pipeline.kernels.hashing import unpack
 from pipeline.kernels.voxels import (
     ACROSS,
+    BORN,
     DIRECTION,
     MEAN_TERM,
     PLANE,
@@ -63,9 +64,9 @@ def signal_along(voxel_map, points, T, outcome, twist):
                 np.cross(n, u), np.cross(n, u)
             )
             feigned += weight * cell[THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
-        if voxels.born[j] <= youngest:
+        if voxels.history[j, BORN] <= youngest:
             told.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
-            places.append(unpack(voxels.voxel_keys[j]))
+            places.append(unpack(voxels.keys[j]))
     loudest = np.array(places[int(np.argmax(told))])
     is_away = np.abs(np.array(places) - loudest).max(axis=1) > 1
     return np.array(told)[is_away].sum() / feigned

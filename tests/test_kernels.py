@@ -33,7 +33,7 @@ def map_of(points, size=0.5, alone=8):
 
 
 def keys_of(voxel_map):
-    return [hashing.unpack(key) for key in voxel_map.voxels.voxel_keys[: len(voxel_map)]]
+    return [hashing.unpack(key) for key in voxel_map.voxels.keys[: len(voxel_map)]]
 
 
 def adjacent(a, b):

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.hashing import find, pack
+from pipeline.kernels.hashing import find_row, pack
 from pipeline.kernels.voxels import move
 
 
@@ -32,10 +32,9 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
                     for dz in range(0 if flat else 1 - ring, 1 if flat else ring + 1):
                         if ring > 1 and not on_side and (flat or (dz > 1 - ring and dz < ring)):
                             continue
-                        slot = find(voxels.keys, pack(ix + dx, iy + dy, iz + dz))
-                        if slot < 0:
+                        voxel = find_row(voxels.rows, voxels.keys, pack(ix + dx, iy + dy, iz + dz))
+                        if voxel < 0:
                             continue
-                        voxel = voxels.row[slot]
                         ex = voxels.cells[voxel, 0] - x
                         ey = voxels.cells[voxel, 1] - y
                         ez = voxels.cells[voxel, 2] - z

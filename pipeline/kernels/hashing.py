@@ -22,17 +22,35 @@ def unpack(key: int):
 
 @njit(cache=True, inline="always")
 def find(keys, key: int):
-    """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs.
-
-    The multiplicative hash of Knuth (1973, § 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones.
-    """
-    mask = keys.size - 1
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64((mixed >> np.uint64(32)) & np.uint64(mask))
+    """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs."""
+    slot = _first_slot(keys.size, key)
     while True:
         held = keys[slot]
         if held == key:
             return slot
         if held == EMPTY:
             return ~slot
-        slot = (slot + 1) & mask
+        slot = (slot + 1) & (keys.size - 1)
+
+
+@njit(cache=True, inline="always")
+def find_row(rows, keys, key: int):
+    """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
+
+    rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for a fast look
+    """
+    slot = _first_slot(rows.size, key)
+    while True:
+        row = np.int64(rows[slot])
+        if row < 0:
+            return ~slot
+        if keys[row] == key:
+            return row
+        slot = (slot + 1) & (rows.size - 1)
+
+
+@njit(cache=True, inline="always")
+def _first_slot(slots: int, key: int):
+    """The multiplicative hash of Knuth (1973, § 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64((mixed >> np.uint64(32)) & np.uint64(slots - 1))

@@ -7,6 +7,7 @@ from pipeline.kernels.evidence import WEAK, is_below
 from pipeline.kernels.hashing import unpack
 from pipeline.kernels.voxels import (
     ACROSS,
+    BORN,
     DIRECTION,
     MEAN_TERM,
     PLANE,
@@ -61,7 +62,7 @@ def signal_along(voxels, points, T, outcome, twist, insertions: int) -> float:
         beside = dx * dx + dy * dy + dz * dz - along * along
         if cell[SHAPE] == PLANE:
             feigned += weight * _error(cell, dx, dy, dz, beside)
-        if voxels.born[voxel] <= youngest:
+        if voxels.history[voxel, BORN] <= youngest:
             told[i] = weight * (along * along if cell[SHAPE] == PLANE else beside)
             total += told[i]
             if told[i] > most:
@@ -98,11 +99,11 @@ def _error(cell, dx: float, dy: float, dz: float, beside: float) -> float:
 @njit(cache=True, nogil=True)
 def _told_around(voxels, voxel: int, partner, told) -> float:
     """What is told (N,) by pairs with a voxel or those beside it."""
-    ix, iy, iz = unpack(voxels.voxel_keys[voxel])
+    ix, iy, iz = unpack(voxels.keys[voxel])
     total = 0.0
     for i in range(partner.shape[0]):
         if told[i] > 0.0:
-            jx, jy, jz = unpack(voxels.voxel_keys[partner[i]])
+            jx, jy, jz = unpack(voxels.keys[partner[i]])
             if max(abs(jx - ix), abs(jy - iy), abs(jz - iz)) <= 1:
                 total += told[i]
     return total

@@ -2,10 +2,10 @@
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
-(3), direction (3), shape, tick of the last insertion; of a line or plane in space the variance across it; and
-of a plane there its second direction (3), and how that variance carries over to the fit: at the mean, and by
-squared distance along both directions; and the number of points when all this was fitted. ``born`` is the tick
-of the first insertion. A 2D map is the plane z = 0 of the same layout.
+(3), direction (3), shape; of a line or plane in space the variance across it; and of a plane there its second
+direction (3), and how that variance carries over to the fit: at the mean, and by squared distance along both
+directions. Its row of ``history`` holds the ticks of the first and of the last insertion, and the number of points
+when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
 """
 
 from typing import NamedTuple
@@ -15,54 +15,59 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeline.kernels.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
-from pipeline.kernels.hashing import find, pack, unpack
+from pipeline.kernels.hashing import find_row, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
-MEAN, DIRECTION, SHAPE, TICK = 0, 3, 6, 7
-ACROSS, THICKNESS, MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG, FITTED = 8, 11, 12, 13, 14, 15
-CELL = 16
+MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
+MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
+CELL = 16  # two more than are used, to fill the second cache line
+BORN, SEEN, FITTED = 0, 1, 2
 _GROWN = 1.3  # times the points of its last fit, from which on a voxel is fitted anew
 _BROAD = 0.125  # voxels, the least width of a plane that is fitted to a voxel's own points
 MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
 
 
 class Voxels(NamedTuple):
-    """The arrays of a voxel map: ``keys``, ``row`` (S,), ``moments`` (V, 10), ``cells`` (V, 16), ``born`` (V,)."""
+    """The arrays of a voxel map.
 
+    ``rows`` (S,) is the hash table; what it holds are rows of ``keys`` (V,), ``moments`` (V, 10), ``cells`` (V, 16)
+    and ``history`` (V, 3).
+    """
+
+    rows: NDArray[np.int32]
     keys: NDArray[np.int64]
-    row: NDArray[np.int32]
-    voxel_keys: NDArray[np.int64]
     moments: NDArray[np.float64]
     cells: NDArray[np.float64]
-    born: NDArray[np.int64]
+    history: NDArray[np.int32]
     used: NDArray[np.int64]
     size_m: float
 
 
 @njit(cache=True, nogil=True)
-def insert(voxels, points, T, tick: float, alone: float):
+def insert(voxels, points, T, tick: int, alone: float):
     """Add points (N, d), moved by T into the map's frame, and fit the voxels anew that have grown by enough.
 
     alone : points from which on a voxel is fitted without its neighbours
-    Room for N more voxels must be there. Returns the number of voxels touched.
+    Room for N more voxels must be there.
     """
     touched = np.empty(points.shape[0], np.int32)
     sums = np.empty(10)
     touches = 0
+    scale = 1.0 / voxels.size_m
     for i in range(points.shape[0]):
         x, y, z = move(T, points, i)
-        voxel = _voxel_at(voxels, x, y, z, tick)
-        if voxels.cells[voxel, TICK] != tick:
-            voxels.cells[voxel, TICK] = tick
+        key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
+        voxel = _voxel_at(voxels, key, tick)
+        if voxels.history[voxel, SEEN] != tick:
+            voxels.history[voxel, SEEN] = tick
             touched[touches] = voxel
             touches += 1
         _accumulate(voxels, voxel, x, y, z)
     for k in range(touches):
         voxel = touched[k]
-        if voxels.moments[voxel, 0] >= _GROWN * voxels.cells[voxel, FITTED]:
+        if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
             _fit(voxels, voxel, points.shape[1], alone, sums)
-            voxels.cells[voxel, FITTED] = voxels.moments[voxel, 0]
-    return touches
+            voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
 
 
 @njit(cache=True, inline="always")
@@ -80,50 +85,42 @@ def move(T, points, i: int):
 
 
 @njit(cache=True, nogil=True)
-def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: float):
+def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: int):
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
     for voxel in range(voxels.used[0]):
         cell = voxels.cells[voxel]
         dx, dy, dz = cell[0] - x, cell[1] - y, cell[2] - z
-        if cell[TICK] < oldest_tick or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
+        is_old = voxels.history[voxel, SEEN] < oldest_tick
+        if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
-        key = voxels.voxel_keys[voxel]
-        slot = ~find(kept.keys, key)
-        new = kept.used[0]
-        kept.used[0] = new + 1
-        kept.keys[slot] = key
-        kept.row[slot] = new
-        kept.voxel_keys[new] = key
-        kept.born[new] = voxels.born[voxel]
+        new = _voxel_at(kept, voxels.keys[voxel], 0)
         for k in range(voxels.moments.shape[1]):
             kept.moments[new, k] = voxels.moments[voxel, k]
         for k in range(CELL):
             kept.cells[new, k] = cell[k]
+        for k in range(voxels.history.shape[1]):
+            kept.history[new, k] = voxels.history[voxel, k]
 
 
 @njit(cache=True, inline="always")
-def _voxel_at(voxels, x: float, y: float, z: float, tick: float) -> int:
-    """Row of the voxel that holds the point; a new one is empty."""
-    scale = 1.0 / voxels.size_m
-    key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
-    slot = find(voxels.keys, key)
-    if slot >= 0:
-        return voxels.row[slot]
+def _voxel_at(voxels, key: int, tick: int) -> int:
+    """Row of the voxel with that key; a new one is empty."""
+    row = find_row(voxels.rows, voxels.keys, key)
+    if row >= 0:
+        return row
     voxel = voxels.used[0]
     voxels.used[0] = voxel + 1
-    voxels.keys[~slot] = key
-    voxels.row[~slot] = voxel
-    voxels.voxel_keys[voxel] = key
-    voxels.born[voxel] = int(tick)
+    voxels.rows[~row] = np.int32(voxel)
+    voxels.keys[voxel] = key
     voxels.moments[voxel].fill(0.0)
     voxels.cells[voxel].fill(0.0)
-    voxels.cells[voxel, TICK] = -1.0
+    voxels.history[voxel, BORN], voxels.history[voxel, SEEN], voxels.history[voxel, FITTED] = tick, -1, 0
     return voxel
 
 
 @njit(cache=True, inline="always")
 def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
-    ix, iy, iz = unpack(voxels.voxel_keys[voxel])
+    ix, iy, iz = unpack(voxels.keys[voxel])
     x -= (ix + 0.5) * voxels.size_m
     y -= (iy + 0.5) * voxels.size_m
     z -= (iz + 0.5) * voxels.size_m
@@ -147,7 +144,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     The neighbours help where the points are few or show no width: a ring that passes again and again while the
     lidar stands still leaves many points and no surface.
     """
-    ix, iy, iz = unpack(voxels.voxel_keys[voxel])
+    ix, iy, iz = unpack(voxels.keys[voxel])
     m = voxels.moments[voxel]
     size = voxels.size_m
     cell = voxels.cells[voxel]
@@ -174,10 +171,10 @@ def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-height, height + 1):
-                slot = find(voxels.keys, pack(ix + dx, iy + dy, iz + dz))
-                if slot < 0:
+                row = find_row(voxels.rows, voxels.keys, pack(ix + dx, iy + dy, iz + dz))
+                if row < 0:
                     continue
-                m = voxels.moments[voxels.row[slot]]
+                m = voxels.moments[row]
                 n, x, y, z = m[0], dx * size, dy * size, dz * size
                 sums[0] += n
                 sums[1] += m[1] + n * x

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline import lie
 from pipeline.config import LocalMapConfig
 from pipeline.data import Points, Pose
-from pipeline.kernels.voxels import CELL, TICK, Voxels, insert, keep
+from pipeline.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
@@ -38,7 +38,7 @@ class VoxelMap:
             self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)
         if len(self) + len(points) > len(self.voxels.cells):
             self._rebuild(2 * (len(self) + len(points)), T_map_lidar, np.inf)
-        insert(self.voxels, points, T_map_lidar, float(self.insertions), float(self.config.min_points_alone))
+        insert(self.voxels, points, T_map_lidar, self.insertions, float(self.config.min_points_alone))
 
     def points(self) -> Points:
         """The mean of every voxel, (V, d), map frame."""
@@ -48,21 +48,18 @@ class VoxelMap:
         kept = _empty(max(room, len(self)), self.voxels.size_m)
         x, y, z = lie.lift(T_map_lidar)[:3, 3]
         oldest = self.insertions - self.config.max_insertions
-        keep(self.voxels, kept, x, y, z, radius_m, float(oldest))
+        keep(self.voxels, kept, x, y, z, radius_m, oldest)
         self.voxels = kept
 
 
 def _empty(room: int, voxel_size_m: float) -> Voxels:
     capacity = 1 << max(12, int(np.ceil(np.log2(room))))
-    cells = np.zeros((capacity, CELL))
-    cells[:, TICK] = -1.0
     return Voxels(
-        keys=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int64),
-        row=np.zeros(_SLOTS_PER_VOXEL * capacity, np.int32),
-        voxel_keys=np.zeros(capacity, np.int64),
+        rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),
+        keys=np.zeros(capacity, np.int64),
         moments=np.zeros((capacity, 10)),
-        cells=cells,
-        born=np.zeros(capacity, np.int64),
+        cells=np.zeros((capacity, CELL)),
+        history=np.zeros((capacity, 3), np.int32),
         used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )

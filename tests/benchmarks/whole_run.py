@@ -99,7 +99,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     from pipeline.graph.pose_graph import PoseGraph
     from pipeline.loops import LoopCloser
     from pipeline.point_store import PointStore
-    from pipeline.runs import processing, results, run, running_ahead
+    from pipeline.runs import metrics, processing, results, run, running_ahead
     from pipeline.runs.journal import Journal
     from pipeline.runs.step_table import StepTable
 
@@ -117,7 +117,8 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("what moved", results, "moved")
     watch.over("other results", processing, "write_results", "write_closures")
     watch.over("other results", StepTable, "write")
-    watch.over("other results", run, "_judge", "measure")
+    watch.over("other results", run, "_judge")
+    watch.over("other results", metrics, "measure")
     watch.over("report", command, "_report")
     open_recording = command._record
 
