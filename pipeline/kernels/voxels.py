@@ -30,8 +30,8 @@ MANY = 30.0  # points, beyond which more of them tell nothing new, because their
 class Voxels(NamedTuple):
     """The arrays of a voxel map.
 
-    ``rows`` (S,) is the hash table; what it holds are rows of ``keys`` (V,), ``moments`` (V, 10), ``cells`` (V, 16)
-    and ``history`` (V, 3).
+    ``rows`` (S,) is the hash table; it holds rows of ``keys`` (V,), ``moments`` (V, 10), ``cells`` (V, 16) and
+    ``history`` (V, 3).
     """
 
     rows: NDArray[np.int32]
