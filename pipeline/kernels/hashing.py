@@ -34,14 +34,14 @@ def find(keys, key: int):
 
 
 @njit(cache=True, inline="always")
-def find_row(rows, keys, key: int):
+def find_row(rows, keys, key: int) -> int:
     """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
 
     rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for a fast look
     """
     slot = _first_slot(rows.size, key)
     while True:
-        row = np.int64(rows[slot])
+        row = int(rows[slot])
         if row < 0:
             return ~slot
         if keys[row] == key:
@@ -50,7 +50,7 @@ def find_row(rows, keys, key: int):
 
 
 @njit(cache=True, inline="always")
-def _first_slot(slots: int, key: int):
+def _first_slot(slots: int, key: int) -> int:
     """The multiplicative hash of Knuth (1973, § 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64((mixed >> np.uint64(32)) & np.uint64(slots - 1))
+    return int(np.int64((mixed >> np.uint64(32)) & np.uint64(slots - 1)))
