@@ -69,7 +69,12 @@ class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a scan is aligned; the first scans, and those after a loss, search wide."""
+    """How a scan is aligned; the first scans, and those after a loss, search wide.
+
+    A scan is degenerate where a direction has less than ``min_information``, a share of what all points together
+    could tell of it, or where, in 3D, the points tell less than ``min_signal`` times what the errors of the map's
+    normals alone would feign.
+    """
 
     matcher: Literal["plicp", "svd"] = "plicp"
     optimiser: Optimiser = "levenberg-marquardt"

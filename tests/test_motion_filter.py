@@ -66,6 +66,6 @@ def test_along_a_direction_that_nothing_tells_of_the_motion_goes_on_and_its_doub
 def test_a_turn_carries_what_is_wrong_with_the_pose_along():
     """A heading that is in doubt puts the next position in doubt, to the side of a motion."""
     found = MotionFilter(1e-12 * np.eye(3))
-    found.begin(lie.pose_2d(2.0, 0.0, 0.0), 1e-12 * np.eye(3))
+    found.begin(lie.pose_2d(2.0, 0.0, 0.0))
     found.pose_covariance = np.diag([0.0, 0.0, 0.01])
     assert found.predicted_covariance(np.zeros(3))[1, 1] == pytest.approx(4.0 * 0.01, rel=1e-3)

@@ -139,7 +139,7 @@ def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
     """Every loop closure tried, and how many of them met which verdict."""
     if not path.exists():
         return
-    table = pq.ParquetFile(path).read()
+    table = pq.ParquetFile(path).read()  # read_table imports much more
     if not table.num_rows:
         yield Section(title, "None was tried: the way came back to no place that it had left.")
         return

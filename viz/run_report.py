@@ -74,7 +74,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
-    steps = pq.ParquetFile(directory / "steps.parquet").read()
+    steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None

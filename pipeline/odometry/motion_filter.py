@@ -28,10 +28,10 @@ class MotionFilter:
         self.nothing = np.zeros_like(any_motion)
         self.begin(lie.identity(2 if len(any_motion) == 3 else 3))
 
-    def begin(self, motion: Pose, covariance: Matrix | None = None) -> None:
-        """Start from a pose that is given, and a motion known by so much or next to nothing."""
+    def begin(self, motion: Pose) -> None:
+        """Start from a pose that is given, and a motion of which next to nothing is known."""
         self.motion = motion
-        self.motion_covariance = self.any_motion if covariance is None else covariance
+        self.motion_covariance = self.any_motion
         self.pose_covariance = self.covariance = self.nothing
 
     def predicted_covariance(self, noise: NDArray[np.float64]) -> Matrix:
