@@ -1,9 +1,13 @@
 """What is compiled is told, once for each module of kernels."""
 
+import subprocess
+
+import pytest
 from numba import njit
 
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.progress import Unwatched
+from pipeline.runs.rehearsal import rehearse
 
 
 class Told(Unwatched):
@@ -38,3 +42,30 @@ def test_what_is_compiled_already_is_not_told():
     with telling_of_compilation(told):
         compiled(3)
     assert told.lines == []
+
+
+def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(monkeypatch):
+    begun, start = [], subprocess.Popen
+
+    def remembered(*words, **options):
+        begun.append(start(*words, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", remembered)
+    with telling_of_compilation(Told(), ("http.server", "0")):
+        assert not begun
+        for module in ("pipeline.kernels.voxels", "pipeline.kernels.eigen"):
+            kernel(module)(2)
+        assert len(begun) == 1 and begun[0].poll() is None
+    assert begun[0].poll() is not None
+
+
+def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
+    monkeypatch.setattr(subprocess, "Popen", None)
+    with telling_of_compilation(Told(), ("http.server", "0")):
+        pass
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_rehearsal_reaches_the_end(dimension):
+    rehearse(dimension)

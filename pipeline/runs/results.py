@@ -51,14 +51,14 @@ def write_results(
     recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
     recording.log_closures([replace(item.closure, verdict=item.verdict) for item in judged], result.state)
     dimension = result.trajectory.dimension
-    cloud = _cloud(result, config)
+    cloud = cloud_of(result, config)
     write_ply(folder / "map.ply", cloud.points)
     if config.maps.write_pcd:
         write_pcd(folder / "map.pcd", cloud.points)
     if config.maps.write_laz:
         write_laz(folder / "map.laz", cloud.points)
     recording.log_map(cloud.points)
-    grid = _grid(result, config.maps)
+    grid = grid_of(result, config.maps)
     write_map(folder, grid)
     if dimension == 2:
         x_m, y_m = grid.origin_m.tolist()
@@ -71,7 +71,7 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
 
-def _cloud(result: SlamResult, config: Config) -> Cloud:
+def cloud_of(result: SlamResult, config: Config) -> Cloud:
     """The cloud of all keyframes, without what moved if that is wished."""
     dimension = result.trajectory.dimension
     built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
@@ -86,7 +86,7 @@ def _cloud(result: SlamResult, config: Config) -> Cloud:
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def _grid(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
+def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
     """The grid of all keyframes, coarser than asked for where the world is too large."""
     resolution_m = fitting_resolution(
         result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m

@@ -77,7 +77,8 @@ def run(
     if left is not None:
         started -= left.checkpoint.run_s
         progress.tell(f"going on after {len(steps):,} scans of {left.folder.name}")
-    with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress):
+    rehearsal = ("pipeline.runs.rehearsal", str(log.dimension))
+    with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress, rehearsal):
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:

@@ -1,0 +1,50 @@
+"""What comes after odometry, done with a few made-up scans: its kernels are compiled, once and for all.
+
+    python -m pipeline.runs.rehearsal 3
+
+A run whose kernels have to be compiled first starts this beside itself, on a core that it does not need yet.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from pipeline import lie
+from pipeline.data import Points, Pose, Scan, State
+from pipeline.odometry import Located
+from pipeline.odometry.tracked import Tracked, first_match
+from pipeline.runs.results import cloud_of, grid_of
+from pipeline.settings import load_settings
+from pipeline.slam import Slam
+
+_SCANS = 3
+_STEP_M = 1.0
+_POINTS = 100
+
+
+def rehearse(dimension: int) -> None:
+    """Place scans of a lidar that drives straight on, optimise, draw the maps; write nothing."""
+    config = load_settings(dimension).config
+    slam = Slam(config, lie.identity(dimension))
+    points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
+    for index in range(_SCANS):
+        T_odom_lidar = lie.identity(dimension)
+        T_odom_lidar[0, -1] = _STEP_M * index
+        slam.place(_located(index, points, T_odom_lidar, slam))
+    result = slam.finish()
+    cloud_of(result, config)
+    grid_of(result, config.maps)
+    slam.points.close()
+
+
+def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Located:
+    scan = Scan(index, index, index, points.astype(np.float32), np.empty(0, np.float32), 0, None)
+    match = first_match(T_odom_lidar, points, slam.config.matching)
+    tracked = Tracked(scan, points, points, T_odom_lidar, match, State.OK, "", 0.0, 0.0, 0.0)
+    return Located(tracked, is_keyframe=True, scale=1.0, local_map=points, first_points=points)
+
+
+if __name__ == "__main__":
+    rehearse(int(sys.argv[1]))
