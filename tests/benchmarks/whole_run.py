@@ -1,19 +1,20 @@
 """How much longer a whole run takes than its odometry alone, and where its time goes.
 
-    python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5]
+    python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5] [--cold]
 
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process that
 reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock,
 from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
 ``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
 which take turns. The stages are those of one more run, in the thread that ends with it and beside it; it imports
-at its start what others import while the odometry is at work.
+at its start what others import while the odometry is at work. With ``--cold`` one more run has to compile all kernels.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -34,6 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_LOGS])
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--cold", action="store_true", help="time a first run too, which compiles")
     parser.add_argument("--track", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--stages", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -44,6 +46,8 @@ def main() -> None:
     else:
         for path in arguments.logs:
             show(path.resolve(), arguments.repeats)
+            if arguments.cold:
+                show_cold(path.resolve())
 
 
 def show(path: Path, repeats: int) -> None:
@@ -68,11 +72,24 @@ def show(path: Path, repeats: int) -> None:
     print(f"  {'the rest':26}{rest_s:8.2f} s\n  {'whole':26}{whole_s:8.2f} s", flush=True)
 
 
-def timed(*module_and_words: str) -> tuple[float, str]:
+def show_cold(path: Path) -> None:
+    """A run without compiled kernels, and the one after it."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = ("pipeline", "run", str(path), "--out", f"{folder}/run", "--force")
+        cold_s, warm_s = (timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2))
+    print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
+
+
+def timed(*module_and_words: str, **environment: str) -> tuple[float, str]:
     """How long ``python -m`` takes, and what it prints."""
     started = perf_counter()
     answer = subprocess.run(
-        [sys.executable, "-m", *module_and_words], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-m", *module_and_words],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return perf_counter() - started, answer.stdout
 
