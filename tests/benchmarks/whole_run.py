@@ -7,7 +7,7 @@ reads the same log and tracks its scans with the same configuration, and nothing
 from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
 ``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
 which take turns. The stages are those of one more run, in the thread that ends with it and beside it; it imports
-at its start what others import while the odometry is at work. With ``--cold`` one more run has to compile all kernels.
+at its start what others import while the odometry is at work. With ``--cold`` one more run compiles all kernels.
 """
 
 from __future__ import annotations
