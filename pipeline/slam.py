@@ -65,18 +65,14 @@ class Slam:
         config: Config,
         T_base_lidar: Pose,
         points_file: Path | None = None,
-        front_end: FrontEnd | None = None,
     ) -> None:
-        """points_file : where points go, which stay out of memory; without one, into a temporary file.
-
-        front_end : one that is at work already; without one, its own
-        """
+        """points_file : where points go, which stay out of memory; without one, into a temporary file."""
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
-        self.front_end = front_end or FrontEnd(config, T_base_lidar)
+        self.front_end = FrontEnd(config, T_base_lidar)
         self.closer = LoopCloser(config, self.dimension)
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
@@ -95,7 +91,7 @@ class Slam:
         return self.place(self.front_end.locate(scan))
 
     def place(self, located: Located) -> Step:
-        """Place one scan that ``front_end`` located, which may be some scans ahead by now."""
+        """Place one scan that ``front_end`` located."""
         tracked = located.tracked
         scan = tracked.scan
         started = perf_counter()

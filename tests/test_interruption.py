@@ -48,7 +48,7 @@ def whole(office, tmp_path_factory):
 
 @pytest.fixture(scope="module", params=["2D", "3D"])
 def undisturbed(request, office, whole, tmp_path_factory):
-    """A log and its run, with scans located one by one (2D) and ahead (3D)."""
+    """A log and its run."""
     if request.param == "2D":
         return office, whole
     log, out = (tmp_path_factory.mktemp("town") / name for name in ("town.mcap", "run"))

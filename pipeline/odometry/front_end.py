@@ -29,7 +29,7 @@ class Located:
 
 
 class FrontEnd:
-    """Feeds on scans, one by one; may run ahead of the back end, with which it shares nothing."""
+    """Feeds on scans, one by one; shares nothing with the back end."""
 
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
         self.config = config.odometry

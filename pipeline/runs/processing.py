@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 from pipeline.config import Config
+from pipeline.data import Scan
 from pipeline.logs import Log
-from pipeline.odometry import FrontEnd
 from pipeline.runs.checkpoint import Checkpoints
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.directory import POINTS_FILE, RunDirectory
@@ -18,8 +19,7 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
-from pipeline.runs.resuming import Left, set_aside
-from pipeline.runs.running_ahead import InTurn
+from pipeline.runs.resuming import Left, after, set_aside
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
@@ -45,13 +45,11 @@ def process(
     progress: Progress,
     steps: StepTable,
     left: Left | None,
-    located: InTurn,
 ) -> Processed:
-    """Place every scan that the odometry locates, and write the results."""
-    slam, notes = _begin(log, config, directory.path, located.front_end, left)
+    """Place every scan, from the first on or from where the run left off, and write the results."""
+    slam, scans, notes = _begin(log, config, directory.path, steps, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     checkpoints = Checkpoints(directory.path, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
-    located.at_rest(lambda: checkpoints.write(slam), when=checkpoints.are_due)
     with (
         record(
             directory.path / "recording.rrd",
@@ -64,9 +62,11 @@ def process(
     ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
-        for step in map(slam.place, located):
+        for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
             recording.log(step)
             journal.append(steps.append(step))
+            if checkpoints.are_due():
+                checkpoints.write(slam)
         if progress.stopped:
             checkpoints.write(slam)
         progress.say("optimising and writing")
@@ -84,14 +84,15 @@ def process(
 
 
 def _begin(
-    log: Log, config: Config, folder: Path, front_end: FrontEnd, left: Left | None
-) -> tuple[Slam, tuple[str, ...]]:
-    """The chain, new or as it was left, and what to say of that."""
+    log: Log, config: Config, folder: Path, steps: StepTable, left: Left | None
+) -> tuple[Slam, Iterator[Scan], tuple[str, ...]]:
+    """The chain, new or as it was left, the scans that it has not seen, and what to say of that."""
     if left is None:
-        return Slam(config, log.T_base_lidar, folder / POINTS_FILE, front_end), ()
+        return Slam(config, log.T_base_lidar, folder / POINTS_FILE), log.scans(), ()
     slam = left.checkpoint.slam
     slam.points.reopen(folder / POINTS_FILE)
-    return slam, set_aside(folder, left.checkpoint.scans)
+    scans = after(tuple(steps.rows), log.scans(), left.folder)
+    return slam, scans, set_aside(folder, left.checkpoint.scans)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -15,25 +14,22 @@ from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
-from pipeline.odometry import FrontEnd
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE
+from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
+from pipeline.runs.processing import process
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder
 from pipeline.runs.rescue import rescued
-from pipeline.runs.running_ahead import InTurn, RunningAhead
+from pipeline.runs.resuming import find_left
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings
+from pipeline.slam import SlamResult
 from pipeline.trajectory import read_tum, write_tum
-
-if TYPE_CHECKING:  # what comes after the odometry is imported while that is at work already
-    from pipeline.runs.metrics import GroundTruth, Metrics
-    from pipeline.runs.resuming import Left
-    from pipeline.slam import SlamResult
 
 TRUTH_FILE = "ground_truth.tum"
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -68,7 +64,7 @@ def run(
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
-    left = _left(job, settings.config)
+    left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
@@ -82,11 +78,7 @@ def run(
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
-            with _located(log, settings.config, progress, steps, left) as located:
-                from pipeline.runs.metrics import measure, summary
-                from pipeline.runs.processing import process
-
-                done = process(job, log, settings.config, directory, record, progress, steps, left, located)
+            done = process(job, log, settings.config, directory, record, progress, steps, left)
             run_s = perf_counter() - started - done.held_s
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             with directory.results() as folder:
@@ -102,27 +94,6 @@ def run(
     return Finished(directory.path, metrics, text, warnings, stopped)
 
 
-def _left(job: Job, config: Config) -> Left | None:
-    """What an earlier run left that is to be gone on with."""
-    if not job.resume:
-        return None
-    from pipeline.runs.resuming import find_left
-
-    return find_left(job.out, dump(config))
-
-
-def _located(log: Log, config: Config, progress: Progress, steps: StepTable, left: Left | None) -> InTurn:
-    """The odometry at work on the scans, those left out that an earlier run has seen."""
-    if left is None:
-        front_end, scans = FrontEnd(config, log.T_base_lidar), log.scans()
-    else:
-        from pipeline.runs.resuming import after
-
-        front_end, scans = left.checkpoint.slam.front_end, after(tuple(steps.rows), log.scans(), left.folder)
-    locating = RunningAhead if log.dimension == 3 else InTurn
-    return locating(front_end, progress.track(scans, log.scan_count - len(steps)))
-
-
 def _check_prior(log: Log, config: Config) -> None:
     """Refuse a prior that the log does not have before anything is processed."""
     if config.odometry.prior == "wheel" and not log.has_odometry:
@@ -136,8 +107,6 @@ def _judge(
     job: Job, log: Log, result: SlamResult, reference: Trajectory | None, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
     """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
-    from pipeline.runs.metrics import judge
-
     source = str(job.ground_truth) if reference is not None else log.config.ground_truth_topic
     if reference is None:
         reference = log.ground_truth()

@@ -6,8 +6,8 @@
 reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock,
 from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
 ``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
-which take turns. The stages are those of one more run, in the thread that ends with it and beside it; it imports
-at its start what others import while the odometry is at work. With ``--cold`` one more run compiles all kernels.
+which take turns. The stages are those of one more run, in the main thread and beside it; it imports rather more at
+its start than others do. With ``--cold`` one more run compiles all kernels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from queue import SimpleQueue
 from time import perf_counter, time
 from typing import Any
 
@@ -106,17 +105,13 @@ def track(path: Path) -> float:
     return seconds
 
 
-class Queue(SimpleQueue):
-    """That of ``RunningAhead``, to be watched."""
-
-
 def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
     """A run in this process, which was begun at that time, with a watch over what it consists of."""
     from pipeline import __main__ as command
     from pipeline.graph.pose_graph import PoseGraph
     from pipeline.loops import LoopCloser
     from pipeline.point_store import PointStore
-    from pipeline.runs import metrics, processing, results, run, running_ahead
+    from pipeline.runs import processing, results, run
     from pipeline.runs.journal import Journal
     from pipeline.runs.step_table import StepTable
 
@@ -124,8 +119,6 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.add("start and imports", time() - began)
     watch.over("opening the log", run, "open_log")
     watch.over("odometry", Odometry, "track")
-    watch.over("waiting for odometry", Queue, "get")
-    running_ahead.SimpleQueue = Queue  # whose own class takes no watch
     watch.over("loops", LoopCloser, "close", "finish")
     watch.over("optimising", PoseGraph, "optimise")
     watch.over("points kept", PointStore, "add", "read")
@@ -134,8 +127,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("what moved", results, "moved")
     watch.over("other results", processing, "write_results", "write_closures")
     watch.over("other results", StepTable, "write")
-    watch.over("other results", run, "_judge")
-    watch.over("other results", metrics, "measure")
+    watch.over("other results", run, "_judge", "measure")
     watch.over("report", command, "_report")
     open_recording = command._record
 
