@@ -15,6 +15,12 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 
 @njit(cache=True, inline="always")
+def key_of(x: float, y: float, z: float, scale: float) -> int:
+    """Key of the voxel that holds a point; scale : voxels a metre."""
+    return pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
+
+
+@njit(cache=True, inline="always")
 def unpack(key: int):
     """The voxel coordinates of a key, pack's inverse."""
     return (key >> 42) - _OFFSET, ((key >> 21) & _LIMIT) - _OFFSET, (key & _LIMIT) - _OFFSET

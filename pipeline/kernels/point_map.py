@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.hashing import find, pack
+from pipeline.kernels.hashing import find, key_of
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 
@@ -60,7 +60,7 @@ def merge_voxels(old_sums, old_counts, voxel_m, slots, cells, sums, counts):
 @njit(cache=True, inline="always")
 def _row_of(point, scale, slots, cells, counts, used):
     """Rows taken, and the row of the point's voxel; −1 where it is new and there is no room."""
-    key = pack(int(np.floor(point[0] * scale)), int(np.floor(point[1] * scale)), int(np.floor(point[2] * scale)))
+    key = key_of(point[0], point[1], point[2], scale)
     slot = find(slots, key)
     if slot >= 0:
         return used, np.int64(cells[slot])

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeline.kernels.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
-from pipeline.kernels.hashing import find_row, pack, unpack
+from pipeline.kernels.hashing import find_row, key_of, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
@@ -56,8 +56,7 @@ def insert(voxels, points, T, tick: int, alone: float):
     scale = 1.0 / voxels.size_m
     for i in range(points.shape[0]):
         x, y, z = move(T, points, i)
-        key = pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
-        voxel = _voxel_at(voxels, key, tick)
+        voxel = _voxel_at(voxels, key_of(x, y, z, scale), tick)
         if voxels.history[voxel, SEEN] != tick:
             voxels.history[voxel, SEEN] = tick
             touched[touches] = voxel
