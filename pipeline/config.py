@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import fields, force_setattr
+
+from pipeline.config_keys import section_keys
+from pipeline.errors import InputError, shown
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -15,7 +19,17 @@ Count = Annotated[int, Meta(ge=1)]
 Optimiser = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
-class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class Section(Struct, frozen=True, forbid_unknown_fields=True):
+    """A branch of the configuration; made in Python it is checked like one read from a file."""
+
+    def __post_init__(self) -> None:
+        """Convert what converts without loss. Raises InputError naming the key, its value and its limits."""
+        for key in section_keys(type(self)):
+            leaf = key.name.rpartition(".")[2]
+            force_setattr(self, leaf, key.check(getattr(self, leaf), type(self).__name__))
+
+
+class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What is read from the log. Empty topics are found automatically.
 
     ``rate_hz`` is how often the scans of a folder come whose files are not named by their stamps.
@@ -39,7 +53,7 @@ class LogConfig(Struct, frozen=True, forbid_unknown_fields=True):
     prefetch_chunks: Count = 4
 
 
-class PreprocessConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What is done to a scan before it is matched: cropped, thinned out, freed of the lidar's own motion.
 
     Voxels are as large as said where the place is wide, and down to ``min_scale`` times that where it is narrow:
@@ -57,7 +71,7 @@ class PreprocessConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.125
 
 
-class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
     """The map that scans are matched against."""
 
     voxel_size_m: Positive = 1.0
@@ -68,7 +82,7 @@ class LocalMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_points_alone: Count = 10
 
 
-class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How a scan is aligned; the first scans, and those after a loss, search wide.
 
     A scan is degenerate where a direction has less than ``min_information``, a share of what all points together
@@ -93,7 +107,7 @@ class MatchingConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_signal: NonNegative = 3.0
 
 
-class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How the motion is predicted, how far off the prediction may be, and when a keyframe is made.
 
     ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as
@@ -114,7 +128,7 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     edge_sigma_rad: Positive = 0.002
 
 
-class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How revisits are found and verified.
 
     The search radius is what odometry may have drifted since the place was seen, ``drift`` metres a metre, at
@@ -150,7 +164,7 @@ class LoopsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     refine: bool = True
 
 
-class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How the pose graph is optimised."""
 
     optimiser: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "newton", "gradient-descent"] = (
@@ -162,7 +176,7 @@ class GraphConfig(Struct, frozen=True, forbid_unknown_fields=True):
     robust_scale: Positive = 3.0
 
 
-class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """The maps that are written at the end.
 
     Without what ``remove_moving`` finds to have moved, the cloud has one point a voxel; it is written as PLY, and
@@ -179,14 +193,14 @@ class MapsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     slice_max_z_m: float = 0.5
 
 
-class RecordingConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What goes into the rerun recording."""
 
     local_map_every: Count = 20
     max_map_points: Count = 20000
 
 
-class OutputsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+class OutputsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What a run directory holds beside the files that are always there.
 
     ``mcap`` adds results.mcap, the poses and maps as ROS 2 messages.
@@ -208,3 +222,13 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     maps: MapsConfig = MapsConfig()
     recording: RecordingConfig = RecordingConfig()
     outputs: OutputsConfig = OutputsConfig()
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a branch is of another kind."""
+        for field in fields(Config):
+            branch = getattr(self, field.name)
+            if not isinstance(branch, field.type):
+                raise InputError(
+                    f"Config: {field.name} is {shown(branch)}; wanted a {field.type.__name__}, as in "
+                    f"Config({field.name}={field.type.__name__}())"
+                )

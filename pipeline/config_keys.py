@@ -5,14 +5,15 @@ from __future__ import annotations
 import difflib
 import functools
 import math
-from collections.abc import Iterator
+import re
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal
 
 from msgspec import inspect
+from msgspec.structs import fields
 
-from pipeline.config import Config
-from pipeline.errors import InputError
+from pipeline.errors import InputError, shown
 
 Value = bool | int | float | str
 Kind = Literal["bool", "int", "float", "choice", "str"]
@@ -61,13 +62,13 @@ class ConfigKey:
             return f"{whole} {'>=' if self.low_is_allowed else '>'} {self.low:g}"
         return whole
 
-    def check(self, value: object, source: str, *, shown: str = "") -> Value:
+    def check(self, value: object, source: str, *, text: str = "") -> Value:
         """The value as this key holds it; ``source``, a file or a flag, is named in the error."""
         parsed = self._word(value) if self.kind in ("bool", "choice", "str") else self._number(value)
         if parsed is None:
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
-            raise InputError(f"{subject} {shown or repr(value)}; it must be {self._demand}{unit}")
+            raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{unit}")
         return parsed
 
     def parse(self, text: str, source: str) -> Value:
@@ -80,7 +81,7 @@ class ConfigKey:
                 value = float(text)
             except ValueError:
                 value = text
-        return self.check(value, source, shown=repr(text) if value is text else text)
+        return self.check(value, source, text=repr(text) if value is text else text)
 
     @property
     def _demand(self) -> str:
@@ -101,22 +102,35 @@ class ConfigKey:
 
     def _number(self, value: object) -> Value | None:
         """The number if it is one and lies within the limits; −∞ and NaN never do, +∞ where it means no limit."""
-        if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        if isinstance(value, bool) or not isinstance(value, Real):
             return None
-        above = value >= self.low if self.low_is_allowed else value > self.low
-        if not above or value > self.high or value == -math.inf:
+        try:
+            number = float(value)
+        except OverflowError:  # an int of hundreds of digits
             return None
-        if self.kind == "float":
-            return float(value)
-        return int(value) if math.isfinite(value) and value == int(value) else None
+        above = number >= self.low if self.low_is_allowed else number > self.low
+        if not above or number > self.high or number == -math.inf:
+            return None
+        return number if self.kind == "float" else int(number) if number.is_integer() else None
 
 
 @functools.cache
 def config_keys() -> dict[str, ConfigKey]:
     """All keys by name, in the order of the tree."""
-    tree = inspect.type_info(Config)
+    from pipeline.config import Config
+
+    return {key.name: key for field in fields(Config) for key in section_keys(field.type)}
+
+
+@functools.cache
+def section_keys(section: type) -> tuple[ConfigKey, ...]:
+    """The keys of one section, ``LocalMapConfig`` being that of ``local_map``, in the order of its fields."""
+    tree = inspect.type_info(section)
     assert isinstance(tree, inspect.StructType)
-    return {key.name: key for key in _leaves(tree, "")}
+    words = re.findall("[A-Z][a-z]*", section.__name__.removesuffix("Config"))
+    return tuple(
+        _leaf(f"{'_'.join(words).lower()}.{field.name}", field.type, field.default) for field in tree.fields
+    )
 
 
 def find_key(name: str, source: str) -> ConfigKey:
@@ -137,15 +151,6 @@ def _remedy(name: str, keys: tuple[str, ...]) -> str:
         near = difflib.get_close_matches(name, keys, n=1, cutoff=0.5)
     listing = "all keys: scanchain config show"
     return f"did you mean {near[0]}? ({listing})" if near else listing
-
-
-def _leaves(tree: inspect.StructType, prefix: str) -> Iterator[ConfigKey]:
-    for field in tree.fields:
-        name = f"{prefix}{field.name}"
-        if isinstance(field.type, inspect.StructType):
-            yield from _leaves(field.type, f"{name}.")
-        else:
-            yield _leaf(name, field.type, field.default)
 
 
 def _leaf(name: str, kind: inspect.Type, default: Value) -> ConfigKey:

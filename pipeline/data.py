@@ -13,12 +13,23 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import checks
+from pipeline.errors import InputError
 from pipeline.point_store import StoredPoints
 
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
 Matrix = NDArray[np.float64]
+
+LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
+
+_WHOLE = (
+    ("index", "the number of the scan, from 0"),
+    ("stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)"),
+    ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)"),
+    ("dropped", "a number of returns"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +46,8 @@ class Scan:
     dropped : returns removed because they were NaN, infinite or out of range
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
     waited_s : seconds that the reader of the log made its consumer wait for this scan
+
+    Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
     """
 
     index: int
@@ -45,6 +58,18 @@ class Scan:
     dropped: int
     T_odom_base: Pose | None
     waited_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check and convert; the class is frozen, so that what was checked stays so."""
+        for name, wanted in _WHOLE:
+            if type(value := getattr(self, name)) is not int:
+                object.__setattr__(self, name, checks.integer(value, name, wanted))
+        d = 2 if np.shape(self.points)[1:] == (2,) else 3
+        points = checks.points(self.points, "points", d, dtype=np.float32)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
+        if self.T_odom_base is not None:
+            object.__setattr__(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 
 
 class State(StrEnum):
@@ -87,12 +112,16 @@ class Match:
         edge takes it; m⁻², rad⁻¹m⁻¹, rad⁻²
     cost : robust cost in m², every point without a partner at the kernel's limit; compares two alignments of
         the same scan to the same map
-    inliers : source points that ended with a partner within reach
+    inliers : source points with a correspondence within ``matching.max_distance_m``, also after a wide search
     points : source points that were tried
-    iterations : linearisations used
+    iterations : linearizations used
     residual_m : root of the weighted mean squared residual over the inliers
-    converged : whether the last step was below the tolerance
-    reason : why the iteration stopped, in words
+    fit : share of the information that the robust kernel leaves to the direction that loses most: near 1 where the
+        correspondences agree with the pose, below 0.6 where those that determine a direction contradict it
+    at_minimum : whether the last step was below the tolerance
+    converged : whether the pose is a minimum that the points fit (``inlier_share`` and ``fit``) and that is
+        determined in every direction (``observability``)
+    reason : why it did not converge, in words
     degeneracy_eigenvalue : smallest eigenvalue of the information per inlier, lengths scaled so that
         translation and rotation compare; 0 is blind, 1 is a direction that every residual sees
     observability : of the worst direction, how many times as much is known of it as it takes to be determined, by
@@ -107,6 +136,8 @@ class Match:
     points: int
     iterations: int
     residual_m: float
+    fit: float
+    at_minimum: bool
     converged: bool
     reason: str
     degeneracy_eigenvalue: float
@@ -115,8 +146,13 @@ class Match:
 
     @property
     def inlier_share(self) -> float:
-        """Share of the source points that found a partner."""
+        """Share of the source points that have a correspondence."""
         return self.inliers / max(self.points, 1)
+
+    @property
+    def is_fit(self) -> bool:
+        """Whether the pose is a minimum that the correspondences agree with, in every direction or not."""
+        return self.at_minimum and self.fit >= LEAST_FIT
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,6 +295,14 @@ class Trajectory:
 
     stamps_ns: NDArray[np.int64]
     poses: Matrix
+
+    def __post_init__(self) -> None:
+        """Raises InputError where there is not one pose for each stamp."""
+        stamps, poses = np.shape(self.stamps_ns), np.shape(self.poses)
+        if len(stamps) != 1 or len(poses) != 3 or poses[1:] not in ((3, 3), (4, 4)) or poses[0] != stamps[0]:
+            raise InputError(
+                f"poses has the shape {poses}, stamps_ns {stamps}; wanted (N, 3, 3) or (N, 4, 4) and (N,)"
+            )
 
     @property
     def dimension(self) -> int:

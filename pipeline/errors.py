@@ -14,3 +14,12 @@ class MissingExtraError(InputError):
 
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(f"{package} is not installed; install it with: pip install 'scanchain[{extra}]'")
+
+
+def shown(value: object) -> str:
+    """A value as an error shows it: short ones as written, arrays and long ones by their kind."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and shape:
+        return f"an array of the shape {shape}"
+    text = repr(value)
+    return text if len(text) <= 40 and text.isprintable() else f"a {type(value).__name__}"

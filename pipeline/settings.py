@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import tomli_w
 
+from pipeline import checks
 from pipeline.config import Config
 from pipeline.config_keys import Value, config_keys, find_key
 from pipeline.errors import InputError
@@ -51,6 +52,7 @@ def load_settings(
     layer: dict[str, Value] = {}
     source = "defaults"
     if dimension is not None:
+        dimension = checks.dimension(dimension)
         layer = read_layer(preset_path(PRESETS[dimension]))
         source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
     if file is not None:
@@ -102,6 +104,11 @@ def flatten(config: Config) -> dict[str, Value]:
     """Every key with its value, in the order of the tree."""
     tree: dict[str, dict[str, Value]] = msgspec.to_builtins(config)
     return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
+
+
+def check_order(config: Config) -> None:
+    """Refuse a configuration whose lower limits are not below the upper ones."""
+    _check_order(flatten(config), "Config", {}, _ORDERED)
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:

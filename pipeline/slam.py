@@ -28,7 +28,7 @@ from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser, refined, spread
-from pipeline.odometry import FrontEnd, Located
+from pipeline.odometry import FrontEnd, Located, checked_mounting
 from pipeline.point_store import PointStore
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
@@ -67,6 +67,7 @@ class Slam:
         points_file: Path | None = None,
     ) -> None:
         """points_file : where points go, which stay out of memory; without one, into a temporary file."""
+        T_base_lidar = checked_mounting(config, T_base_lidar)
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.points = PointStore(self.dimension, points_file)

@@ -184,7 +184,7 @@ def test_a_scan_far_from_the_map_says_that_nothing_matched(matcher_name):
     away = lie.pose_2d(500.0, 0.0, 0.0)
     match = matcher.align(scan_at(truth(2)), target, away)
     assert (match.inliers, match.converged) == (0, False)
-    assert match.reason == "no point has a partner in the map"
+    assert match.reason == "no point has a correspondence in the map"
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -49,7 +49,8 @@ def drive(count, dimension, points=180, seed=1):
             T_target_source=T_odom_lidar,
             information=np.diag([1e6] * dimension + [1e8] * (k - dimension)), cost=0.5,
             inliers=points - 7, points=points, iterations=4, residual_m=np.inf if state is State.LOST else 0.02,
-            converged=True, reason="converged", degeneracy_eigenvalue=0.3, observability=9.0,
+            fit=0.9, at_minimum=True, converged=True, reason="converged", degeneracy_eigenvalue=0.3,
+            observability=9.0,
             degeneracy_direction=np.eye(k)[0],
         )  # fmt: skip
         keyframe = i // 5 if i % 5 == 0 else -1

@@ -7,7 +7,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
+from pipeline import checks, lie
 from pipeline.config import GraphConfig
 from pipeline.data import GraphState, Matrix, Pose
 from pipeline.errors import InputError
@@ -31,7 +31,7 @@ class PoseGraph:
 
     def __init__(self, dimension: int) -> None:
         """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses."""
-        self.dimension = dimension
+        dimension = self.dimension = checks.dimension(dimension)
         self.freedom = 3 if dimension == 2 else 6
         pose, k = (dimension + 1, dimension + 1), self.freedom
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
@@ -99,24 +99,44 @@ class PoseGraph:
 
     def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
         """Index of the new pose, with this first guess."""
-        return self._append(T_world, stamp_ns, is_point=False)
+        return self._append(checks.pose(T_world, "T_world", self.dimension), stamp_ns, is_point=False)
 
     def add_point(self, position: NDArray[np.float64], stamp_ns: int) -> int:
         """Index of a new point of the plane (2,): it counts among the poses, with the identity as its rotation."""
-        return self._append(lie.pose_2d(position[0], position[1], 0.0), stamp_ns, is_point=True)
+        if self.dimension != 2:
+            raise InputError("a point of the plane was added to a graph of SE(3) poses; make it PoseGraph(2)")
+        x_m, y_m = checks.matrices(position, "position", (2,)).tolist()
+        return self._append(lie.pose_2d(x_m, y_m, 0.0), stamp_ns, is_point=True)
 
     def add_edge(self, i: int, j: int, T_ij: Pose, information: Matrix, is_loop: bool = False) -> None:
         """Add a measurement of frame j in frame i.
 
-        information (k, k) is the inverse covariance of e = log(T_ij⁻¹ T_i⁻¹ T_j), a right twist on T_ij; what a
-        matcher says about left twists becomes that by ``right_information``. Loops get the robust loss.
+        information (k, k) is the inverse covariance of e = log(T_ij⁻¹ T_i⁻¹ T_j), a right twist on T_ij, as
+        ``Match.information`` is. Loops get the robust loss.
         """
-        self.add_edges(np.array([[i, j]]), T_ij[None], information[None], np.array([is_loop]))
+        T_ij = checks.pose(T_ij, "T_ij", self.dimension)
+        information = checks.matrices(information, "information", (self.freedom, self.freedom))
+        pair = [checks.integer(each, name, "the index of a pose") for each, name in ((i, "i"), (j, "j"))]
+        self._add_edges(np.array([pair], np.int64), T_ij[None], information[None], np.array([bool(is_loop)]))
 
     def add_edges(
         self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> None:
         """Add many edges: (E, 2), (E, d+1, d+1), (E, k, k), (E,)."""
+        edges = checks.indices(edges, "edges")
+        measurements = checks.poses(measurements, "measurements", self.dimension)
+        information = checks.matrices(information, "information", (len(edges), self.freedom, self.freedom))
+        is_loop = np.asarray(is_loop, np.bool_)
+        if len(measurements) != len(edges) or is_loop.shape != (len(edges),):
+            raise InputError(
+                f"measurements has {len(measurements)} entries, is_loop the shape {is_loop.shape}; wanted one for "
+                f"each of the {len(edges)} edges"
+            )
+        self._add_edges(edges, measurements, information, is_loop)
+
+    def _add_edges(
+        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
+    ) -> None:
         check_edges(edges, measurements, information, len(self))
         self._changed()
         self._edges.extend(edges)
@@ -127,14 +147,16 @@ class PoseGraph:
 
     def add_sightings(self, edges: NDArray[np.int64], positions: NDArray[np.float64], information: Matrix) -> None:
         """Add points as poses see them: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
+        edges = checks.indices(edges, "edges")
         measurements = np.tile(lie.identity(2), (len(edges), 1, 1))
-        measurements[:, :2, 2] = positions
+        measurements[:, :2, 2] = checks.matrices(positions, "positions", (len(edges), 2))
         padded = np.zeros((len(edges), 3, 3))
-        padded[:, :2, :2] = information
+        padded[:, :2, :2] = checks.matrices(information, "information", (len(edges), 2, 2))
         self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
 
     def fix(self, index: int) -> None:
         """Hold this pose where it is, instead of pose 0."""
+        index = checks.integer(index, "index", "the index of a pose")
         if not 0 <= index < len(self):
             raise InputError(f"pose {index} cannot be fixed: the graph has {len(self)} poses; add it first")
         self._changed()
@@ -198,8 +220,7 @@ class PoseGraph:
         return own_covariances(self._factored(), self.poses)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
-        if not np.isfinite(T_world).all():
-            raise InputError(f"pose {len(self)} is not finite; give it a first guess or leave it out")
+        stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")
         self._changed()
         self._stamps_ns.append(stamp_ns)
         self._is_point.append(is_point)

@@ -23,9 +23,6 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
     for index in np.flatnonzero(edges[:, 0] == edges[:, 1])[:1]:
         i, j = edges[index]
         raise InputError(f"edge {i}-{j} joins a pose to itself; remove it")
-    for index in np.flatnonzero(~np.isfinite(np.sum(measurements, axis=(1, 2))))[:1]:
-        i, j = edges[index]
-        raise InputError(f"edge {i}-{j}: measurement is not finite; leave the edge out")
     for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
         i, j = edges[index]
         raise InputError(

@@ -16,6 +16,8 @@ COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
 class Terms(NamedTuple):
     """What an alignment runs under.
 
+    reach, max_distance_m : of the search for correspondences while the pose moves
+    last_reach, last_distance_m : of those that the answer is judged by
     first_scale_m, widest_scale_m, scale_m : of the kernel, at first unless the prediction is in doubt, at the
         most, and at last
     variance : of a range, σ² in m²
@@ -28,6 +30,8 @@ class Terms(NamedTuple):
     max_iterations: int
     reach: int
     max_distance_m: float
+    last_reach: int
+    last_distance_m: float
     first_scale_m: float
     widest_scale_m: float
     scale_m: float
@@ -98,12 +102,11 @@ def weigh_up(problem, scale_m: float, estimate):
 
 
 @njit(cache=True, nogil=True)
-def leave_out_points(problem):
-    """Take the trust from pairs with a voxel that has no shape."""
-    for i in range(problem.partner.shape[0]):
-        voxel = problem.partner[i]
-        if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
-            problem.trust[i] = 0.0
+def leave_out_points(voxels, partner, trust):
+    """Take the weight from correspondences (N,) with a voxel that has no shape."""
+    for i in range(partner.shape[0]):
+        if partner[i] >= 0 and voxels.cells[partner[i], SHAPE] == POINT:
+            trust[i] = 0.0
 
 
 @njit(cache=True, nogil=True)

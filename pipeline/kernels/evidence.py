@@ -12,6 +12,7 @@ from pipeline.kernels.poses import adjoint, centred
 
 WEAK = 10.0  # times the limits, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction
+_NOTHING = 1e-12  # of the largest eigenvalue, below which one is rounding
 
 
 class Spectrum(NamedTuple):
@@ -43,6 +44,37 @@ def spectrum_of(H, weights: float, range_m: float):
             evened[i, j] = H[i, j] * scale[i] * scale[j] / max(weights, 1e-300)
     eigensystem(evened, values, vectors)
     return Spectrum(scale, values, vectors, np.full(k, np.inf))
+
+
+@njit(cache=True, nogil=True)
+def fit_of(H, unweighted, range_m: float) -> float:
+    """Share of the information that the robust kernel leaves to the direction that loses most, 0 to 1.
+
+    The smallest eigenvalue of H x = λ U x, with H and U (k, k) the information with and without robust weights:
+    near 1 where the correspondences along every direction agree with the pose, low where those that determine a
+    direction contradict it, however many others (the ground, as a rule) fit. Directions without information are
+    left out; 0 where there is none at all.
+    """
+    k = H.shape[0]
+    plain = spectrum_of(unweighted, 1.0, range_m)
+    largest = plain.values[k - 1]
+    if not largest > 0.0:
+        return 0.0
+    whitened, values, vectors = np.eye(k), np.empty(k), np.empty((k, k))
+    for m in range(k):
+        if plain.values[m] <= _NOTHING * largest:
+            continue
+        for n in range(k):
+            if plain.values[n] <= _NOTHING * largest:
+                continue
+            total = 0.0
+            for i in range(k):
+                for j in range(k):
+                    along = plain.vectors[i, m] * plain.vectors[j, n]
+                    total += along * H[i, j] * plain.scale[i] * plain.scale[j]
+            whitened[m, n] = total / np.sqrt(plain.values[m] * plain.values[n])
+    eigensystem(whitened, values, vectors)
+    return max(values[0], 0.0)
 
 
 @njit(cache=True, inline="always")

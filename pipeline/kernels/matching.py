@@ -7,11 +7,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeline.kernels.association import associate
+from pipeline.kernels.estimate import leave_out_points
 from pipeline.kernels.evidence import (
     WEAK,
     add,
     congruent,
     definite_inverse,
+    fit_of,
     hold,
     is_below,
     seen_from_source,
@@ -20,8 +23,10 @@ from pipeline.kernels.evidence import (
 )
 from pipeline.kernels.pose_log import twist_3d
 from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
-from pipeline.kernels.registration import align
+from pipeline.kernels.registration import NO_PARTNERS, align, position_of
+from pipeline.kernels.residuals import information, robust_sums
 from pipeline.kernels.signal import listen
+from pipeline.kernels.trust import weigh
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
@@ -35,17 +40,36 @@ class Expectation(NamedTuple):
     is_known: int
 
 
+class Quality(NamedTuple):
+    """How well points fit a map at a pose, by the correspondences within the last gate of the search.
+
+    pairs, on_surfaces : points with a correspondence, and those of them on a plane or line
+    residual_m, fit : as in ``Match``
+    H (k, k), weights : information of planes and lines about the lidar's position, and the sum of all weights
+    """
+
+    pairs: int
+    on_surfaces: int
+    residual_m: float
+    fit: float
+    H: NDArray[np.float64]
+    weights: float
+
+
 class Answer(NamedTuple):
-    """How a matching ended; fields as in ``Match``, the ending a code of ``registration``."""
+    """How a matching ended; fields as in ``Match``, ``range_m`` of the points, a code of ``registration``."""
 
     T: NDArray[np.float64]
     information: NDArray[np.float64]
     direction: NDArray[np.float64]
     eigenvalue: float
     signal: float
+    fit: float
+    range_m: float
     residual_m: float
     cost: float
     pairs: int
+    on_surfaces: int
     iterations: int
     ending: int
 
@@ -82,17 +106,59 @@ def match(voxels, points, T_first, expected, terms):
             believed = _turned(definite_inverse(expected.covariance), T_first, terms.variance)
         add(information, hold(spectrum, outcome.weights, believed, terms))
         T = T_first.copy()
-    return answer_of(T, T_first, outcome, spectrum, terms.variance)
+    quality = _quality_of(voxels, points, T, outcome, range_m, terms)
+    return answer_of(T, T_first, outcome, spectrum, quality, range_m, terms.variance)
 
 
 @njit(cache=True, nogil=True)
-def judge(T, outcome, range_m: float, variance: float):
-    """The ``Answer`` of an outcome whose information is about T itself."""
-    return answer_of(T, T, outcome, spectrum_of(outcome.H, outcome.weights, range_m), variance)
+def judge(voxels, points, T, outcome, terms):
+    """The ``Answer`` of an outcome whose information is about T (d+1, d+1) itself.
+
+    The means of voxels constrain a pose in every direction, whether the surfaces do or not: what is determined is
+    therefore judged by the surfaces.
+    """
+    range_m = root_mean_square_range(points)
+    quality = _quality_at(voxels, points, T, range_m, terms)
+    spectrum = spectrum_of(quality.H, quality.weights, range_m)
+    return answer_of(T, T, outcome, spectrum, quality, range_m, terms.variance)
+
+
+@njit(cache=True, nogil=True)
+def _quality_of(voxels, points, T, outcome, range_m: float, terms):
+    """The ``Quality`` of an outcome: by its own correspondences, or by closer ones where the search was wider."""
+    if terms.reach != terms.last_reach or terms.max_distance_m != terms.last_distance_m:
+        return _quality_at(voxels, points, T, range_m, terms)
+    residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
+    fit = fit_of(outcome.H, outcome.unweighted, range_m)
+    return Quality(outcome.pairs, _positive(outcome.trust), residual_m, fit, outcome.H, outcome.weights)
+
+
+@njit(cache=True, nogil=True)
+def _quality_at(voxels, points, T, range_m: float, terms):
+    """The ``Quality`` of points (N, d) at the pose T (d+1, d+1)."""
+    k = 3 if points.shape[1] == 2 else 6
+    partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
+    pairs = associate(voxels, points, T, terms.last_reach, terms.last_distance_m, partner)
+    weigh(voxels, points, T, partner, terms.variance, trust)
+    _, weights, squares = robust_sums(voxels, points, T, partner, trust, terms.scale_m)
+    leave_out_points(voxels, partner, trust)
+    H, unweighted = np.empty((k, k)), np.empty((k, k))
+    information(voxels, points, T, position_of(T), partner, trust, terms.scale_m, H, unweighted)
+    residual_m = math.sqrt(squares / weights) if weights > 0.0 else math.inf
+    return Quality(pairs, _positive(trust), residual_m, fit_of(H, unweighted, range_m), H, weights)
 
 
 @njit(cache=True, inline="always")
-def answer_of(T, T_first, outcome, spectrum, variance: float):
+def _positive(values) -> int:
+    """How many of the values (N,) are above 0."""
+    count = 0
+    for i in range(values.shape[0]):
+        count += values[i] > 0.0
+    return count
+
+
+@njit(cache=True, inline="always")
+def answer_of(T, T_first, outcome, spectrum, quality, range_m: float, variance: float):
     """The ``Answer`` that an outcome amounts to, turned into the source's own frame.
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
@@ -108,11 +174,14 @@ def answer_of(T, T_first, outcome, spectrum, variance: float):
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
-        residual_m,
+        quality.fit,
+        range_m,
+        quality.residual_m,
         outcome.cost,
-        outcome.pairs,
+        quality.pairs,
+        quality.on_surfaces,
         outcome.iterations,
-        outcome.ending,
+        outcome.ending if quality.pairs else NO_PARTNERS,
     )
 
 

@@ -21,7 +21,7 @@ from pipeline.kernels.estimate import (
     take,
     weigh_up,
 )
-from pipeline.kernels.residuals import normal_equations
+from pipeline.kernels.residuals import information
 from pipeline.kernels.trust import weigh
 from pipeline.kernels.twist import orthonormalise, perturb
 
@@ -38,6 +38,7 @@ class Outcome(NamedTuple):
 
     H (k, k) : Σ w JᵀJ over planes and lines alone, twists about the first value's position, map axes; the mean
         of a voxel without a shape holds a pose in every direction, whether the surface there does or not
+    unweighted (k, k) : the same without robust weights
     cost : robust cost in m², every unpaired point at its limit ½s²
     weights, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : points with a partner, linearisations, one of the codes above
@@ -46,6 +47,7 @@ class Outcome(NamedTuple):
     """
 
     H: NDArray[np.float64]
+    unweighted: NDArray[np.float64]
     cost: float
     weights: float
     squares: float
@@ -70,7 +72,7 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
     Returns an ``Outcome``.
     """
     k = 3 if points.shape[1] == 2 else 6
-    origin = _position(T)
+    origin = position_of(T)
     partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
     problem = Problem(voxels, points, origin, prior, partner, trust, terms)
     now = Estimate(T, away.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
@@ -106,15 +108,25 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
     orthonormalise(T)
     cost = now.sums[COST] - pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
-    leave_out_points(problem)
-    normal_equations(voxels, points, T, origin, partner, trust, terms.scale_m, 0.0, now.H, now.b)
+    leave_out_points(voxels, partner, trust)
+    information(voxels, points, T, origin, partner, trust, terms.scale_m, now.H, trial.H)
     return Outcome(
-        now.H, cost, now.sums[WEIGHTS], now.sums[SQUARES], pairs, iterations, ending, origin, partner, trust
+        now.H,
+        trial.H,
+        cost,
+        now.sums[WEIGHTS],
+        now.sums[SQUARES],
+        pairs,
+        iterations,
+        ending,
+        origin,
+        partner,
+        trust,
     )
 
 
 @njit(cache=True, nogil=True)
-def _position(T):
+def position_of(T):
     """Of a pose (d+1, d+1), as (3,); z is 0 in the plane."""
     out, d = np.zeros(3), T.shape[0] - 1
     for axis in range(d):

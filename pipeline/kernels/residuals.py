@@ -1,5 +1,6 @@
 """Normal equations of the distances between points and the local shapes they are paired with."""
 
+import numpy as np
 from numba import njit
 
 from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
@@ -55,6 +56,35 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
             _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
     _mirror(H)
     return cost, weights, squares
+
+
+@njit(cache=True, nogil=True)
+def information(voxels, points, T, origin, partner, trust, scale_m: float, H, unweighted):
+    """Fill H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
+    H.fill(0.0)
+    unweighted.fill(0.0)
+    s2, b = scale_m * scale_m, np.zeros(H.shape[0])
+    planar = points.shape[1] == 2
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+        shape = cell[SHAPE]
+        ratio = s2 / (s2 + r2 * trust[i])
+        for A, w in ((H, trust[i] * ratio * ratio), (unweighted, trust[i])):
+            if planar:
+                _add_2d(A, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
+            elif shape == PLANE:
+                _add_plane(A, b, w, px, py, pz, nx, ny, nz, along)
+            else:
+                _add_point(A, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+    _mirror(H)
+    _mirror(unweighted)
 
 
 @njit(cache=True, nogil=True)

@@ -89,7 +89,7 @@ class NearCloser:
     def _problem(self, match: Match, overlap: float, moved_m: float, min_overlap: float) -> str:
         """Why the match is no closure, empty if it is one."""
         limits, information = self.config, match.degeneracy_eigenvalue
-        if not match.converged:
+        if not match.is_fit:
             return match.reason
         if overlap < min_overlap:
             return f"overlap {overlap:.2f} < loops.min_overlap ({min_overlap:g})"

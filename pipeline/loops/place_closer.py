@@ -134,7 +134,7 @@ class PlaceCloser:
         """Why a measurement is no closure, empty if it is one."""
         limits, match = self.config, measured.match
         plausible_m = max(limits.place_drift * travelled_m, limits.min_radius_m)
-        if not match.converged:
+        if not match.is_fit:
             return match.reason
         if measured.overlap < limits.min_place_overlap:
             return f"overlap {measured.overlap:.2f} < loops.min_place_overlap ({limits.min_place_overlap:g})"

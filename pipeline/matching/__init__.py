@@ -2,6 +2,7 @@
 
 from typing import Protocol
 
+from pipeline import checks
 from pipeline.config import MatchingConfig
 from pipeline.data import Match, Points, Pose, Prior
 from pipeline.matching.correlative import CorrelativeMap, Seed
@@ -35,4 +36,5 @@ class Matcher(Protocol):
 
 def create_matcher(config: MatchingConfig) -> Matcher:
     """The matcher that the configuration names."""
+    checks.instance(config, MatchingConfig, "config", "load_settings(dimension).config.matching")
     return PointToShapeMatcher(config) if config.matcher == "plicp" else SvdMatcher(config)

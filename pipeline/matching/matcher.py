@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
-from pipeline import lie
+from pipeline import checks, lie
 from pipeline.config import MatchingConfig
-from pipeline.data import Match, Points, Pose, Prior
+from pipeline.data import LEAST_FIT, Match, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from pipeline.kernels.estimate import Terms
 from pipeline.kernels.matching import Answer, Expectation, match
+from pipeline.kernels.validity import largest_magnitude
 from pipeline.matching.voxel_map import VoxelMap
 
 OPTIMISERS = {
@@ -22,11 +23,13 @@ OPTIMISERS = {
     "levenberg-marquardt": LEVENBERG_MARQUARDT,
 }
 
+_MAJORITY = 0.5  # share of the points that must have a correspondence for a pose to be relied on
+_REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
+_SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _ENDINGS = {
-    registration.CONVERGED: "converged",
-    registration.OUT_OF_ITERATIONS: "out of iterations",
-    registration.NO_PARTNERS: "no point has a partner in the map",
-    registration.SINGULAR: "the partners do not determine the pose",
+    registration.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
+    registration.NO_PARTNERS: "no point has a correspondence in the map",
+    registration.SINGULAR: "the correspondences do not determine the pose",
 }
 
 
@@ -48,16 +51,21 @@ class PointToShapeMatcher:
         points : (N, d) metres, lidar frame
         prior : what the pose is expected to be, and how surely; its doubt sets the first scale of the kernel
         wide : search far, for a first pose that is little more than a guess
+        Raises InputError where points or first pose do not fit the map.
         """
+        points, T_first = aligned(points, target, T_first)
         expected = _expectation(prior, T_first)
-        answer = match(
-            target.voxels,
-            np.ascontiguousarray(points),
-            np.ascontiguousarray(T_first),
-            expected,
-            terms_of(self.config, target, wide=wide),
-        )
-        return match_of(answer, len(points), self.config)
+        answer = match(target.voxels, points, T_first, expected, terms_of(self.config, target, wide=wide))
+        return match_of(answer, len(points), target, self.config)
+
+
+def aligned(points: Points, target: VoxelMap, T_first: Pose) -> tuple[Points, Pose]:
+    """The points and the first pose of an alignment to a map, checked."""
+    checks.instance(target, VoxelMap, "target", "target = VoxelMap(3, config.local_map); target.insert(points, T)")
+    points = checks.points(points, "points", target.dimension)
+    T_first = checks.pose(T_first, "T_first", target.dimension)
+    checks.within_map(points, T_first, target.voxels.size_m, "points")
+    return points, T_first
 
 
 def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
@@ -67,6 +75,8 @@ def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
         max_iterations=config.max_iterations,
         reach=config.wide_reach_voxels if wide else config.reach_voxels,
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
+        last_reach=config.reach_voxels,
+        last_distance_m=target.scale * config.max_distance_m,
         first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
         widest_scale_m=config.wide_kernel_scale_m,
         scale_m=config.kernel_scale_m,
@@ -79,8 +89,12 @@ def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
     )
 
 
-def match_of(answer: Answer, points: int, config: MatchingConfig) -> Match:
+def match_of(answer: Answer, points: int, target: VoxelMap, config: MatchingConfig) -> Match:
     """The match that a kernel's answer for so many points amounts to."""
+    observability = min(
+        _times(answer.eigenvalue, config.min_information), _times(answer.signal, config.min_signal)
+    )
+    problem = _problem(answer, points, target, observability, config)
     return Match(
         T_target_source=answer.T,
         information=answer.information,
@@ -89,14 +103,68 @@ def match_of(answer: Answer, points: int, config: MatchingConfig) -> Match:
         points=points,
         iterations=answer.iterations,
         residual_m=answer.residual_m,
-        converged=answer.ending == registration.CONVERGED,
-        reason=_ENDINGS[answer.ending],
+        fit=answer.fit,
+        at_minimum=answer.ending == registration.CONVERGED,
+        converged=not problem,
+        reason=problem or "converged",
         degeneracy_eigenvalue=answer.eigenvalue,
-        observability=min(
-            _times(answer.eigenvalue, config.min_information), _times(answer.signal, config.min_signal)
-        ),
+        observability=observability,
         degeneracy_direction=answer.direction,
     )
+
+
+def _problem(answer: Answer, points: int, target: VoxelMap, observability: float, config: MatchingConfig) -> str:
+    """Why an answer is no pose to rely on, empty if it is one."""
+    if not math.isfinite(largest_magnitude(answer.T)):
+        return "the pose is not finite"
+    if answer.ending == registration.NO_PARTNERS:
+        return _ENDINGS[answer.ending]
+    if answer.pairs < config.min_inlier_share * points:
+        return (
+            f"{answer.pairs} of {points} points have a correspondence, below the share "
+            f"matching.min_inlier_share ({config.min_inlier_share:g})"
+        )
+    if observability < 1.0:
+        direction = " ".join(f"{value:.2f}" for value in answer.direction)
+        return (
+            f"motion along [{direction}] is undetermined: observability {observability:.1e} < 1, by "
+            f"matching.min_signal ({config.min_signal:g}) or matching.min_information ({config.min_information:g})"
+        )
+    if answer.ending != registration.CONVERGED:
+        return _ENDINGS[answer.ending]
+    return _contradiction(answer, config) or _chance(answer, points, target)
+
+
+def _contradiction(answer: Answer, config: MatchingConfig) -> str:
+    """How far the correspondences are from agreeing with the pose, empty if they do agree."""
+    if answer.fit < LEAST_FIT:
+        return (
+            f"the correspondences contradict the pose: fit {answer.fit:.2f} < {LEAST_FIT:g}, residuals along one "
+            f"direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})"
+        )
+    if answer.residual_m > config.kernel_scale_m:
+        return f"residual {answer.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})"
+    return ""
+
+
+def _chance(answer: Answer, points: int, target: VoxelMap) -> str:
+    """Why so good a fit may be chance, empty if it cannot."""
+    freedom, voxel_m = len(answer.information), target.voxels.size_m
+    if answer.pairs < _MAJORITY * points:
+        return f"{answer.pairs} of {points} points have a correspondence: no majority"
+    if answer.on_surfaces < _REDUNDANCY * freedom:
+        return (
+            f"{answer.on_surfaces} correspondences with a surface, fewer than {_REDUNDANCY} for each of {freedom} "
+            "degrees of freedom"
+        )
+    if len(target) < 2 * _REDUNDANCY * freedom:
+        return f"the map has {len(target)} voxels, fewer than {2 * _REDUNDANCY} for each degree of freedom"
+    if answer.range_m < _SPAN_VOXELS * voxel_m:
+        return (
+            f"the points spread over {answer.range_m:.2g} m, too little for voxels of {voxel_m:g} m "
+            "(local_map.voxel_size_m)"
+        )
+    return ""
 
 
 def _times(known: float, least: float) -> float:

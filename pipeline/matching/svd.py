@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import checks
 from pipeline.data import Points, Pose
-from pipeline.errors import ScanchainError
+from pipeline.errors import InputError, ScanchainError
 
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
 _ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise
@@ -27,7 +28,12 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64])
     source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0
     Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
     """
-    d = source.shape[1]
+    d = 2 if np.shape(source)[1:] == (2,) else 3
+    source = checks.points(source, "source", d)
+    target = checks.points(target, "target", d)
+    if len(target) != len(source):
+        raise InputError(f"target has {len(target)} points, source {len(source)}; wanted pairs, row by row")
+    weight = checks.weights(weight, "weight", len(source))
     total = weight.sum()
     if len(source) < d or total <= 0.0:
         raise DegeneratePairsError(f"{len(source)} pairs of weight {total:g} do not determine a rotation in {d}D")

@@ -11,9 +11,9 @@ from pipeline.data import Match, Points, Pose, Prior
 from pipeline.kernels import registration
 from pipeline.kernels.association import associate
 from pipeline.kernels.cross_covariance import weighted_pairs
-from pipeline.kernels.matching import judge, root_mean_square_range
+from pipeline.kernels.matching import judge
 from pipeline.kernels.registration import SHRINK, Outcome
-from pipeline.matching.matcher import match_of, terms_of
+from pipeline.matching.matcher import aligned, match_of, terms_of
 from pipeline.matching.svd import DegeneratePairsError, rigid_transform
 from pipeline.matching.voxel_map import VoxelMap
 
@@ -32,6 +32,7 @@ class SvdMatcher:
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """
         del prior
+        points, T_first = aligned(points, target, T_first)
         terms = terms_of(self.config, target, wide=wide)
         T, scale_m = T_first.copy(), terms.first_scale_m
         partner = np.empty(len(points), np.int32)
@@ -54,8 +55,8 @@ class SvdMatcher:
         outcome = self._outcome(
             T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
         )
-        answer = judge(T, outcome, root_mean_square_range(points), terms.variance)
-        return match_of(answer, len(points), self.config)
+        answer = judge(target.voxels, points, T, outcome, terms)
+        return match_of(answer, len(points), target, self.config)
 
     def _stands_still(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]
@@ -80,6 +81,7 @@ class SvdMatcher:
         cost = 0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (tried - len(source))
         return Outcome(
             H=_information(source - T[:-1, -1], weight),
+            unweighted=np.empty((0, 0)),
             cost=cost,
             weights=float(weight.sum()),
             squares=float(weight @ squares),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import lie
+from pipeline import checks, lie
 from pipeline.config import LocalMapConfig
 from pipeline.data import Points, Pose
 from pipeline.kernels.voxels import CELL, Voxels, insert, keep
@@ -22,9 +22,11 @@ class VoxelMap:
     """
 
     def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0) -> None:
-        self.dimension = dimension
+        """Make an empty map with voxels of ``scale`` times ``local_map.voxel_size_m``."""
+        checks.instance(config, LocalMapConfig, "config", "load_settings(dimension).config.local_map")
+        self.dimension = checks.dimension(dimension)
         self.config = config
-        self.scale = scale
+        self.scale = checks.positive(scale, "scale")
         self.insertions = 0
         self.voxels = _empty(1 << 12, scale * config.voxel_size_m)
 
@@ -32,7 +34,13 @@ class VoxelMap:
         return int(self.voxels.used[0])
 
     def insert(self, points: Points, T_map_lidar: Pose) -> None:
-        """Add points (N, d) of the lidar frame; every so often forget what is far or old."""
+        """Add points (N, d) of the lidar frame; every so often forget what is far or old.
+
+        Raises InputError where points or pose do not fit the map.
+        """
+        points = checks.points(points, "points", self.dimension)
+        T_map_lidar = checks.pose(T_map_lidar, "T_map_lidar", self.dimension)
+        checks.within_map(points, T_map_lidar, self.voxels.size_m, "points")
         self.insertions += 1
         if self.insertions % _SWEEP_EVERY == 0 and self.config.max_distance_m < np.inf:
             self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)

@@ -9,14 +9,16 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
+from pipeline import checks, lie
 from pipeline.config import Config
 from pipeline.data import Match, Points, Pose, Scan, State
 from pipeline.errors import InputError
+from pipeline.kernels.validity import largest_magnitude
 from pipeline.matching import CorrelativeMap, VoxelMap, create_matcher
 from pipeline.odometry.prediction import Prediction, Predictor
 from pipeline.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from pipeline.preprocess import Resolution, Sweep
+from pipeline.settings import check_order
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
@@ -31,6 +33,8 @@ class Odometry:
     """Feeds on scans, one by one, and keeps the local map."""
 
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
+        """T_base_lidar : (3, 3) for laser scans, (4, 4) for clouds; the identity where there are no wheels."""
+        T_base_lidar = checked_mounting(config, T_base_lidar)
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.predictor = Predictor(config.odometry, T_base_lidar)
@@ -46,7 +50,15 @@ class Odometry:
         self.first_points = self.first_sweep.points  # as seen from its stamp, once the second scan is there
 
     def track(self, scan: Scan) -> Tracked:
-        """Predict, correct by registration, extend the map."""
+        """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""
+        checks.instance(
+            scan, Scan, "scan", "Scan(index, stamp_ns, log_time_ns, points, times_s, dropped, T_odom_base)"
+        )
+        if scan.points.shape[1] != self.dimension:
+            raise InputError(
+                f"scan {scan.index} has {scan.points.shape[1]}D points; wanted (N, {self.dimension}), because "
+                f"T_base_lidar is a pose of SE({self.dimension})"
+            )
         started = perf_counter()
         sweep, sparse = self.resolution.look(scan)
         if self.resolution.scale != self.local_map.scale:
@@ -190,21 +202,11 @@ class Odometry:
 
     def _judge(self, match: Match) -> tuple[State, str]:
         config = self.config.matching
-        if match.inlier_share < config.min_inlier_share:
-            return State.LOST, (
-                f"{match.inliers} of {match.points} points found a partner, below the share "
-                f"matching.min_inlier_share ({config.min_inlier_share:g})"
-            )
-        if not np.isfinite(match.T_target_source).all():
+        if match.inlier_share < config.min_inlier_share or not math.isfinite(
+            largest_magnitude(match.T_target_source)
+        ):
             return State.LOST, match.reason
-        if match.observability < 1.0:
-            direction = " ".join(f"{value:.2f}" for value in match.degeneracy_direction)
-            return State.DEGENERATE, (
-                f"motion along [{direction}] is undetermined: observability {match.observability:.1e} < 1, by "
-                f"matching.min_signal ({config.min_signal:g}) or matching.min_information "
-                f"({config.min_information:g})"
-            )
-        return State.OK, match.reason
+        return State.DEGENERATE if match.observability < 1.0 else State.OK, match.reason
 
     def _extend(self, points: Points, T_odom_lidar: Pose, state: State) -> None:
         """Insert the scan where it is known well and brings something new."""
@@ -232,3 +234,10 @@ class Odometry:
         config = self.config.local_map
         distance_m, angle_rad = lie.apart(self.T_odom_inserted, T_odom_lidar)
         return distance_m >= config.insert_distance_m or angle_rad >= config.insert_angle_rad
+
+
+def checked_mounting(config: Config, T_base_lidar: Pose) -> Pose:
+    """Where the lidar sits; InputError where that is no pose, or the configuration contradicts itself."""
+    checks.instance(config, Config, "config", "load_settings(dimension).config")
+    check_order(config)
+    return checks.pose(T_base_lidar, "T_base_lidar", 2 if np.shape(T_base_lidar) == (3, 3) else 3)

@@ -46,6 +46,8 @@ def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> M
         points=len(points),
         iterations=0,
         residual_m=0.0,
+        fit=1.0,
+        at_minimum=True,
         converged=True,
         reason="first scan: the frame starts here",
         degeneracy_eigenvalue=1.0,
@@ -64,6 +66,8 @@ def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
         points=0,
         iterations=0,
         residual_m=0.0,
+        fit=0.0,
+        at_minimum=False,
         converged=False,
         reason=(
             f"no point lies between preprocess.min_range_m ({config.min_range_m:g}) and "

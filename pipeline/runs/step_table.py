@@ -110,6 +110,7 @@ class StepTable:
             "inliers": [match.inliers for match in matches],
             "iterations": [match.iterations for match in matches],
             "residual_m": [match.residual_m for match in matches],
+            "fit": [match.fit for match in matches],
             "cost_m2": [match.cost for match in matches],
             "converged": [match.converged for match in matches],
             "match_reason": pa.array([match.reason for match in matches]).dictionary_encode(),

@@ -1,0 +1,196 @@
+"""Arguments of public functions, checked where they enter: converted where nothing is lost, else one clear error.
+
+Each function returns its argument as the kernels take it, C-contiguous, writeable and of one dtype (another layout
+would be compiled for anew), or raises an InputError that names the argument, what came and what is wanted.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from pipeline.errors import InputError, shown
+from pipeline.kernels.validity import largest_magnitude, largest_moved, rigidity_error
+
+_RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
+_MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat
+_LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
+
+
+def dimension(value: object, name: str = "dimension") -> int:
+    """2 for the plane, 3 for space."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool) and value in (2, 3):
+        return int(value)
+    raise InputError(f"{name} is {shown(value)}; it must be 2 (laser scans) or 3 (clouds)")
+
+
+def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """Points (N, d), finite; N may be 0."""
+    array = _numbers(value, name, f"an (N, {d}) array of metres", dtype)
+    if array.ndim != 2 or array.shape[1] != d:
+        raise InputError(
+            f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
+        )
+    if not math.isfinite(largest_magnitude(array)):
+        bad = int((~np.isfinite(array)).any(axis=1).sum())
+        raise InputError(
+            f"{name}: {bad:,} of {len(array):,} points are NaN or infinite; leave them out, with their times"
+        )
+    return array
+
+
+def pose(value: object, name: str, d: int) -> NDArray[np.float64]:
+    """A rigid transformation of SE(d): (d+1, d+1), RᵀR = I, det R = 1, last row 0 … 0 1."""
+    n = d + 1
+    array = _numbers(value, name, f"a ({n}, {n}) pose", np.float64)
+    if array.shape != (n, n):
+        raise InputError(
+            f"{name} has the shape {array.shape}; wanted a ({n}, {n}) pose, because the points are {d}D"
+        )
+    error = rigidity_error(array)
+    if not error <= _RIGID:
+        what = (
+            "holds NaN or infinite values"
+            if math.isinf(error)
+            else f"is no rigid transformation (off by {error:.2g})"
+        )
+        raise InputError(f"{name} {what}; wanted [R t; 0 1] with RᵀR = I and det R = 1")
+    return array
+
+
+def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
+    """Rigid transformations (N, d+1, d+1)."""
+    array = _numbers(value, name, f"an (N, {d + 1}, {d + 1}) array of poses", np.float64)
+    if array.ndim != 3 or array.shape[1:] != (d + 1, d + 1):
+        raise InputError(f"{name} has the shape {array.shape}; wanted (N, {d + 1}, {d + 1})")
+    for index, each in enumerate(array):
+        if not rigidity_error(each) <= _RIGID:
+            pose(each, f"{name}[{index}]", d)
+    return array
+
+
+def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
+    """Refuse points that, moved by T, lie beyond what a voxel map can address."""
+    farthest_m = largest_moved(points, T)
+    if not farthest_m < _MOST_VOXELS * voxel_m:
+        raise InputError(
+            f"{name} reach {farthest_m:.3g} m from the origin; a map of {voxel_m:g} m voxels holds "
+            f"{_MOST_VOXELS * voxel_m:.3g} m: give metres, and coordinates near the lidar (subtract a map offset)"
+        )
+
+
+def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
+    """Seconds (N,) of points relative to their scan's stamp, or (0,) where there are none."""
+    if type(value) is np.ndarray and value.dtype == np.float32 and value.shape == (0,):
+        return value
+    array = _numbers(value, name, "seconds, one a point", np.float64)
+    if array.shape not in ((count,), (0,)):
+        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or (0,) for none")
+    farthest_s = float(np.abs(array).max(initial=0.0))
+    if not farthest_s <= _LONGEST_SWEEP_S:
+        raise InputError(
+            f"{name}: a point lies {farthest_s:.3g} s from the stamp of its scan; wanted seconds after the stamp, "
+            f"at most {_LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
+        )
+    return value if _is_ready(value, np.float32) else array.astype(np.float32)  # type: ignore[return-value]
+
+
+def integer(value: object, name: str, wanted: str) -> int:
+    """A whole number; floats are refused, also those without a fraction."""
+    if isinstance(value, bool):
+        raise InputError(f"{name} is {value}; wanted {wanted}")
+    try:
+        whole = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise InputError(f"{name} is {shown(value)}; wanted {wanted}") from None
+    if abs(whole) >= 1 << 63:
+        raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
+    return whole
+
+
+def positive(value: object, name: str) -> float:
+    """A finite number above 0."""
+    if isinstance(value, int | float | np.number) and not isinstance(value, bool) and 0.0 < value < math.inf:
+        return float(value)
+    raise InputError(f"{name} is {shown(value)}; wanted a finite number > 0")
+
+
+def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
+    """Weights (N,), finite and not negative."""
+    array = _numbers(value, name, f"({count},) weights", np.float64)
+    if array.shape != (count,):
+        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a pair")
+    if not (np.isfinite(array).all() and (array >= 0.0).all()):
+        raise InputError(f"{name} holds negative, NaN or infinite values; wanted weights from 0 on")
+    return array
+
+
+def matrices(value: object, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Finite numbers of a shape."""
+    array = _numbers(value, name, f"an array of the shape {shape}", np.float64)
+    if array.shape != shape:
+        raise InputError(f"{name} has the shape {array.shape}; wanted {shape}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} holds NaN or infinite values")
+    return array
+
+
+def indices(value: object, name: str) -> NDArray[np.int64]:
+    """Pairs (E, 2) of whole numbers."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != 2:
+        raise InputError(
+            f"{name} is {shown(array)} of {_kind(array)}; wanted (E, 2) whole numbers: indices of poses"
+        )
+    return array.astype(np.int64)
+
+
+def instance(value: object, kind: type, name: str, remedy: str) -> None:
+    """Refuse what is not of a kind."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is {shown(value)}; wanted a {kind.__name__}: {remedy}")
+
+
+def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike) -> NDArray[Any]:
+    """The value as a C-contiguous, writeable array of this dtype."""
+    if _is_ready(value, dtype):
+        return value  # type: ignore[return-value]
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} has masked entries; leave them out")
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{name} is {shown(value)}, no array ({_one_line(error)}); wanted {wanted}") from None
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{name} holds {_kind(array)}, not real numbers; wanted {wanted}")
+    with np.errstate(over="ignore"):  # what becomes infinite is refused as such
+        return np.require(array, dtype, ["C_CONTIGUOUS", "WRITEABLE", "ALIGNED"]).view(np.ndarray)
+
+
+def _is_ready(value: object, dtype: DTypeLike) -> bool:
+    return type(value) is np.ndarray and value.dtype == dtype and value.flags.carray
+
+
+def _remedy(array: NDArray[Any], name: str, d: int) -> str:
+    """What would make an array of another shape fit."""
+    if array.ndim == 2 and array.shape[1] > d and array.shape[0] != d:
+        return f"; of more columns, as with intensity, pass {name}[:, :{d}]"
+    if array.ndim == 2 and array.shape[0] == d:
+        return f"; transposed? pass {name}.T"
+    if array.ndim == 2 and array.shape[1] == d - 1:
+        return f"; {d - 1}D points need a {d - 1}D map or odometry"
+    return ""
+
+
+def _kind(array: NDArray[Any]) -> str:
+    return {"b": "booleans", "c": "complex numbers", "O": "objects", "U": "text", "S": "text"}.get(
+        array.dtype.kind, f"{array.dtype}"
+    )
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
