@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.data import fit_text
+
 if TYPE_CHECKING:
     from pipeline.graph.certificate import Certificate
     from pipeline.graph.g2o import G2oFile
@@ -33,17 +35,25 @@ class Answer:
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
             f"first guess    {guess}",
-            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
+            f"chi2           {self._chi2}",
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
         ]
         if graph.is_loop.any():
-            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
+            rest = "; they do not count" if done.rejected.any() else ""
             lines.append(
                 f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
             )
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    @property
+    def _chi2(self) -> str:
+        """Of the edges in force, with how many degrees of freedom."""
+        done, degrees = self.optimisation, self.optimisation.state.degrees_of_freedom
+        if degrees == 0:
+            return fit_text(done.chi2_after, degrees, 0)
+        return f"{done.chi2_before:.6g} before, {done.chi2_after:.8g} after, over {degrees:,} degrees of freedom"
 
     def json(self, written: list[Path]) -> str:
         """The same, and every rejected edge, by vertex ids."""
@@ -58,6 +68,7 @@ class Answer:
             "kept_lines": dict(self.file.other_tags),
             "chi2_before": done.chi2_before,
             "chi2_after": done.chi2_after,
+            "degrees_of_freedom": done.state.degrees_of_freedom,
             "cost_after": done.cost_after,
             "iterations": done.iterations,
             "converged": done.converged,

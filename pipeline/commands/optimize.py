@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -64,13 +64,14 @@ def optimize(
     """Optimise a pose graph and say whether the minimum is the global one.
 
     GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
-    below; edges that --robust rejected do not count in it.
+    below. Edges that --robust rejects count in no χ²: --out FILE.g2o holds the edges in force, each with its
+    robust weight in its information matrix, and FILE_rejected.g2o the rejected ones, if there are any.
 
     \b
     Examples:
       scanchain optimize sphere2500.g2o --out optimised.g2o
       scanchain optimize sphere2500.g2o --png sphere.png --json
-      scanchain optimize run/graph.g2o --robust truncated --out run/robust.g2o --marginals all
+      scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
       scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
     """
     outputs = Outputs(out, marginals, png, recording)
@@ -79,8 +80,8 @@ def optimize(
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     answer = _solved(source, config, cast("Initialisation", initialise), is_suspicious)
-    outputs.write(answer, ctx.obj)
-    click.echo(answer.json(outputs.paths) if as_json else answer.text(outputs.paths))
+    written = outputs.write(answer, ctx.obj)
+    click.echo(answer.json(written) if as_json else answer.text(written))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,29 +103,42 @@ class Outputs:
         """Every file that is wanted."""
         return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
 
+    @property
+    def rejected(self) -> Path | None:
+        """Where the edges go that are not in force, if there are any."""
+        from pipeline.graph.g2o_write import rejected_path
+
+        return rejected_path(self.graph) if self.graph else None
+
     def check(self, force: bool) -> None:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
         endings = {self.picture: ".png", self.recording: ".rrd"}
-        for path in self.paths:
+        for path in (*self.paths, *filter(None, [self.rejected])):
             check_output(path, force=force, ending=endings.get(path, ""))
 
-    def write(self, answer: Answer, viewing: Viewing) -> None:
-        """Write them all."""
+    def write(self, answer: Answer, viewing: Viewing) -> list[Path]:
+        """Write them all; which those are."""
         from pipeline.graph.covariance_table import chosen_poses, write_covariances
         from pipeline.graph.g2o_write import write_graph
 
         file = answer.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
-        if self.graph is not None:
+        written = self.paths
+        if self.graph is not None and self.rejected is not None:
             write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+            self.rejected.unlink(missing_ok=True)  # of an earlier answer, whose place --force gave away
+            if file.graph.is_rejected.any():
+                write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
+                written.insert(1, self.rejected)
         if self.table is not None:
             write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
             viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
             viewing.record_graph(answer.change, self.recording)
+        return written
 
 
 def _shortcuts(flags: dict[str, str | None]) -> list[Override]:
@@ -150,5 +164,6 @@ def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_su
     check_connected(file.graph.edges, file.graph.fixed, file.ids)
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
-    change = GraphChange(source.name, before, done.state, done.rejected)
+    before = replace(before, chi2=done.chi2_before, degrees_of_freedom=done.state.degrees_of_freedom)
+    change = GraphChange(source.name, before, done.state)
     return Answer(file, change, done, file.graph.certify())

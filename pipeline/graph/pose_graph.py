@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import GraphConfig
-from pipeline.data import GraphState, Matrix, Pose
+from pipeline.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.certificate import Certificate, certify
@@ -20,7 +20,7 @@ from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation
 from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.solve import solve
-from pipeline.graph.soundness import check_connected, check_edges, undetermined
+from pipeline.graph.soundness import check_connected, check_edges, ranks, undetermined
 
 
 class PoseGraph:
@@ -38,6 +38,7 @@ class PoseGraph:
         self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
         self._information, self._is_loop = GrowingArray((k, k), np.float64), GrowingArray((), np.bool_)
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
+        self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
@@ -81,6 +82,11 @@ class PoseGraph:
         return self._weight.rows
 
     @property
+    def is_rejected(self) -> NDArray[np.bool_]:
+        """Which edges the last optimisation put out of force, (E,)."""
+        return self.weight < REJECTED_WEIGHT
+
+    @property
     def is_point(self) -> NDArray[np.bool_]:
         """Which poses are points, without a heading, (K,)."""
         return self._is_point.rows
@@ -122,6 +128,7 @@ class PoseGraph:
         self._edges.extend(edges)
         self._measurements.extend(measurements)
         self._information.extend(information)
+        self._rank.extend(ranks(information))
         self._is_loop.extend(is_loop)
         self._weight.extend(np.ones(len(edges)))
 
@@ -149,7 +156,7 @@ class PoseGraph:
         """
         begin = time.perf_counter()
         problem = self._prepared()
-        chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
+        chi2_before = problem.chi2(problem.errors(self.poses))
         solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
         minimum = solved.minimum
         self._poses.replace(solved.poses)
@@ -157,10 +164,9 @@ class PoseGraph:
         self._factor_is_now = False
         return Optimisation(
             state=self.state(),
-            chi2_before=chi2_before,
-            chi2_after=float(minimum.estimate.chi2.sum()),
+            chi2_before=self._in_force(chi2_before),
+            chi2_after=self._in_force(minimum.estimate.chi2),
             cost_after=minimum.estimate.cost,
-            rejected=solved.rejected[self._order()],
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
@@ -182,8 +188,9 @@ class PoseGraph:
             edges=self.edges[order],
             is_loop=self.is_loop[order],
             weight=self.weight[order],
-            chi2=float(chi2.sum()),
+            chi2=self._in_force(chi2),
             edge_chi2=chi2[order],
+            degrees_of_freedom=self._degrees_of_freedom(problem),
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
@@ -224,6 +231,13 @@ class PoseGraph:
             check_connected(self.edges, fixed)
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
+
+    def _in_force(self, chi2: NDArray[np.float64]) -> float:
+        """The sum of w χ² over the edges in force, of χ² (E,)."""
+        return float((self.weight * chi2)[~self.is_rejected].sum())
+
+    def _degrees_of_freedom(self, problem: BetweenProblem) -> int:
+        return max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0)
 
     def _order(self) -> NDArray[np.int64]:
         """Edges with odometry first, otherwise as they were added."""

@@ -15,17 +15,16 @@ from pipeline.graph.estimate import Minimum
 from pipeline.graph.graduation import Judgement, minimise
 from pipeline.graph.initialise import Initialisation, first_guess
 from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import rejection_limit, robust_loss
+from pipeline.graph.robust import robust_loss
 from pipeline.graph.soundness import undetermined
 
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """Poses (K, d+1, d+1) of the minimum, the minimum itself, rejected loop edges (E,), and whence it began."""
+    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and whence it began."""
 
     poses: Matrix
     minimum: Minimum
-    rejected: NDArray[np.bool_]
     initialisation: Initialisation
 
 
@@ -52,9 +51,7 @@ def solve(
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
     found[fixed] = poses[fixed]
-    limit = np.inf if config.robust == "none" else rejection_limit(config.robust_scale, problem.freedom)
-    rejected = is_loop & ((minimum.weights == 0.0) | (minimum.estimate.chi2 > limit))
-    return Solved(found, minimum, rejected, source)
+    return Solved(found, minimum, source)
 
 
 def _orthonormal(poses: Matrix) -> Matrix:

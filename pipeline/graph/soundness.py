@@ -11,6 +11,7 @@ from pipeline.data import Matrix
 from pipeline.errors import InputError
 from pipeline.kernels.graph_soundness import judge_matrices
 
+_NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
 
 
@@ -37,6 +38,19 @@ def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     """Which of the matrices (E, k, k) are finite, symmetric and without negative eigenvalues, (E,)."""
     result = np.empty(len(information), np.bool_)
     judge_matrices(np.ascontiguousarray(information), _ROUNDING, result)
+    return result
+
+
+def ranks(information: Matrix) -> NDArray[np.int64]:
+    """Rank of each of the positive semidefinite matrices (E, k, k), whatever their units, (E,)."""
+    k = information.shape[-1]
+    diagonal = np.einsum("eaa->ea", information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    correlation = scale[:, :, None] * information * scale[:, None, :]
+    is_full = np.empty(len(information), np.bool_)
+    judge_matrices(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
+    result = np.full(len(information), k, np.int64)
+    result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
     return result
 
 
