@@ -34,6 +34,7 @@ class Answer:
         lines = [
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            *self._projected,
             f"first guess    {guess}",
             f"chi2           {self._chi2}",
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
@@ -46,6 +47,13 @@ class Answer:
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    @property
+    def _projected(self) -> list[str]:
+        projection = self.file.projection
+        if projection is None:
+            return []
+        return [f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"]
 
     @property
     def _chi2(self) -> str:
@@ -65,6 +73,7 @@ class Answer:
             "edges": len(graph.edges),
             "suspected": int(graph.is_loop.sum()),
             "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
+            "projected": None if self.file.projection is None else asdict(self.file.projection),
             "kept_lines": dict(self.file.other_tags),
             "chi2_before": done.chi2_before,
             "chi2_after": done.chi2_after,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -16,6 +17,7 @@ from pipeline.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from pipeline.config import GraphConfig
+    from pipeline.graph.g2o import G2oFile, Indefinite
     from pipeline.graph.initialise import Initialisation
     from pipeline.runs.recorder import Viewing
 
@@ -40,6 +42,13 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     help="Suspect edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: trust all]",
 )
 @click.option(
+    "--indefinite",
+    type=click.Choice(("project", "refuse")),
+    default="project",
+    show_default=True,
+    help="Information matrices that are not positive semidefinite: put the nearest one that is in place, or stop.",
+)
+@click.option(
     "--marginals",
     metavar="all|IDS",
     help="Covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
@@ -54,6 +63,7 @@ def optimize(
     source: Path,
     out: Path | None,
     initialise: str,
+    indefinite: str,
     marginals: str | None,
     png: Path | None,
     recording: Path | None,
@@ -79,7 +89,8 @@ def optimize(
     settings = [*_shortcuts(shortcuts), *overrides(ctx)]
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
-    answer = _solved(source, config, cast("Initialisation", initialise), is_suspicious)
+    file = _read(source, cast("Indefinite", indefinite), is_suspicious)
+    answer = _solved(file, source.name, config, cast("Initialisation", initialise))
     written = outputs.write(answer, ctx.obj)
     click.echo(answer.json(written) if as_json else answer.text(written))
 
@@ -154,16 +165,27 @@ def _config(settings: list[Override]) -> GraphConfig:
     return load_settings(overrides=settings).config.graph
 
 
-def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_suspicious: bool) -> Answer:
-    """Read, optimise, certify."""
+def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
+    """The graph, with a warning where it is not taken as it stands."""
     from pipeline.graph.g2o import read_g2o
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file = read_g2o(source, loops="suspect" if is_suspicious else "trusted", indefinite=indefinite)
+    if file.projection is not None:
+        remedy = "mend what wrote them, or stop here with --indefinite refuse"
+        click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)
+    return file
+
+
+def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialisation) -> Answer:
+    """Optimise and certify."""
     from pipeline.graph.optimisation import GraphChange
     from pipeline.graph.soundness import check_connected
 
-    file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
     check_connected(file.graph.edges, file.graph.fixed, file.ids)
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
     before = replace(before, chi2=done.chi2_before, degrees_of_freedom=done.state.degrees_of_freedom)
-    change = GraphChange(source.name, before, done.state)
+    change = GraphChange(name, before, done.state)
     return Answer(file, change, done, file.graph.certify())

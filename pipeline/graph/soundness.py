@@ -41,6 +41,13 @@ def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     return result
 
 
+def nearest_semidefinite(information: Matrix) -> Matrix:
+    """The positive semidefinite matrix nearest to each symmetric one (E, k, k), V max(Λ, 0) Vᵀ (Higham 1988)."""
+    values, vectors = np.linalg.eigh(information)
+    projected = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return 0.5 * (projected + np.swapaxes(projected, 1, 2))
+
+
 def ranks(information: Matrix) -> NDArray[np.int64]:
     """Rank of each of the positive semidefinite matrices (E, k, k), whatever their units, (E,)."""
     k = information.shape[-1]
