@@ -713,6 +713,33 @@ def test_the_rejected_edges_of_an_earlier_answer_do_not_stay_behind(call, refuse
     assert not stale.exists()
 
 
+def test_optimize_names_the_poses_that_are_free_before_it_certifies_anything(call, ring):
+    lines = ring.read_text().splitlines()[:3]
+    ring.write_text("\n".join([*lines, "EDGE_SE2 3 17 1 0 0 100 0 0 100 0 0"]) + "\n")
+    code, output, errors = call("optimize", ring)
+    assert (code, errors) == (0, "")
+    says(output, "free           the edges leave 1 pose free: 17 (yaw)")
+    says(output, "certificate    not certified: the edges leave 1 pose free: 17 (yaw)")
+    tree = json.loads(call("optimize", ring, "--json")[1])
+    assert tree["free"] == {"17": ["yaw"]} and not tree["certificate"]["certified"]
+    ring.write_text("\n".join([*lines, "EDGE_SE2 3 17 1 0 0 1e-7 0 0 1e-7 0 1e-6"]) + "\n")
+    says(call("optimize", ring)[1], "weakly joined  by edges of less than a millionth", "1 poses, 17")
+
+
+def test_optimize_says_loudly_that_it_projects_indefinite_information(call, refused, ring):
+    ring.write_text(ring.read_text().replace("0 2 1 1.01 3.14 100 0 0 100", "0 2 1 1.01 3.14 100 150 0 100"))
+    code, output, errors = call("optimize", ring)
+    assert code == 0
+    says(
+        errors, "warning: ", "1 of 5 edges have an indefinite information matrix", "nearest", "first 0-2 in line 5"
+    )
+    says(errors, "--indefinite refuse")
+    says(output, "projected      1 of 5")
+    code, output, errors = call("optimize", ring, "--json")
+    assert json.loads(output)["projected"]["edges"] == 1 and "warning: " in errors
+    says(refused("optimize", ring, "--indefinite", "refuse"), "ring.g2o:5: information matrix of edge 0-2")
+
+
 def test_a_chain_has_no_loops_to_check(call, ring):
     lines = ring.read_text().splitlines(keepends=True)
     ring.write_text("".join(line for line in lines if " 3 0 " not in line and " 0 2 " not in line))

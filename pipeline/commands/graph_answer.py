@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING
 from pipeline.data import fit_text
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipeline.graph.certificate import Certificate
     from pipeline.graph.g2o import G2oFile
+    from pipeline.graph.observability import FreePose
     from pipeline.graph.optimisation import GraphChange, Optimisation
 
 
@@ -22,6 +26,8 @@ class Answer:
     file: G2oFile
     change: GraphChange
     optimisation: Optimisation
+    free: tuple[FreePose, ...]
+    weak: NDArray[np.int64]
     certificate: Certificate
 
     def text(self, written: list[Path]) -> str:
@@ -44,9 +50,17 @@ class Answer:
             lines.append(
                 f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
             )
+        lines += self._free
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    @property
+    def _free(self) -> list[str]:
+        from pipeline.graph.observability import free_text, weak_text
+
+        lines = [f"free           {free_text(self.free)}"] if self.free else []
+        return [*lines, f"weakly joined  {weak_text(self.weak)}"] if len(self.weak) else lines
 
     @property
     def _projected(self) -> list[str]:
@@ -84,6 +98,8 @@ class Answer:
             "reason": done.reason,
             "initialisation": done.initialisation,
             "time_s": done.time_s,
+            "free": {str(pose.name): pose.axes for pose in self.free},
+            "weakly_joined": self.weak.tolist(),
             "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
             "written": [str(path) for path in written],
         }

@@ -181,11 +181,10 @@ def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
 def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialisation) -> Answer:
     """Optimise and certify."""
     from pipeline.graph.optimisation import GraphChange
-    from pipeline.graph.soundness import check_connected
 
-    check_connected(file.graph.edges, file.graph.fixed, file.ids)
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
     before = replace(before, chi2=done.chi2_before, degrees_of_freedom=done.state.degrees_of_freedom)
     change = GraphChange(name, before, done.state)
-    return Answer(file, change, done, file.graph.certify())
+    free, weak = file.graph.free_poses(), file.graph.weakly_joined()
+    return Answer(file, change, done, free, weak, file.graph.certify())

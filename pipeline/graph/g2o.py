@@ -103,7 +103,7 @@ def read_g2o(
         poses = follow_odometry(poses, held, pairs, measurements)
         from_i = poses[sightings[:, 0]]
         points[sightings[:, 1] - len(poses)] = (from_i[:, :2, :2] @ seen[..., None])[..., 0] + from_i[:, :2, 2]
-    graph = PoseGraph(dimension)
+    graph = PoseGraph(dimension, ids)
     for pose, stamp in zip(poses, pose_ids.tolist(), strict=True):
         graph.add_pose(pose, stamp)
     for point, stamp in zip(points, point_ids.tolist(), strict=True):

@@ -18,9 +18,10 @@ from pipeline.graph.covariance import own_covariances, relative_covariance
 from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation
+from pipeline.graph.observability import FreePose, free_poses, free_text, weakly_joined
 from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.solve import solve
-from pipeline.graph.soundness import check_connected, check_edges, ranks, undetermined
+from pipeline.graph.soundness import check_connected, check_edges, ranks
 
 
 class PoseGraph:
@@ -29,9 +30,10 @@ class PoseGraph:
     The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
     """
 
-    def __init__(self, dimension: int) -> None:
-        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses."""
+    def __init__(self, dimension: int, names: NDArray[np.int64] | None = None) -> None:
+        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses, called by these names in what is said."""
         self.dimension = dimension
+        self._names = names
         self.freedom = 3 if dimension == 2 else 6
         pose, k = (dimension + 1, dimension + 1), self.freedom
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
@@ -50,6 +52,14 @@ class PoseGraph:
     def poses(self) -> Matrix:
         """T_world_lidar of every pose, (K, d+1, d+1)."""
         return self._poses.rows
+
+    @property
+    def names(self) -> NDArray[np.int64]:
+        """What every pose is called in what is said, (K,); without names given, its index."""
+        if self._names is None:
+            return np.arange(len(self))
+        more = len(self) - len(self._names)
+        return np.append(self._names, self._names.max(initial=-1) + 1 + np.arange(more))[: len(self)]
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -157,7 +167,10 @@ class PoseGraph:
         begin = time.perf_counter()
         problem = self._prepared()
         chi2_before = problem.chi2(problem.errors(self.poses))
-        solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+        try:
+            solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+        except SingularMatrixError as error:
+            raise self._undetermined(error, problem) from error
         minimum = solved.minimum
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
@@ -176,7 +189,19 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
-        return certify(self._prepared(), self.poses, self.weight)
+        free = self.free_poses()
+        return certify(self._prepared(), self.poses, self.weight * ~self.is_rejected, free, self.names)
+
+    def free_poses(self) -> tuple[FreePose, ...]:
+        """Poses that the edges in force leave free in some direction, at the poses of now."""
+        self._factor_is_now = False
+        weight = self.weight * ~self.is_rejected
+        return free_poses(self._prepared(), self.poses, weight, self._rank.rows, self.names)
+
+    def weakly_joined(self) -> NDArray[np.int64]:
+        """Names of the poses that hang on edges in force of next to no information."""
+        kept = ~self.is_rejected
+        return self.names[weakly_joined(self.edges[kept], self.information[kept], self.fixed)]
 
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
@@ -220,7 +245,7 @@ class PoseGraph:
             try:
                 problem.cholesky.factorise(equations.values)
             except SingularMatrixError as error:
-                raise undetermined(int(problem.free[error.variable])) from error
+                raise self._undetermined(error, problem) from error
             self._factor_is_now = True
         return problem
 
@@ -228,9 +253,18 @@ class PoseGraph:
         """The least-squares problem; built anew after the graph has grown."""
         if self._problem is None:
             fixed = self.fixed
-            check_connected(self.edges, fixed)
+            check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
+
+    def _undetermined(self, error: SingularMatrixError, problem: BetweenProblem) -> InputError:
+        """The error for poses that their edges leave free, or as good as free."""
+        pose = int(problem.free[error.variable])
+        free = self.free_poses() or (FreePose(int(self.names[pose]), ("next to no information",)),)
+        return InputError(
+            f"pose graph: {free_text(free)};"
+            " give their edges full information matrices, fix them or leave them out"
+        )
 
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
         """The sum of w χ² over the edges in force, of χ² (E,)."""

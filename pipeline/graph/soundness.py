@@ -61,37 +61,30 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
     return result
 
 
-def check_connected(
-    edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64] | None = None
-) -> None:
+def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
     """Refuse a graph with poses that no chain of edges joins to a fixed one; ``names`` (K,) are the poses'."""
     if not len(fixed):
         raise InputError("the pose graph has no poses; add some before optimising")
-    n, loose = len(fixed), _loose(edges, fixed)
-    if len(loose):
-        called = loose if names is None else names[loose]
-        listed = ", ".join(map(str, called[:8].tolist())) + (", ..." if len(loose) > 8 else "")
+    apart = loose(edges, fixed)
+    if len(apart):
         raise InputError(
-            f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {listed};"
-            " add edges to them or fix one of them"
+            f"pose graph: {len(apart)} of {len(fixed)} poses are not joined to a fixed one:"
+            f" {listed(names[apart])}; add edges to them whose information is not zero, or fix one of them"
         )
 
 
 def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
     """Whether a chain of these edges joins every pose to a fixed one."""
-    return not len(_loose(edges, fixed))
+    return not len(loose(edges, fixed))
 
 
-def _loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Poses that no chain of edges joins to a fixed one."""
     links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(fixed), len(fixed)))
     _, part = connected_components(links, directed=False)
     return np.flatnonzero(~np.isin(part, part[fixed]))
 
 
-def undetermined(pose: int) -> InputError:
-    """The error for a pose that its edges leave free in some direction."""
-    return InputError(
-        f"pose graph: the edges leave pose {pose} free in some direction (singular information);"
-        " give its edges full information matrices, or use levenberg-marquardt"
-    )
+def listed(names: NDArray[np.int64]) -> str:
+    """The first of these names, for people."""
+    return ", ".join(map(str, names[:8].tolist())) + (", ..." if len(names) > 8 else "")
