@@ -114,3 +114,26 @@ def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
         assert [pose.name for pose in found] == moving.tolist()
         seen.add(len(moving))
     assert len(seen) >= 3
+
+
+@pytest.mark.parametrize("initialise", ["auto", "given", "odometry", "spanning-tree", "chordal"])
+@pytest.mark.parametrize("robust", ["none", "huber", "truncated"])
+def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_poses(initialise, robust):
+    rng = np.random.default_rng(2)
+    for _ in range(40):
+        dimension, count = int(rng.integers(2, 4)), int(rng.integers(1, 7))
+        k, graph = (3, 6)[dimension - 2], PoseGraph(dimension)
+        true = lie.exp(rng.normal(size=(count, k)))
+        for index, pose in enumerate(true):
+            graph.add_pose(pose, index)
+        pairs = [(i, i + 1) for i in range(count - 1)] + [(0, count - 1)] * (count > 2)
+        for i, j in pairs:
+            information = np.eye(k) * (rng.random(k) < 0.7)
+            Z = lie.inverse(true[i]) @ true[j] @ lie.exp(0.1 * rng.normal(size=k))
+            graph.add_edge(i, j, Z, information, is_loop=j - i > 1)
+        try:
+            graph.optimise(GraphConfig(robust=robust), initialise=initialise)
+        except InputError as error:
+            assert "not joined to a fixed one" in str(error) or " free: " in str(error)
+            continue
+        assert not (graph.free_poses() and graph.certify().certified)

@@ -154,7 +154,7 @@ class SparseCholesky:
 
     def solve(self, right_side: Matrix) -> Matrix:
         """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
-        columns = right_side.reshape(len(right_side), -1)
+        columns = right_side[:, None] if right_side.ndim == 1 else right_side
         result, local = np.empty_like(columns), np.empty(self._fronts.widest)
         x = np.empty(self.pattern.scalars)
         for column in range(columns.shape[1]):

@@ -68,17 +68,17 @@ def minorise(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     turned = errors[:, d:] if d == 2 else (poses[j, :3, :3] @ errors[:, 3:, None])[..., 0]
     tau, kappa = _isotropic(information, d)
     seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
-    tau[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], _NOTHING
+    of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
+    tau[seen], kappa[seen] = np.maximum(of_seen, _NOTHING), _NOTHING
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
     costs = _Costs(tau, kappa, _length(errors[:, :d]), _length(errors[:, d:]), _length(pull[:, :d]))
-    isotropic = tau
     tau, kappa = costs.paid(0.5 * _length(force), excess)
     short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (costs.theta < _FARTHEST)), seen)
     if len(short):
         parts = (information, errors, pull, force, torque, turned)
         tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
     kappa[costs.theta >= _FARTHEST] = np.nan
-    tau[seen], kappa[seen] = isotropic[seen], 0.0
+    tau[seen], kappa[seen] = of_seen, 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
 
