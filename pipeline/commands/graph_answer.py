@@ -98,7 +98,7 @@ class Answer:
             "reason": done.reason,
             "initialisation": done.initialisation,
             "time_s": done.time_s,
-            "free": {str(pose.name): pose.axes for pose in self.free},
+            "free": [asdict(pose) for pose in self.free],
             "weakly_joined": self.weak.tolist(),
             "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
             "written": [str(path) for path in written],

@@ -30,19 +30,23 @@ class FreePose:
     ----------
     name : what the pose is called: its vertex id, or its index
     axes : the axes of its own frame, as "x" or "yaw", along which or about which it may move
+    followers : the other poses that move with it as one rigid body
     """
 
     name: int
     axes: tuple[str, ...]
+    followers: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.name} ({', '.join(self.axes)})"
+        more = f" and {len(self.followers):,} that move with it" if self.followers else ""
+        return f"{self.name} ({', '.join(self.axes)}){more}"
 
 
 def free_text(free: Sequence[FreePose]) -> str:
     """One line for people: how many poses are free, and which in what."""
     shown = ", ".join(map(str, free[:8])) + (", ..." if len(free) > 8 else "")
-    return f"the edges leave {len(free):,} pose{'s' * (len(free) != 1)} free: {shown}"
+    count = sum(1 + len(pose.followers) for pose in free)
+    return f"the edges leave {count:,} pose{'s' * (count != 1)} free: {shown}"
 
 
 def free_poses(
@@ -65,19 +69,32 @@ def free_poses(
         return ()
     apart = loose(problem.edges[kept & (ranks > 0)], fixed)
     null = _null_space(problem, poses, weights * kept, problem.variable[apart])
-    k, axes = problem.freedom, _AXES[problem.freedom]
-    result = {
-        pose: FreePose(int(names[pose]), axes[: 2 if problem.is_point[pose] else k]) for pose in apart.tolist()
-    }
-    scale = np.abs(null).max(axis=(0, 1), initial=1e-300)
-    moving = (np.abs(null) > _MOVES * scale).any(axis=(1, 2))
-    for variable in np.flatnonzero(moving):
-        pose = int(problem.free[variable])
-        U, values, _ = np.linalg.svd(null[variable] / scale)
-        reach = np.abs(U[:, : len(values)][:, values > _MOVES]).max(axis=1, initial=0.0)
-        told = tuple(axis for axis, size in zip(axes, reach, strict=True) if size > _NAMED)
-        result.setdefault(pose, FreePose(int(names[pose]), told))
-    return tuple(result[pose] for pose in sorted(result))
+    bodies = _bodies(problem, poses, null)
+    axes = {body[0]: _axes(null[problem.variable[body[0]]]) for body in bodies}
+    axes |= {pose: _AXES[problem.freedom][: 2 if problem.is_point[pose] else None] for pose in apart}
+    bodies += list(apart[:, None])
+    bodies.sort(key=lambda body: body[0])
+    return tuple(FreePose(int(names[b[0]]), axes[b[0]], tuple(names[b[1:]].tolist())) for b in bodies)
+
+
+def _bodies(problem: BetweenProblem, poses: Matrix, null: Matrix) -> list[NDArray[np.int64]]:
+    """The poses that move in the null space (n, k, m), those together that have the same twists in the world."""
+    moving = np.flatnonzero((np.abs(null) > _MOVES).any(axis=(1, 2)))
+    middle = poses[problem.free, :-1, -1].mean(axis=0)
+    centred = poses[problem.free[moving]]
+    centred[:, :-1, -1] -= middle
+    twists = (lie.adjoint(centred) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
+    largest = np.abs(twists).max(initial=0.0) or 1.0
+    _, body = np.unique(np.round(twists / largest, 6), axis=0, return_inverse=True)
+    body = np.where(problem.is_point[problem.free[moving]], len(moving) + np.arange(len(moving)), body.reshape(-1))
+    return [problem.free[moving[body == one]] for one in np.unique(body)]
+
+
+def _axes(null: Matrix) -> tuple[str, ...]:
+    """The axes along which twists of one pose (k, m) lie."""
+    U, values, _ = np.linalg.svd(null, full_matrices=False)
+    reach = np.abs(U[:, values > _MOVES]).max(axis=1, initial=0.0)
+    return tuple(axis for axis, size in zip(_AXES[len(null)], reach, strict=True) if size > _NAMED)
 
 
 def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -99,7 +116,7 @@ def weak_text(names: NDArray[np.int64]) -> str:
 def _null_space(
     problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64], apart: NDArray[np.int64]
 ) -> Matrix:
-    """Twists (n, k, m) of all variables in their own frames that change no edge; those ``apart`` are held."""
+    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are held."""
     pattern, k = problem.pattern, problem.freedom
     values = problem.packing.values(_own_blocks(problem, poses, weights))
     is_turn = (np.arange(k) >= poses.shape[-1] - 1).astype(np.float64)
@@ -127,7 +144,8 @@ def _null_space(
         return np.zeros((len(problem.free), k, 0))
     ends = np.zeros((pattern.scalars, len(vanished)))
     ends[vanished, np.arange(len(vanished))] = 1.0
-    return problem.packing.spread_rows(problem.cholesky.solve(ends))
+    null = problem.packing.spread_rows(problem.cholesky.solve(ends))
+    return null / np.abs(null).max(axis=(0, 1))
 
 
 def _own_blocks(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Matrix:
