@@ -216,6 +216,9 @@ class Closure:
     chi2_before: float = float("nan")
 
 
+REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force
+
+
 @dataclass(frozen=True, slots=True)
 class GraphState:
     """The pose graph after an optimisation.
@@ -227,8 +230,9 @@ class GraphState:
     edges : (E, 2) int64 keyframe pairs (i, j), odometry first
     is_loop : (E,) bool
     weight : (E,) robust weight in [0, 1] that the optimiser left to each edge; 1 for odometry
-    chi2 : Σ eᵀΩe
+    chi2 : Σ w eᵀΩe of the edges in force: all but the rejected ones
     edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
+    degrees_of_freedom : numbers that the edges in force measure, less those that they are to determine
     """
 
     poses: Matrix
@@ -238,6 +242,21 @@ class GraphState:
     weight: NDArray[np.float64]
     chi2: float
     edge_chi2: NDArray[np.float64]
+    degrees_of_freedom: int = 0
+
+    @property
+    def is_rejected(self) -> NDArray[np.bool_]:
+        """Loop edges that contradict the rest and are not in force, (E,)."""
+        return self.weight < REJECTED_WEIGHT
+
+
+def fit_text(chi2: float, degrees_of_freedom: int, rejected: int, noun: str = "closures") -> str:
+    """How well the edges in force agree, in words: χ², its degrees of freedom, how many edges do not count."""
+    left_out = f", {rejected:,} {noun if rejected != 1 else noun.removesuffix('s')} rejected" if rejected else ""
+    if degrees_of_freedom == 0:
+        return f"no loops {'in force ' if rejected else ''}to check{left_out}"
+    shown = f"{chi2:,.0f}" if 100.0 <= chi2 < 1e7 else f"{chi2:.3g}"
+    return f"χ² {shown} over {degrees_of_freedom:,} degrees of freedom{left_out}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from naive_logs import (
 from scenes import ROOT, configured
 
 from pipeline.__main__ import scanchain
+from pipeline.graph.g2o import read_g2o
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
 
@@ -686,6 +687,67 @@ def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path
     says(output, "rejected       1 of 3 suspected edges")
     tree = json.loads(call("optimize", ring, "--graph.robust", "truncated", "--json")[1])
     assert tree["rejected"] == [[1, 3]] and tree["certificate"]["chi2"] < 1.0
+    assert tree["chi2_after"] == pytest.approx(tree["certificate"]["chi2"]) and tree["degrees_of_freedom"] == 6
+    says(output, "over 6 degrees of freedom")
+
+
+@pytest.mark.parametrize("robust", ["truncated", "geman-mcclure", "tukey", "cauchy", "huber"])
+def test_the_graph_of_a_robust_answer_holds_what_is_in_force_and_its_own_minimum(call, tmp_path, ring, robust):
+    ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
+    words = ["--robust", robust, "--graph.tolerance", "1e-12", "--out", tmp_path / "done.g2o", "--json"]
+    tree = json.loads(call("optimize", ring, *words)[1])
+    assert tree["rejected"] == [[1, 3]] and str(tmp_path / "done_rejected.g2o") in tree["written"]
+    assert (tmp_path / "done.g2o").read_text().count("EDGE_SE2") == 5
+    assert (tmp_path / "done_rejected.g2o").read_text().count("EDGE_SE2 1 3") == 1
+    before = read_g2o(tmp_path / "done.g2o").graph.poses
+    again = json.loads(call("optimize", tmp_path / "done.g2o", "--out", tmp_path / "again.g2o", "--json")[1])
+    assert again["chi2_before"] == pytest.approx(tree["chi2_after"], rel=1e-9)
+    assert np.abs(read_g2o(tmp_path / "again.g2o").graph.poses - before).max() < 1e-6
+
+
+def test_the_rejected_edges_of_an_earlier_answer_do_not_stay_behind(call, refused, tmp_path, ring):
+    stale = tmp_path / "done_rejected.g2o"
+    stale.write_text("of an earlier answer")
+    says(refused("optimize", ring, "--out", tmp_path / "done.g2o"), "done_rejected.g2o", "--force")
+    assert call("optimize", ring, "--out", tmp_path / "done.g2o", "--force")[0] == 0
+    assert not stale.exists()
+
+
+def test_optimize_names_the_poses_that_are_free_before_it_certifies_anything(call, ring):
+    lines = ring.read_text().splitlines()[:3]
+    ring.write_text("\n".join([*lines, "EDGE_SE2 3 17 1 0 0 100 0 0 100 0 0"]) + "\n")
+    code, output, errors = call("optimize", ring)
+    assert (code, errors) == (0, "")
+    says(output, "free           the edges leave 1 pose free: 17 (yaw)")
+    says(output, "certificate    not certified: the edges leave 1 pose free: 17 (yaw)")
+    tree = json.loads(call("optimize", ring, "--json")[1])
+    assert (
+        tree["free"] == [{"name": 17, "axes": ["yaw"], "followers": []}] and not tree["certificate"]["certified"]
+    )
+    ring.write_text("\n".join([*lines, "EDGE_SE2 3 17 1 0 0 1e-7 0 0 1e-7 0 1e-6"]) + "\n")
+    says(call("optimize", ring)[1], "weakly joined  by edges of less than a millionth", "1 poses, 17")
+
+
+def test_optimize_says_loudly_that_it_projects_indefinite_information(call, refused, ring):
+    ring.write_text(ring.read_text().replace("0 2 1 1.01 3.14 100 0 0 100", "0 2 1 1.01 3.14 100 150 0 100"))
+    code, output, errors = call("optimize", ring)
+    assert code == 0
+    says(
+        errors, "warning: ", "1 of 5 edges have an indefinite information matrix", "nearest", "first 0-2 in line 5"
+    )
+    says(errors, "--indefinite refuse")
+    says(output, "projected      1 of 5")
+    code, output, errors = call("optimize", ring, "--json")
+    assert json.loads(output)["projected"]["edges"] == 1 and "warning: " in errors
+    says(refused("optimize", ring, "--indefinite", "refuse"), "ring.g2o:5: information matrix of edge 0-2")
+
+
+def test_a_chain_has_no_loops_to_check(call, ring):
+    lines = ring.read_text().splitlines(keepends=True)
+    ring.write_text("".join(line for line in lines if " 3 0 " not in line and " 0 2 " not in line))
+    code, output, _ = call("optimize", ring)
+    assert code == 0
+    says(output, "chi2           no loops to check")
 
 
 def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, ring):

@@ -151,3 +151,20 @@ def test_a_weight_is_the_slope_of_its_loss_and_one_at_zero(loss):
 def test_geman_mcclure_is_unit_true():
     s, chi2 = 3.0, np.array([0.0, 1.0, 9.0, 100.0])
     assert np.allclose(robust_loss("geman-mcclure", s, 3).weight(chi2), (s**2 / (s**2 + chi2)) ** 2)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("angle", [0.0, 0.1, 3.0])
+def test_an_edge_of_position_alone_measures_the_position_whatever_the_rotation(dimension, angle):
+    full, poses, _ = _problem_with_error(dimension, angle)
+    Z, information = full.measurements, full.information.copy()
+    information[:, dimension:], information[:, :, dimension:] = 0.0, 0.0
+    problem = BetweenProblem(full.edges, Z, information, np.array([True, False]))
+    mismatch = lie.inverse(Z[0]) @ lie.inverse(poses[0]) @ poses[1]
+    assert np.allclose(problem.errors(poses)[0, :dimension], mismatch[:-1, -1])
+    assert not problem.errors(poses)[0, dimension:].any()
+    J, step = problem.jacobians(poses, problem.errors(poses))[0], 1e-6
+    for axis, twist in enumerate(step * np.eye(len(J))):
+        ends = [np.stack([poses[0], lie.exp(sign * twist) @ poses[1]]) for sign in (1.0, -1.0)]
+        ahead, back = (problem.errors(pair)[0] for pair in ends)
+        assert np.allclose(J[:, axis], (ahead - back) / (2.0 * step), atol=1e-7)

@@ -9,7 +9,7 @@ from pipeline.errors import InputError
 from pipeline.graph.g2o import read_g2o
 from pipeline.graph.g2o_write import write_g2o, write_toro
 from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.soundness import check_connected
+from pipeline.graph.soundness import check_connected, nearest_semidefinite
 
 SQUARE = """\
 # a comment
@@ -191,7 +191,10 @@ EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
             r":4: vertex 8 is not in",
         ),
         (f"{EDGE}\nEDGE_SE2_XY 0 1 1 1 1 0 1\n", r"vertex 1 is a pose and a point"),
-        (f"{EDGE}\nEDGE_SE2_XY 0 8 1 1 1 5 1\n", r":2: information matrix is not positive semidefinite"),
+        (
+            f"{EDGE}\nEDGE_SE2_XY 0 8 1 1 1 5 1\n",
+            r":2: information matrix of edge 0-8 is not positive semidefinite",
+        ),
         (f"{EDGE}\nFIX 5\n", r":2: vertex 5 is not in the file"),
         (f"{EDGE}\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", r":2: VERTEX_SE3:QUAT in an SE\(2\) graph"),
         ("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 " + "0 " * 21 + "\n", r":1: quaternion of length 0"),
@@ -201,7 +204,7 @@ def test_a_malformed_file_is_refused_in_one_line_that_names_the_place(text, word
     path = tmp_path / "bad.g2o"
     path.write_text(text)
     with pytest.raises(InputError, match=words) as caught:
-        read_g2o(path)
+        read_g2o(path, indefinite="refuse")
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -216,3 +219,64 @@ def test_poses_that_nothing_holds_are_called_by_their_ids():
     held = np.array([True, False, False, False])
     with pytest.raises(InputError, match="not joined to a fixed one: 30, 40"):
         check_connected(np.array([[0, 1], [2, 3]]), held, np.array([10, 20, 30, 40]))
+
+
+def with_indefinite_matrices(path, copy, share):
+    """A published graph of which some edges have entries off the diagonal that no covariance has: their ids."""
+    rng = np.random.default_rng(0)
+    lines, changed = path.read_text().splitlines(), []
+    for number, line in enumerate(lines):
+        words = line.split()
+        if words[0].startswith("EDGE") and rng.random() < share:
+            k = 3 if words[0] == "EDGE_SE2" else 6
+            upper = np.array(words[-k * (k + 1) // 2 :], float)
+            upper[1] = 1.5 * np.sqrt(upper[0] * upper[k])
+            lines[number] = " ".join([*words[: -k * (k + 1) // 2], *map(repr, upper.tolist())])
+            changed.append([int(words[1]), int(words[2])])
+    copy.write_text("\n".join(lines) + "\n")
+    return changed
+
+
+@pytest.mark.parametrize("name", ["smallGrid3D", "intel"])
+def test_indefinite_matrices_are_projected_with_a_warning_that_says_how_many_how_far_and_which_first(
+    name, tmp_path
+):
+    """As the cubicle of the SE-Sync set has them."""
+    path = tmp_path / "bad.g2o"
+    published = shared_data(f"graphs/{name}.g2o")
+    changed = with_indefinite_matrices(published, path, 0.3)
+    with pytest.warns(
+        UserWarning, match=f"{len(changed)} of .* edges have an indefinite information matrix"
+    ) as caught:
+        file = read_g2o(path)
+    assert f"first {changed[0][0]}-{changed[0][1]} in line" in str(caught[0].message)
+    assert (file.projection.edges, file.projection.of) == (len(changed), len(file.graph.edges))
+    assert 0.0 < file.projection.median <= file.projection.most < 1.0
+    sound = read_g2o(published).graph.information
+    same = (file.graph.information == sound).all(axis=(1, 2))
+    assert (~same).sum() == len(changed)
+    assert np.linalg.eigvalsh(file.graph.information)[:, 0].min() > -1e-9 * sound.max()
+    with pytest.raises(
+        InputError, match=f"edge {changed[0][0]}-{changed[0][1]} is not .* first of {len(changed)};"
+    ):
+        read_g2o(path, indefinite="refuse")
+
+
+@pytest.mark.parametrize("tag", ["EDGE2 0 1 1 0 0 1 0 1 1 5 0", "EDGE_SE2 0 1 1 0 0 1 0 5 1 0 1"])
+def test_toro_has_its_indefinite_matrices_projected_too(tag, tmp_path):
+    path = tmp_path / "bad.graph"
+    path.write_text(f"{tag}\n")
+    with pytest.warns(UserWarning, match="1 of 1 edges .* first 0-1 in line 1"):
+        information = read_g2o(path).graph.information[0]
+    assert np.allclose(information, [[3, 0, 3], [0, 1, 0], [3, 0, 3]])
+
+
+def test_the_projected_matrix_is_the_nearest_semidefinite_one():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(50, 6, 6))
+    A += np.swapaxes(A, 1, 2)
+    nearest = nearest_semidefinite(A)
+    assert np.linalg.eigvalsh(nearest)[:, 0].min() > -1e-12
+    # optimal: what is left over is negative semidefinite and orthogonal to the projection
+    assert np.linalg.eigvalsh(A - nearest)[:, -1].max() < 1e-12
+    assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11

@@ -144,3 +144,31 @@ def test_a_minimum_of_the_robust_loss_is_flat(robust):
     equations = problem.linearise(graph.poses, problem.errors(graph.poses), graph.weight)
     diagonal = equations.values[problem.pattern.diagonal]
     assert np.abs(equations.gradient / np.sqrt(diagonal)).max() < 1e-3
+
+
+def test_false_edges_stay_in_force_where_a_pose_would_be_loose_without_them():
+    """Two loops hold the last pose, and each claims another place."""
+    graph = PoseGraph(2)
+    for index, x in enumerate((0.0, 1.0, 3.0)):
+        graph.add_pose(lie.pose_2d(x, 0.0, 0.0), index)
+    graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), 1e4 * np.eye(3))
+    graph.add_edge(0, 2, lie.pose_2d(2.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    graph.add_edge(1, 2, lie.pose_2d(3.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    answer = graph.optimise(GraphConfig(robust="huber"))
+    assert not answer.rejected.any() and answer.state.degrees_of_freedom == 3
+    assert answer.state.weight.min() > 0.0 and graph.certify().chi2 == pytest.approx(answer.chi2_after)
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy", "geman-mcclure", "tukey", "truncated"])
+def test_rejected_edges_have_no_weight_and_the_answer_is_the_minimum_without_them(robust):
+    graph, _, _ = with_false_loops("intel", 0.03)
+    answer = graph.optimise(GraphConfig(robust=robust))
+    assert answer.rejected.any()
+    assert np.array_equal(answer.rejected, answer.state.weight == 0.0)
+    in_force = (answer.state.weight * answer.state.edge_chi2)[~answer.rejected].sum()
+    assert answer.state.chi2 == pytest.approx(in_force) and answer.state.chi2 == pytest.approx(answer.chi2_after)
+    problem = graph._prepared()
+    equations = problem.linearise(graph.poses, problem.errors(graph.poses), graph.weight)
+    step = problem.cholesky
+    step.factorise(equations.values)
+    assert np.abs(step.solve(equations.gradient)).max() < 0.02  # m and rad, left to the tolerance

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.graph.soundness import positive_semidefinite
+from pipeline.graph.soundness import positive_semidefinite, ranks
 
 
 def some_matrices(k, seed=0):
@@ -39,3 +39,13 @@ def test_printed_digits_may_make_an_eigenvalue_a_little_negative(negative, is_so
 
 def test_no_matrices_are_no_trouble():
     assert len(positive_semidefinite(np.empty((0, 3, 3)))) == 0
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+def test_the_rank_of_an_information_matrix_does_not_depend_on_its_units(k):
+    rng = np.random.default_rng(0)
+    for rank in range(k + 1):
+        A = rng.normal(size=(20, rank, k))
+        units = np.diag(10.0 ** rng.uniform(-6.0, 6.0, k))
+        assert (ranks(units @ np.swapaxes(A, 1, 2) @ A @ units) == rank).all()
+    assert ranks(np.diag([1e-12, *[1e9] * (k - 1)])[None]).tolist() == [k]

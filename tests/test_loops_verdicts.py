@@ -1,13 +1,19 @@
 """The last word on loop closures: wrong ones are found out, and the table says what became of each."""
 
+import json
+import re
+
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from false_loops import MADE_UP, false_closures
 from scenes import configured
 
-from pipeline.config import LogConfig
+from pipeline.__main__ import main
+from pipeline.config import GraphConfig, LogConfig
 from pipeline.data import Proposal, Verdict
 from pipeline.evaluate import absolute_error, pair
+from pipeline.graph.g2o import read_g2o
 from pipeline.logs import open_log
 from pipeline.runs.closure_table import write_closures
 from pipeline.runs.verdicts import final_verdicts
@@ -81,3 +87,81 @@ def test_the_table_says_who_proposed_and_what_the_graph_said(tmp_path, disturbed
         entered = closure.verdict is Verdict.ACCEPTED
         assert (before is not None and before >= 0.0) == entered
         assert (after is not None and after >= 0.0) == entered
+
+
+@pytest.fixture(scope="module")
+def forced(log, tmp_path_factory):
+    """The directory of a run into which false loops were forced at its end."""
+
+    class Forced(Slam):
+        def finish(self):
+            self._take(false_closures(self, 0.3))
+            return super().finish()
+
+    out = tmp_path_factory.mktemp("forced") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.runs.processing.Slam", Forced)
+        assert main(["run", str(log.paths[0]), "--out", str(out), "--odometry.prior", "constant-velocity"]) == 0
+    return out
+
+
+def moved_m(poses, others):
+    return np.linalg.norm((poses - others)[:, :-1, -1], axis=1).max()
+
+
+def by_gtsam(path):
+    """The poses of a graph's minimum by GTSAM, started from the file's own."""
+    gtsam = pytest.importorskip("gtsam")
+    graph, values = gtsam.readG2o(str(path), False)
+    graph.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.array([found.atPose2(index).matrix() for index in range(found.size())])
+
+
+def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    assert metrics["closures_rejected"] >= 5
+    graph = read_g2o(forced / "graph.g2o").graph
+    before = graph.poses
+    answer = graph.optimise(GraphConfig())
+    assert moved_m(graph.poses, before) < 1e-3
+    assert answer.chi2_before == pytest.approx(metrics["chi2"], rel=1e-6)
+    assert (
+        answer.state.degrees_of_freedom == metrics["degrees_of_freedom"] == 3 * (len(graph.edges) - len(graph) + 1)
+    )
+    assert moved_m(by_gtsam(forced / "graph.g2o"), before) < 1e-3
+
+
+def test_rejected_loops_stand_in_a_file_of_their_own(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    rejected = read_g2o(forced / "graph_rejected.g2o").graph
+    table = pq.read_table(forced / "loops.parquet").to_pylist()
+    named = [[row["target"], row["source"]] for row in table if "contradicts" in row["reason"]]
+    assert rejected.edges.tolist() == named and len(named) == metrics["closures_rejected"]
+    kept = read_g2o(forced / "graph.g2o").graph
+    assert np.array_equal(rejected.poses, kept.poses)
+    kept.add_edges(rejected.edges, rejected.measurements, rejected.information, np.zeros(len(named), bool))
+    before = kept.poses
+    kept.optimise(GraphConfig(), initialise="given")
+    assert moved_m(kept.poses, before) > 0.5  # what a graph with all of them would do
+
+
+def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    assert metrics["chi2"] < 5.0 * metrics["degrees_of_freedom"]
+    said = re.search(
+        r"χ² ([0-9.,]+) over ([0-9,]+) degrees of freedom, ([0-9]+) closures rejected",
+        (forced / "summary.txt").read_text(encoding="utf-8"),
+    )
+    chi2, degrees, rejected = (float(word.replace(",", "")) for word in said.groups())
+    assert chi2 == pytest.approx(metrics["chi2"], rel=0.01)
+    assert (degrees, rejected) == (metrics["degrees_of_freedom"], metrics["closures_rejected"])
+    assert said[0] in (forced / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_run_without_loops_has_none_to_check(tmp_path, log):
+    words = ["run", log.paths[0], "--out", tmp_path / "run", "--end", "3", "--no-loops", "--rerun", "off"]
+    assert main([str(word) for word in words]) == 0
+    said = (tmp_path / "run" / "summary.txt").read_text(encoding="utf-8")
+    assert "no loops to check" in said and "χ²" not in said
+    assert not (tmp_path / "run" / "graph_rejected.g2o").exists()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState
+from pipeline.data import GraphState, fit_text
 from pipeline.errors import InputError
 from pipeline.graph.optimisation import GraphChange
 
@@ -27,8 +27,9 @@ def draw_graph(change: GraphChange, path: Path) -> None:
     figure = Figure(figsize=(2.0 * _PANEL_INCHES, _PANEL_INCHES), layout="constrained")
     panels = figure.subplots(1, 2)
     for axes, state, when in zip(panels, (change.before, change.after), ("before", "after"), strict=True):
-        _draw_state(axes, state, change.rejected if when == "after" else np.zeros_like(change.rejected))
-        axes.set_title(f"{change.name} {when}: χ² {state.chi2:.6g}", loc="left", fontsize=11)
+        _draw_state(axes, state)
+        fit = fit_text(state.chi2, state.degrees_of_freedom, int(state.is_rejected.sum()), "edges")
+        axes.set_title(f"{change.name} {when}\n{fit}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     try:
@@ -37,7 +38,8 @@ def draw_graph(change: GraphChange, path: Path) -> None:
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
 
 
-def _draw_state(axes: Axes, state: GraphState, rejected: NDArray[np.bool_]) -> None:
+def _draw_state(axes: Axes, state: GraphState) -> None:
+    rejected = state.is_rejected
     positions = state.poses[:, :-1, -1]
     is_flat = positions.shape[1] == 2
     seen = positions if is_flat else positions @ _SEEN_FROM.T

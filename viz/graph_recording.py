@@ -29,15 +29,15 @@ def record_graph(change: GraphChange, path: Path) -> None:
     )
     sink = file_sink(path, stream, layout)
     sink.send([Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)])
-    accepted = np.zeros_like(change.rejected)
-    sink.send([*_messages(change.before, accepted, 0), *_messages(change.after, change.rejected, 1)])
+    sink.send([*_messages(change.before, 0), *_messages(change.after, 1)])
     sink.close()
     for warning in sink.warnings:
         raise InputError(f"{path}: {warning}")
 
 
-def _messages(state: GraphState, rejected: NDArray[np.bool_], when: int) -> list[Message]:
+def _messages(state: GraphState, when: int) -> list[Message]:
     """Nodes, chain, loops and rejected edges at one instant."""
+    rejected = state.is_rejected
     times = Times.at(when, when)
     nodes = shapes.positions(state.poses)
     skips = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1

@@ -63,6 +63,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "way", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
+    yield "pose graph", m.fit
     yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
     yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
     yield (

@@ -12,7 +12,18 @@ from pipeline.batch.task import Row, State
 from pipeline.runs.metrics import Metrics
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
-_NUMBERS = ("scans", "dimension", "ok", "degenerate", "lost", "keyframes", "closures_tried", "closures_accepted")
+_NUMBERS = (
+    "scans",
+    "dimension",
+    "ok",
+    "degenerate",
+    "lost",
+    "keyframes",
+    "closures_tried",
+    "closures_accepted",
+    "closures_rejected",
+    "degrees_of_freedom",
+)
 _FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "travelled_m", "chi2", "median_residual_m")
 _ERRORS = ("ate_rmse_m", "ate_share_of_path", "kitti_translation_share", "kitti_rotation_rad_per_m")
 

@@ -7,9 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.data import fit_text
+
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipeline.graph.certificate import Certificate
     from pipeline.graph.g2o import G2oFile
+    from pipeline.graph.observability import FreePose
     from pipeline.graph.optimisation import GraphChange, Optimisation
 
 
@@ -20,6 +26,8 @@ class Answer:
     file: G2oFile
     change: GraphChange
     optimisation: Optimisation
+    free: tuple[FreePose, ...]
+    weak: NDArray[np.int64]
     certificate: Certificate
 
     def text(self, written: list[Path]) -> str:
@@ -32,18 +40,42 @@ class Answer:
         lines = [
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            *self._projected,
             f"first guess    {guess}",
-            f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
+            f"chi2           {self._chi2}",
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
         ]
         if graph.is_loop.any():
-            rest = f"; chi2 {self.certificate.chi2:.8g} without them" if done.rejected.any() else ""
+            rest = "; they do not count" if done.rejected.any() else ""
             lines.append(
                 f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
             )
+        lines += self._free
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    @property
+    def _free(self) -> list[str]:
+        from pipeline.graph.observability import free_text, weak_text
+
+        lines = [f"free           {free_text(self.free)}"] if self.free else []
+        return [*lines, f"weakly joined  {weak_text(self.weak)}"] if len(self.weak) else lines
+
+    @property
+    def _projected(self) -> list[str]:
+        projection = self.file.projection
+        if projection is None:
+            return []
+        return [f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"]
+
+    @property
+    def _chi2(self) -> str:
+        """Of the edges in force, with how many degrees of freedom."""
+        done, degrees = self.optimisation, self.optimisation.state.degrees_of_freedom
+        if degrees == 0:
+            return fit_text(done.chi2_after, degrees, 0)
+        return f"{done.chi2_before:.6g} before, {done.chi2_after:.8g} after, over {degrees:,} degrees of freedom"
 
     def json(self, written: list[Path]) -> str:
         """The same, and every rejected edge, by vertex ids."""
@@ -55,15 +87,19 @@ class Answer:
             "edges": len(graph.edges),
             "suspected": int(graph.is_loop.sum()),
             "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
+            "projected": None if self.file.projection is None else asdict(self.file.projection),
             "kept_lines": dict(self.file.other_tags),
             "chi2_before": done.chi2_before,
             "chi2_after": done.chi2_after,
+            "degrees_of_freedom": done.state.degrees_of_freedom,
             "cost_after": done.cost_after,
             "iterations": done.iterations,
             "converged": done.converged,
             "reason": done.reason,
             "initialisation": done.initialisation,
             "time_s": done.time_s,
+            "free": [asdict(pose) for pose in self.free],
+            "weakly_joined": self.weak.tolist(),
             "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
             "written": [str(path) for path in written],
         }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,6 +17,7 @@ from pipeline.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from pipeline.config import GraphConfig
+    from pipeline.graph.g2o import G2oFile, Indefinite
     from pipeline.graph.initialise import Initialisation
     from pipeline.runs.recorder import Viewing
 
@@ -40,6 +42,13 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     help="Suspect edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: trust all]",
 )
 @click.option(
+    "--indefinite",
+    type=click.Choice(("project", "refuse")),
+    default="project",
+    show_default=True,
+    help="Information matrices that are not positive semidefinite: put the nearest one that is in place, or stop.",
+)
+@click.option(
     "--marginals",
     metavar="all|IDS",
     help="Covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
@@ -54,6 +63,7 @@ def optimize(
     source: Path,
     out: Path | None,
     initialise: str,
+    indefinite: str,
     marginals: str | None,
     png: Path | None,
     recording: Path | None,
@@ -64,13 +74,14 @@ def optimize(
     """Optimise a pose graph and say whether the minimum is the global one.
 
     GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
-    below; edges that --robust rejected do not count in it.
+    below. Edges that --robust rejects count in no χ²: --out FILE.g2o holds the edges in force, each with its
+    robust weight in its information matrix, and FILE_rejected.g2o the rejected ones, if there are any.
 
     \b
     Examples:
       scanchain optimize sphere2500.g2o --out optimised.g2o
       scanchain optimize sphere2500.g2o --png sphere.png --json
-      scanchain optimize run/graph.g2o --robust truncated --out run/robust.g2o --marginals all
+      scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
       scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
     """
     outputs = Outputs(out, marginals, png, recording)
@@ -78,9 +89,10 @@ def optimize(
     settings = [*_shortcuts(shortcuts), *overrides(ctx)]
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
-    answer = _solved(source, config, cast("Initialisation", initialise), is_suspicious)
-    outputs.write(answer, ctx.obj)
-    click.echo(answer.json(outputs.paths) if as_json else answer.text(outputs.paths))
+    file = _read(source, cast("Indefinite", indefinite), is_suspicious)
+    answer = _solved(file, source.name, config, cast("Initialisation", initialise))
+    written = outputs.write(answer, ctx.obj)
+    click.echo(answer.json(written) if as_json else answer.text(written))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,29 +114,42 @@ class Outputs:
         """Every file that is wanted."""
         return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
 
+    @property
+    def rejected(self) -> Path | None:
+        """Where the edges go that are not in force, if there are any."""
+        from pipeline.graph.g2o_write import rejected_path
+
+        return rejected_path(self.graph) if self.graph else None
+
     def check(self, force: bool) -> None:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
         endings = {self.picture: ".png", self.recording: ".rrd"}
-        for path in self.paths:
+        for path in (*self.paths, *filter(None, [self.rejected])):
             check_output(path, force=force, ending=endings.get(path, ""))
 
-    def write(self, answer: Answer, viewing: Viewing) -> None:
-        """Write them all."""
+    def write(self, answer: Answer, viewing: Viewing) -> list[Path]:
+        """Write them all; which those are."""
         from pipeline.graph.covariance_table import chosen_poses, write_covariances
         from pipeline.graph.g2o_write import write_graph
 
         file = answer.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
-        if self.graph is not None:
+        written = self.paths
+        if self.graph is not None and self.rejected is not None:
             write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+            self.rejected.unlink(missing_ok=True)  # of an earlier answer, whose place --force gave away
+            if file.graph.is_rejected.any():
+                write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
+                written.insert(1, self.rejected)
         if self.table is not None:
             write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
             viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
             viewing.record_graph(answer.change, self.recording)
+        return written
 
 
 def _shortcuts(flags: dict[str, str | None]) -> list[Override]:
@@ -140,15 +165,26 @@ def _config(settings: list[Override]) -> GraphConfig:
     return load_settings(overrides=settings).config.graph
 
 
-def _solved(source: Path, config: GraphConfig, initialise: Initialisation, is_suspicious: bool) -> Answer:
-    """Read, optimise, certify."""
+def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
+    """The graph, with a warning where it is not taken as it stands."""
     from pipeline.graph.g2o import read_g2o
-    from pipeline.graph.optimisation import GraphChange
-    from pipeline.graph.soundness import check_connected
 
-    file = read_g2o(source, loops="suspect" if is_suspicious else "trusted")
-    check_connected(file.graph.edges, file.graph.fixed, file.ids)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file = read_g2o(source, loops="suspect" if is_suspicious else "trusted", indefinite=indefinite)
+    if file.projection is not None:
+        remedy = "mend what wrote them, or stop here with --indefinite refuse"
+        click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)
+    return file
+
+
+def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialisation) -> Answer:
+    """Optimise and certify."""
+    from pipeline.graph.optimisation import GraphChange
+
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
-    change = GraphChange(source.name, before, done.state, done.rejected)
-    return Answer(file, change, done, file.graph.certify())
+    before = replace(before, chi2=done.chi2_before, degrees_of_freedom=done.state.degrees_of_freedom)
+    change = GraphChange(name, before, done.state)
+    free, weak = file.graph.free_poses(), file.graph.weakly_joined()
+    return Answer(file, change, done, free, weak, file.graph.certify())

@@ -34,8 +34,9 @@ class BetweenProblem:
     fixed poses out of the system: ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,)
     the pose of each block, ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
 
-    In the plane, j may be a point: a pose without a heading, its rotation the identity. Then e is
-    (R_iᵀ(t_j − t_i) − t_z, 0), Ω has no rotational part, and of the point's block only the translation is kept.
+    Edges whose Ω says nothing about the rotation are ``sightings`` of a position: e is
+    (R_zᵀ(R_iᵀ(t_j − t_i) − t_z), 0), as g2o has it, whatever the rotation of j. In the plane, j may be a point: a
+    pose without a heading, its rotation the identity, of whose block only the translation is kept.
     """
 
     def __init__(
@@ -62,7 +63,8 @@ class BetweenProblem:
         self.slots[:, :2] = ends
         self.slots[joined, 2] = len(self.free) + which
         self.is_point = np.zeros(len(fixed), np.bool_) if is_point is None else is_point
-        self.sightings = np.flatnonzero(self.is_point[edges].any(axis=1))
+        d = measurements.shape[-1] - 1
+        self.sightings = np.flatnonzero(self.is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2)))
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
@@ -113,10 +115,11 @@ class BetweenProblem:
         kernel = graph_between_se2 if self.freedom == 3 else graph_between_se3
         kernel.residuals(_kept(poses), _kept(edges), self.measurements, errors)
         if len(self.sightings):
+            d, Z = poses.shape[-1] - 1, self.measurements[self.sightings]
             T_i, T_j = poses[edges[self.sightings].T]
-            seen = (T_j[:, None, :2, 2] - T_i[:, None, :2, 2]) @ T_i[:, :2, :2]
-            errors[self.sightings, :2] = seen[:, 0] - self.measurements[self.sightings, :2, 2]
-            errors[self.sightings, 2] = 0.0
+            seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
+            errors[self.sightings, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
+            errors[self.sightings, d:] = 0.0
         return errors
 
     def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
@@ -126,12 +129,20 @@ class BetweenProblem:
         else:
             graph_between_se3.jacobians(_kept(poses), _kept(edges), errors, jacobian)
         if len(self.sightings):
+            d = poses.shape[-1] - 1
             T_i, T_j = poses[edges[self.sightings].T]
-            R_t, (x, y) = np.swapaxes(T_i[:, :2, :2], 1, 2), T_j[:, :2, 2].T
+            R_t = np.swapaxes(T_i[:, :d, :d] @ self.measurements[self.sightings, :d, :d], 1, 2)
             jacobian[self.sightings] = 0.0
-            jacobian[self.sightings, :2, :2] = R_t
-            jacobian[self.sightings, :2, 2] = (R_t @ np.stack([-y, x], axis=1)[..., None])[..., 0]
+            jacobian[self.sightings, :d, :d] = R_t
+            jacobian[self.sightings, :d, d:] = R_t @ _turns(T_j[:, :d, d])
         return jacobian
+
+
+def _turns(positions: Matrix) -> Matrix:
+    """∂t/∂φ (E, d, 1 or 3) of positions (E, d) turned about the origin."""
+    if positions.shape[1] == 3:
+        return -lie.hat(positions)
+    return np.stack([-positions[:, 1], positions[:, 0]], axis=1)[..., None]
 
 
 def _kept(array: NDArray[Any]) -> NDArray[Any]:

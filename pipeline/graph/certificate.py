@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from pipeline.graph.minorant import Minorants, minorise
+from pipeline.graph.observability import FreePose, free_text
 from pipeline.graph.soundness import is_connected
 from pipeline.kernels.graph_dual import scatter_dual
 
@@ -46,14 +48,20 @@ class Certificate:
     @property
     def verdict(self) -> str:
         """One line for people."""
-        if self.chi2 < _NOTHING:
+        if self.certified and self.chi2 < _NOTHING:
             return "globally optimal: χ² is zero"
         if self.certified:
             return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
         return f"not certified: {self.reason}"
 
 
-def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Certificate:
+def certify(
+    problem: BetweenProblem,
+    poses: Matrix,
+    weights: NDArray[np.float64],
+    free: Sequence[FreePose],
+    names: NDArray[np.int64],
+) -> Certificate:
     """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
 
     Every edge's χ² is replaced by a quadratic function of rotations and positions that is nowhere above it and
@@ -62,29 +70,37 @@ def certify(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorisation goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function are bounded by zero instead: their χ² is part of the gap.
+    measurements for such a function are bounded by zero instead: their χ² is part of the gap. Where poses are
+    ``free``, nothing is certified. ``names`` (K,) are what the poses are called.
     """
     begin = time.perf_counter()
     kept = weights > 0.0
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
+    if free:
+        return Certificate(False, chi2, chi2, free_text(free), time.perf_counter() - begin)
+    if chi2 < _NOTHING:
+        return Certificate(True, chi2, chi2, "", time.perf_counter() - begin)
     if len(poses) - len(problem.free) > 1:
         reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
         return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
     centred = poses.copy()
     centred[:, :-1, -1] -= centred[:, :-1, -1].mean(axis=0)
     minorants = minorise(problem, centred, weights)
-    turning = ~problem.is_point[problem.edges].any(axis=1)
-    loose = kept & turning & ~(minorants.kappa > 0.0)
+    loose = kept & np.isnan(minorants.kappa)
     given_up = float(of_edges[loose].sum())
     rest = problem.edges[kept & ~loose]
     if loose.any() and (given_up > _SHARES[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
-        i, j = problem.edges[loose][0]
+        i, j = names[problem.edges[loose][0]]
         reason = f"{loose.sum()} edges are too far from their measurements to be bounded, first {i}-{j}"
         return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
     gap = _gap(problem, minorants, kept & ~loose, chi2)
     if gap is None:
         reason = "the dual matrix is not positive definite, as at a local minimum"
+        borrowing = kept & ((minorants.tau < 0.0) | (minorants.kappa < 0.0))
+        if borrowing.any():
+            i, j = names[problem.edges[borrowing][0]]
+            reason += f", or where Ω says little of some direction, first at {i}-{j} of {borrowing.sum():,} edges"
         return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", time.perf_counter() - begin)
 

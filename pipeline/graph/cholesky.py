@@ -16,11 +16,11 @@ _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is roundi
 
 
 class SingularMatrixError(ArithmeticError):
-    """A pivot vanished: ``variable`` is the block whose value the equations leave open."""
+    """A pivot vanished: the equations leave open the value of this block, ``variable``, and ``scalar`` of all."""
 
-    def __init__(self, variable: int) -> None:
+    def __init__(self, variable: int, scalar: int) -> None:
         super().__init__(f"variable {variable} is not determined by the equations")
-        self.variable = variable
+        self.variable, self.scalar = variable, scalar
 
 
 class BlockPattern:
@@ -150,11 +150,11 @@ class SparseCholesky:
         )
         if failed >= 0:
             scalar = int(np.flatnonzero(self._places == failed)[0])
-            raise SingularMatrixError(int(np.searchsorted(self.pattern.starts, scalar, side="right") - 1))
+            raise SingularMatrixError(int(np.searchsorted(self.pattern.starts, scalar, side="right") - 1), scalar)
 
     def solve(self, right_side: Matrix) -> Matrix:
         """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
-        columns = right_side.reshape(len(right_side), -1)
+        columns = right_side[:, None] if right_side.ndim == 1 else right_side
         result, local = np.empty_like(columns), np.empty(self._fronts.widest)
         x = np.empty(self.pattern.scalars)
         for column in range(columns.shape[1]):

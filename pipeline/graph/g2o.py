@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,37 @@ from pipeline.errors import InputError
 from pipeline.graph.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
 from pipeline.graph.initialise import follow_odometry
 from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.soundness import positive_semidefinite
+from pipeline.graph.soundness import nearest_semidefinite, positive_semidefinite
+
+Indefinite = Literal["project", "refuse"]
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """Which edges of a file have an indefinite information matrix, and what projecting it changed.
+
+    Attributes
+    ----------
+    edges, of : how many edges, of how many
+    median, most : ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius
+    first : the first of them, by its vertices and its line
+    """
+
+    edges: int
+    of: int
+    median: float
+    most: float
+    first: str
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        return (
+            f"{self.edges:,} of {self.of:,} edges have an indefinite information matrix, which is no inverse "
+            "covariance; each was projected to the nearest positive semidefinite one, which changed it by "
+            f"{100.0 * self.median:.3g} % of its norm (median), {100.0 * self.most:.3g} % at most; "
+            f"first {self.first}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +60,14 @@ class G2oFile:
     ids : (K,) the file's vertex ids
     other_lines : lines that say nothing about poses and edges, kept to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
+    projection : what became of indefinite information matrices; None without any
     """
 
     graph: PoseGraph
     ids: NDArray[np.int64]
     other_lines: tuple[str, ...]
     has_guess: bool
+    projection: Projection | None
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
@@ -42,8 +75,15 @@ class G2oFile:
         return tuple(Counter(line.split(maxsplit=1)[0] for line in self.other_lines).items())
 
 
-def read_g2o(path: Path | str, *, loops: Literal["trusted", "suspect"] = "trusted") -> G2oFile:
-    """Read a graph; "suspect" marks edges between poses that do not follow each other for the robust loss."""
+def read_g2o(
+    path: Path | str, *, loops: Literal["trusted", "suspect"] = "trusted", indefinite: Indefinite = "project"
+) -> G2oFile:
+    """Read a graph.
+
+    loops : "suspect" marks edges between poses that do not follow each other for the robust loss
+    indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
+        semidefinite one and warn, or "refuse" the file
+    """
     path = Path(path)
     lines = sort_lines(path)
     dimension = lines.dimension
@@ -53,13 +93,17 @@ def read_g2o(path: Path | str, *, loops: Literal["trusted", "suspect"] = "truste
     pairs = _places(path, lines.edges, 2, pose_ids)
     measurements, information = _measurements(path, lines.edges, dimension)
     sightings, seen, certainty = _sightings(path, lines.sightings, pose_ids, point_ids)
+    bad = [
+        _indefinite(path, *rows, indefinite) for rows in ((lines.edges, information), (lines.sightings, certainty))
+    ]
+    projection = _project(bad, len(pairs) + len(sightings))
     fixed = _places(path, lines.fixed, 1, ids)[:, 0]
     if not lines.vertices.ids:
         held = np.isin(np.arange(len(pose_ids)), fixed if len(fixed) else 0)
         poses = follow_odometry(poses, held, pairs, measurements)
         from_i = poses[sightings[:, 0]]
         points[sightings[:, 1] - len(poses)] = (from_i[:, :2, :2] @ seen[..., None])[..., 0] + from_i[:, :2, 2]
-    graph = PoseGraph(dimension)
+    graph = PoseGraph(dimension, ids)
     for pose, stamp in zip(poses, pose_ids.tolist(), strict=True):
         graph.add_pose(pose, stamp)
     for point, stamp in zip(points, point_ids.tolist(), strict=True):
@@ -70,7 +114,46 @@ def read_g2o(path: Path | str, *, loops: Literal["trusted", "suspect"] = "truste
         graph.add_sightings(sightings, seen, certainty)
     for index in fixed.tolist():
         graph.fix(index)
-    return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids))
+    return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids), projection)
+
+
+@dataclass(frozen=True, slots=True)
+class _Indefinite:
+    """Indefinite information matrices: all of their kind (E, k, k), which of them, and where the first stands."""
+
+    information: Matrix
+    which: NDArray[np.int64]
+    first: str
+
+
+def _indefinite(path: Path, rows: Rows, information: Matrix, indefinite: Indefinite) -> _Indefinite:
+    which = np.flatnonzero(~positive_semidefinite(information))
+    first = ""
+    if len(which):
+        (i, j), line = rows.ids[which[0]], rows.lines[which[0]]
+        first = f"{i}-{j} in line {line}"
+        if indefinite == "refuse":
+            raise InputError(
+                f"{path}:{line}: information matrix of edge {i}-{j} is not positive semidefinite, the first of "
+                f"{len(which):,}; give the upper triangle of an inverse covariance, or have it projected"
+            )
+    return _Indefinite(information, which, first)
+
+
+def _project(kinds: list[_Indefinite], edges: int) -> Projection | None:
+    """Put the nearest semidefinite matrices in place of the indefinite ones, with a warning; what that changed."""
+    off = []
+    for kind in kinds:
+        before = kind.information[kind.which]
+        kind.information[kind.which] = nearest_semidefinite(before)
+        difference = np.linalg.norm(kind.information[kind.which] - before, axis=(1, 2))
+        off += (difference / np.linalg.norm(before, axis=(1, 2))).tolist()
+    if not off:
+        return None
+    first = next(kind.first for kind in kinds if kind.first)
+    projection = Projection(len(off), edges, float(np.median(off)), max(off), first)
+    warnings.warn(projection.text, stacklevel=3)
+    return projection
 
 
 def _vertices(path: Path, lines: G2oLines) -> tuple[NDArray[np.int64], Matrix]:
@@ -111,11 +194,6 @@ def _sightings(
     single = [Rows(rows.lines, [[name] for name in names[:, end].tolist()]) for end in (0, 1)]
     i, j = _places(path, single[0], 1, pose_ids)[:, 0], _places(path, single[1], 1, point_ids)[:, 0]
     information = numbers[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    for bad in np.flatnonzero(~positive_semidefinite(information))[:1]:
-        raise InputError(
-            f"{path}:{rows.lines[bad]}: information matrix is not positive semidefinite;"
-            " give the upper triangle of an inverse covariance"
-        )
     return np.stack([i, j + len(pose_ids)], axis=1), numbers[:, :2], information
 
 
@@ -141,12 +219,6 @@ def _measurements(path: Path, rows: Rows, dimension: int) -> tuple[Matrix, Matri
     information = np.zeros((len(numbers), k, k))
     upper = np.triu_indices(k)
     information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = numbers[:, values:]
-    for bad in np.flatnonzero(~positive_semidefinite(information))[:1]:
-        i, j = rows.ids[bad]
-        raise InputError(
-            f"{path}:{rows.lines[bad]}: information matrix of edge {i}-{j} is not positive semidefinite;"
-            " give the upper triangle of an inverse covariance"
-        )
     for i, j in rows.ids_array(2)[rows.ids_array(2)[:, 0] == rows.ids_array(2)[:, 1]][:1]:
         line = rows.lines[rows.ids.index([i, j])]
         raise InputError(f"{path}:{line}: edge {i}-{j} joins a vertex to itself; remove it")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,28 @@ from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_to
 TORO_SUFFIXES = (".graph", ".toro")
 
 
-def write_graph(path: Path, graph: PoseGraph, *, ids: NDArray[np.int64], other_lines: Iterable[str] = ()) -> None:
+Chosen = Literal["in force", "rejected"]
+
+
+def write_graph(
+    path: Path,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
+) -> None:
     """Write a g2o file, or a TORO one where the name ends in .graph or .toro."""
     write = write_toro if path.suffix in TORO_SUFFIXES else write_g2o
     try:
-        write(path, graph, ids=ids, other_lines=other_lines)
+        write(path, graph, ids=ids, other_lines=other_lines, edges=edges)
     except OSError as error:
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+
+
+def rejected_path(path: Path) -> Path:
+    """The file beside a graph that holds its rejected edges: graph_rejected.g2o beside graph.g2o."""
+    return path.with_name(f"{path.stem}_rejected{path.suffix}")
 
 
 def write_g2o(
@@ -33,10 +49,12 @@ def write_g2o(
     *,
     ids: NDArray[np.int64] | None = None,
     other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
 ) -> None:
     """Write poses, points and edges with full information matrices.
 
-    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name.
+    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name. Edges "in
+    force" are written with their robust weight in Ω, so that the poses are the minimum of the file's own χ².
     """
     d = graph.dimension
     names = (np.arange(len(graph)) if ids is None else ids).tolist()
@@ -44,8 +62,10 @@ def write_g2o(
     for name, pose, is_point in zip(names, _numbers(graph.poses).tolist(), graph.is_point.tolist(), strict=True):
         lines.append(f"{POINT} {name} {_text(pose[:2])}" if is_point else f"{VERTICES[d]} {name} {_text(pose)}")
     lines += [f"FIX {names[index]}" for index in graph.held]
-    sees = graph.is_point[graph.edges[:, 1]].tolist()
-    rows = zip(graph.edges.tolist(), _numbers(graph.measurements).tolist(), _triangles(graph), sees, strict=True)
+    chosen, triangles = _triangles(graph, edges)
+    pairs, measured = graph.edges[chosen], _numbers(graph.measurements[chosen])
+    sees = graph.is_point[pairs[:, 1]].tolist()
+    rows = zip(pairs.tolist(), measured.tolist(), triangles, sees, strict=True)
     for (i, j), measured, upper, is_sighting in rows:
         if is_sighting:
             lines.append(
@@ -62,6 +82,7 @@ def write_toro(
     *,
     ids: NDArray[np.int64] | None = None,
     other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
 ) -> None:
     """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO knows no points."""
     if graph.is_point.any():
@@ -72,7 +93,9 @@ def write_toro(
         f"{TORO_VERTICES[d]} {name} {_text(row)}" for name, row in zip(names, _toro(graph.poses), strict=True)
     ]
     lines += [f"FIX {names[index]}" for index in graph.held]
-    for (i, j), row, upper in zip(graph.edges.tolist(), _toro(graph.measurements), _triangles(graph), strict=True):
+    chosen, triangles = _triangles(graph, edges)
+    pairs, measured = graph.edges[chosen], _toro(graph.measurements[chosen])
+    for (i, j), row, upper in zip(pairs.tolist(), measured, triangles, strict=True):
         lines.append(f"{TORO_EDGES[d]} {names[i]} {names[j]} {_text([*row, *to_toro_triangle(upper)])}")
     _write(path, [*lines, *other_lines])
 
@@ -96,10 +119,13 @@ def _toro(poses: Matrix) -> list[list[float]]:
     return [[*T[:3, 3].tolist(), *to_toro_angles(T[:3, :3])] for T in poses]
 
 
-def _triangles(graph: PoseGraph) -> list[list[float]]:
-    """Ω of every edge, upper triangle row by row."""
+def _triangles(graph: PoseGraph, edges: Chosen) -> tuple[NDArray[np.bool_], list[list[float]]]:
+    """Which edges are chosen, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
     upper = np.triu_indices(graph.freedom)
-    return graph.information[:, upper[0], upper[1]].tolist()
+    triangles = graph.information[:, upper[0], upper[1]]
+    if edges == "rejected":
+        return graph.is_rejected, triangles[graph.is_rejected].tolist()
+    return ~graph.is_rejected, (graph.weight[:, None] * triangles)[~graph.is_rejected].tolist()
 
 
 def _text(row: list[float]) -> str:

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
+from pipeline.data import REJECTED_WEIGHT, Matrix
 from pipeline.graph.estimate import Estimate, Minimum
 from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import GRADUATED, RobustLoss
+from pipeline.graph.robust import GRADUATED, RobustLoss, rejection_limit
 from pipeline.graph.soundness import is_connected
 from pipeline.graph.verdicts import Verdicts, contradictions, fair_price
 
@@ -41,6 +41,8 @@ def minimise(
         minimum = _judge(minimiser, now, loss, max_iterations, tolerance)
     else:
         minimum = minimiser.descend(now, loss, max_iterations, tolerance)
+        if loss.kernel not in ("none", "truncated"):
+            minimum = _settle_without_outliers(minimiser, minimum, loss, max_iterations, tolerance)
     return replace(minimum, iterations=used + minimum.iterations)
 
 
@@ -54,6 +56,29 @@ def _graduate(minimiser: Minimiser, now: Estimate, loss: RobustLoss) -> tuple[Es
         now, used = minimiser.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
         loss = loss.tightened()
     return minimiser.reweighed(now, loss), loss, used
+
+
+def _settle_without_outliers(
+    minimiser: Minimiser, minimum: Minimum, loss: RobustLoss, max_iterations: int, tolerance: float
+) -> Minimum:
+    """The minimum without the edges that this one shows to be false, whose weight becomes 0.
+
+    A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
+    """
+    problem, limit = minimiser.problem, rejection_limit(loss.scale, minimiser.problem.freedom)
+    rejected = minimiser.is_loop & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
+    if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
+        return minimum
+    rest = minimiser.restricted(~rejected)
+    settled = rest.descend(rest.evaluate(minimum.estimate.poses, loss), loss, max_iterations, tolerance)
+    weights = np.zeros(len(rejected))
+    weights[~rejected] = settled.weights
+    return replace(
+        settled,
+        estimate=minimiser.evaluate(settled.estimate.poses, loss),
+        weights=weights,
+        iterations=minimum.iterations + settled.iterations,
+    )
 
 
 class _Focus:

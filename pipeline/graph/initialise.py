@@ -40,7 +40,10 @@ def first_guess(
     chi2 = problem.chi2(problem.errors(poses)).sum()
     redundancy = problem.freedom * max(len(problem.edges) - len(problem.free), 1)
     if initialise == "auto" and trusted and chi2 > _GOOD_GUESS * redundancy:
-        relaxed = relax_chordally(problem, poses)
+        try:
+            relaxed = relax_chordally(problem, poses)
+        except SingularMatrixError:
+            return poses.copy(), "given"
         if problem.chi2(problem.errors(relaxed)).sum() < chi2:
             return relaxed, "chordal"
     return poses.copy(), "given"

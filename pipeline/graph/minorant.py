@@ -7,6 +7,10 @@ Translation: z = V(φ)(ρ − ρ*) is no longer than ρ − ρ*, and differs fro
 (V(φ) − V(φ*))ρ*, at most ½‖ρ*‖‖Δ‖; the linear term changes with V⁻¹, whose slope is at most 0.9311 up to θ = π.
 Rotation: κ‖φ‖² ≥ κ‖φ*‖² + 2κ φ*ᵀP + κ (2 − 0.72 θ*²)(1 − cos δ) for θ* ≤ 1; any other linear term changes from Δ
 to P at a cost of ½‖·‖‖Δ‖². Every cost is paid from τ or from κ, by 2xy ≤ ε x² + y²/ε.
+
+An edge that cannot pay, as one whose Ω is singular, borrows: its τ or κ becomes negative, and the sum over all
+edges shows whether the others make up for it. For these it takes bounds from above as well, ‖ρ − ρ*‖ ≤ ½π‖z‖ and
+‖Δ‖² ≤ ((π + θ*) / (2 cos ½θ*))² 2(1 − cos δ).
 """
 
 from __future__ import annotations
@@ -22,6 +26,8 @@ from pipeline.graph.between import BetweenProblem
 
 _SLOPE = 0.9311  # of V(φ)⁻¹, at most, for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, in θ*², up to 1 rad
+_FARTHEST = 1.0  # θ*, rad, up to which edges are bounded
+_STRETCH = 0.25 * np.pi**2  # ‖ρ − ρ*‖² over ‖z‖², at most
 _ROUNDING = 1e-9  # by which the isotropic information is kept below the smallest eigenvalue
 _NOTHING = 1e-30  # in place of no information at all, so that nothing is divided by zero
 _SHARES = (1.0, 2.0, 4.0)  # of what is paid from τ, tried one after the other
@@ -38,8 +44,8 @@ class Minorants:
     leap : (E, d) l, from pose i to pose j at the estimate, m
     force : (E, d) f, slope of χ² with the position of j
     torque : (E, d, d) [g]×, slope of χ² with the rotation of j, its position held
-    tau : (E,) m⁻²
-    kappa : (E,) rad⁻²; not positive where the edge is too far from its measurement for the bound to hold
+    tau : (E,) m⁻², negative where borrowed
+    kappa : (E,) rad⁻², negative where borrowed; NaN where the edge is too far from its measurement for any bound
     """
 
     leap: Matrix
@@ -62,12 +68,17 @@ def minorise(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     turned = errors[:, d:] if d == 2 else (poses[j, :3, :3] @ errors[:, 3:, None])[..., 0]
     tau, kappa = _isotropic(information, d)
     seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
-    tau[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], _NOTHING
+    of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
+    tau[seen], kappa[seen] = np.maximum(of_seen, _NOTHING), _NOTHING
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
     costs = _Costs(tau, kappa, _length(errors[:, :d]), _length(errors[:, d:]), _length(pull[:, :d]))
-    isotropic = tau
     tau, kappa = costs.paid(0.5 * _length(force), excess)
-    tau[seen], kappa[seen] = isotropic[seen], 0.0
+    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (costs.theta < _FARTHEST)), seen)
+    if len(short):
+        parts = (information, errors, pull, force, torque, turned)
+        tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
+    kappa[costs.theta >= _FARTHEST] = np.nan
+    tau[seen], kappa[seen] = of_seen, 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
 
@@ -105,6 +116,44 @@ class _Costs:
         cost += force * self.rho / 3.0 + 0.5 * excess
         kappa = self.kappa - cost / np.maximum(1.0 - self.theta, 1e-12)
         return tau, np.where(self.theta < 1.0, (1.0 - 0.5 * _BEND * self.theta**2) * kappa, -1.0)
+
+
+def _borrowed(
+    information: Matrix, errors: Matrix, pull: Matrix, force: Matrix, torque: Matrix, turned: Matrix
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """τ and κ, (E,), of edges that cannot pay for their bounds, negative as far as they borrow."""
+    d = force.shape[1]
+    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
+    tau, kappa, tau_mean, kappa_mean = _isotropic_of_singular(information, d)
+    rate = np.sqrt(tau_mean / kappa_mean)
+    slope = _SLOPE * _length(pull[:, :d])
+    loan = slope * rate + _NOTHING
+    left = tau - loan
+    bent = np.clip(0.5 * rho * rate, 1e-12, 1.0)
+    has = left >= 0.0
+    tau = left * np.where(has, 1.0 / (1.0 + bent), _STRETCH * (1.0 + bent))
+    cost = 0.25 * rho**2 * left * np.where(has, 1.0, -_STRETCH * (1.0 + bent)) / bent
+    cost += slope**2 / loan + 0.5 * _length(force) * rho / 3.0
+    cost += 0.5 * _length(torque - 2.0 * np.maximum(kappa, 0.0)[:, None] * turned) + np.maximum(-kappa, 0.0)
+    kappa = np.maximum(kappa, 0.0) - cost / (1.0 - theta)
+    far = (0.5 * (np.pi + theta) / np.cos(0.5 * theta)) ** 2
+    return tau, kappa * np.where(kappa > 0.0, 1.0 - 0.5 * _BEND * theta**2, (1.0 - theta) * far)
+
+
+def _isotropic_of_singular(information: Matrix, d: int) -> tuple[NDArray[np.float64], ...]:
+    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω, one of them negative if need be; mean eigenvalues of both blocks."""
+    k = information.shape[-1]
+    translation, coupling, rotation = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
+    tau_mean = np.maximum(np.trace(translation, axis1=1, axis2=2) / d, _NOTHING)
+    kappa_mean = np.maximum(np.trace(rotation, axis1=1, axis2=2) / (k - d), _NOTHING)
+    least = np.linalg.eigvalsh(rotation)[:, 0]
+    half = np.where(least > 1e-6 * kappa_mean, 0.5 * least, -1e-3 * kappa_mean)
+    is_coupled = coupling.any(axis=(1, 2))
+    kappa = np.where(is_coupled, half, least - _ROUNDING * kappa_mean)
+    rest = rotation - np.where(is_coupled, kappa, -1.0)[:, None, None] * np.eye(k - d)
+    schur = translation - coupling @ np.linalg.solve(rest, np.swapaxes(coupling, 1, 2))
+    tau = np.linalg.eigvalsh(0.5 * (schur + np.swapaxes(schur, 1, 2)))[:, 0] - _ROUNDING * tau_mean
+    return tau, kappa, tau_mean, kappa_mean
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

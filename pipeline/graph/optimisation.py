@@ -13,12 +13,11 @@ from pipeline.graph.initialise import Initialisation
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
-    """A graph before and after, for those who show it; ``rejected`` (E,) in the order of ``after.edges``."""
+    """A graph before and after, for those who show it; χ² of both is that of the edges in force after."""
 
     name: str
     before: GraphState
     after: GraphState
-    rejected: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +27,8 @@ class Optimisation:
     Attributes
     ----------
     state : the graph as it is now
-    chi2_before, chi2_after : Σ eᵀΩe over all edges, unweighted, at the poses before and of the answer
-    cost_after : what was minimised: as chi2_after, with the robust loss of the loop edges
-    rejected : (E,) bool, in the order of ``state.edges``: loop edges that contradict the rest
+    chi2_before, chi2_after : Σ w eᵀΩe over the edges in force in the end, at the poses before and of the answer
+    cost_after : what was minimised: Σ eᵀΩe of all edges, with the robust loss of the loop edges
     iterations : linear solves
     converged, reason : whether and why the iteration stopped
     initialisation : where the first guess came from
@@ -41,9 +39,13 @@ class Optimisation:
     chi2_before: float
     chi2_after: float
     cost_after: float
-    rejected: NDArray[np.bool_]
     iterations: int
     converged: bool
     reason: str
     initialisation: Initialisation
     time_s: float
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """(E,) bool, in the order of ``state.edges``: loop edges that contradict the rest."""
+        return self.state.is_rejected

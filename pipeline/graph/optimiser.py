@@ -88,7 +88,7 @@ class _Model:
 
     def solve(self, damping: float) -> Vector:
         damped = self._curvature.copy()
-        damped[self._problem.pattern.diagonal] += damping * self.diagonal
+        damped[self._problem.pattern.diagonal] += damping * np.where(self.diagonal > 0.0, self.diagonal, 1.0)
         self._problem.cholesky.factorise(damped)
         return self._problem.cholesky.solve(-self.gradient)
 

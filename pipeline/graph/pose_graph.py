@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline import checks, lie
 from pipeline.config import GraphConfig
-from pipeline.data import GraphState, Matrix, Pose
+from pipeline.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.certificate import Certificate, certify
@@ -18,9 +18,10 @@ from pipeline.graph.covariance import own_covariances, relative_covariance
 from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation
+from pipeline.graph.observability import FreePose, free_poses, free_text, weakly_joined
 from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.solve import solve
-from pipeline.graph.soundness import check_connected, check_edges, undetermined
+from pipeline.graph.soundness import check_connected, check_edges, ranks
 
 
 class PoseGraph:
@@ -29,15 +30,17 @@ class PoseGraph:
     The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
     """
 
-    def __init__(self, dimension: int) -> None:
-        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses."""
+    def __init__(self, dimension: int, names: NDArray[np.int64] | None = None) -> None:
+        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses, called by these names in what is said."""
         dimension = self.dimension = checks.dimension(dimension)
+        self._names = names
         self.freedom = 3 if dimension == 2 else 6
         pose, k = (dimension + 1, dimension + 1), self.freedom
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
         self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
         self._information, self._is_loop = GrowingArray((k, k), np.float64), GrowingArray((), np.bool_)
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
+        self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
@@ -49,6 +52,14 @@ class PoseGraph:
     def poses(self) -> Matrix:
         """T_world_lidar of every pose, (K, d+1, d+1)."""
         return self._poses.rows
+
+    @property
+    def names(self) -> NDArray[np.int64]:
+        """What every pose is called in what is said, (K,); without names given, its index."""
+        if self._names is None:
+            return np.arange(len(self))
+        more = len(self) - len(self._names)
+        return np.append(self._names, self._names.max(initial=-1) + 1 + np.arange(more))[: len(self)]
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -79,6 +90,11 @@ class PoseGraph:
     def weight(self) -> NDArray[np.float64]:
         """Weight that the last optimisation left to every edge, (E,); 1 before."""
         return self._weight.rows
+
+    @property
+    def is_rejected(self) -> NDArray[np.bool_]:
+        """Which edges the last optimisation put out of force, (E,)."""
+        return self.weight < REJECTED_WEIGHT
 
     @property
     def is_point(self) -> NDArray[np.bool_]:
@@ -142,6 +158,7 @@ class PoseGraph:
         self._edges.extend(edges)
         self._measurements.extend(measurements)
         self._information.extend(information)
+        self._rank.extend(ranks(information))
         self._is_loop.extend(is_loop)
         self._weight.extend(np.ones(len(edges)))
 
@@ -171,18 +188,20 @@ class PoseGraph:
         """
         begin = time.perf_counter()
         problem = self._prepared()
-        chi2_before = float(problem.chi2(problem.errors(self.poses)).sum())
-        solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+        chi2_before = problem.chi2(problem.errors(self.poses))
+        try:
+            solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+        except SingularMatrixError as error:
+            raise self._undetermined(error, problem) from error
         minimum = solved.minimum
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         return Optimisation(
             state=self.state(),
-            chi2_before=chi2_before,
-            chi2_after=float(minimum.estimate.chi2.sum()),
+            chi2_before=self._in_force(chi2_before),
+            chi2_after=self._in_force(minimum.estimate.chi2),
             cost_after=minimum.estimate.cost,
-            rejected=solved.rejected[self._order()],
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
@@ -192,7 +211,19 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
-        return certify(self._prepared(), self.poses, self.weight)
+        free = self.free_poses()
+        return certify(self._prepared(), self.poses, self.weight * ~self.is_rejected, free, self.names)
+
+    def free_poses(self) -> tuple[FreePose, ...]:
+        """Poses that the edges in force leave free in some direction, at the poses of now."""
+        self._factor_is_now = False
+        weight = self.weight * ~self.is_rejected
+        return free_poses(self._prepared(), self.poses, weight, self._rank.rows, self.names)
+
+    def weakly_joined(self) -> NDArray[np.int64]:
+        """Names of the poses that hang on edges in force of next to no information."""
+        kept = ~self.is_rejected
+        return self.names[weakly_joined(self.edges[kept], self.information[kept], self.fixed)]
 
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
@@ -204,8 +235,9 @@ class PoseGraph:
             edges=self.edges[order],
             is_loop=self.is_loop[order],
             weight=self.weight[order],
-            chi2=float(chi2.sum()),
+            chi2=self._in_force(chi2),
             edge_chi2=chi2[order],
+            degrees_of_freedom=self._degrees_of_freedom(problem),
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
@@ -234,7 +266,7 @@ class PoseGraph:
             try:
                 problem.cholesky.factorise(equations.values)
             except SingularMatrixError as error:
-                raise undetermined(int(problem.free[error.variable])) from error
+                raise self._undetermined(error, problem) from error
             self._factor_is_now = True
         return problem
 
@@ -242,9 +274,25 @@ class PoseGraph:
         """The least-squares problem; built anew after the graph has grown."""
         if self._problem is None:
             fixed = self.fixed
-            check_connected(self.edges, fixed)
+            check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
+
+    def _undetermined(self, error: SingularMatrixError, problem: BetweenProblem) -> InputError:
+        """The error for poses that their edges leave free, or as good as free."""
+        pose = int(problem.free[error.variable])
+        free = self.free_poses() or (FreePose(int(self.names[pose]), ("next to no information",)),)
+        return InputError(
+            f"pose graph: {free_text(free)};"
+            " give their edges full information matrices, fix them or leave them out"
+        )
+
+    def _in_force(self, chi2: NDArray[np.float64]) -> float:
+        """The sum of w χ² over the edges in force, of χ² (E,)."""
+        return float((self.weight * chi2)[~self.is_rejected].sum())
+
+    def _degrees_of_freedom(self, problem: BetweenProblem) -> int:
+        return max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0)
 
     def _order(self) -> NDArray[np.int64]:
         """Edges with odometry first, otherwise as they were added."""

@@ -53,7 +53,7 @@ class RobustLoss:
         """ρ(χ²), equal to χ² near zero."""
         s2 = self.scale**2
         if self.kernel == "huber":
-            return np.where(chi2 <= s2, chi2, 2.0 * self.scale * np.sqrt(chi2) - s2)
+            return np.where(chi2 <= s2, chi2, 2.0 * self.scale * np.sqrt(np.maximum(chi2, s2)) - s2)
         if self.kernel == "cauchy":
             return s2 * np.log1p(chi2 / s2)
         if self.kernel == "geman-mcclure":
@@ -97,7 +97,7 @@ class RobustLoss:
         s2, mu = self.scale**2, self.control
         if np.isinf(mu):
             return np.minimum(chi2, s2)
-        middle = 2.0 * self.scale * np.sqrt(mu * (mu + 1.0) * chi2) - mu * (s2 + chi2)
+        middle = 2.0 * self.scale * np.sqrt(mu * (mu + 1.0) * np.maximum(chi2, 0.0)) - mu * (s2 + chi2)
         return np.where(chi2 <= mu / (mu + 1.0) * s2, chi2, np.where(chi2 >= (mu + 1.0) / mu * s2, s2, middle))
 
 

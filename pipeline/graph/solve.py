@@ -10,22 +10,19 @@ from numpy.typing import NDArray
 from pipeline.config import GraphConfig
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.estimate import Minimum
 from pipeline.graph.graduation import Judgement, minimise
 from pipeline.graph.initialise import Initialisation, first_guess
 from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import rejection_limit, robust_loss
-from pipeline.graph.soundness import undetermined
+from pipeline.graph.robust import robust_loss
 
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """Poses (K, d+1, d+1) of the minimum, the minimum itself, rejected loop edges (E,), and whence it began."""
+    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and whence it began."""
 
     poses: Matrix
     minimum: Minimum
-    rejected: NDArray[np.bool_]
     initialisation: Initialisation
 
 
@@ -37,24 +34,22 @@ def solve(
     initialise: Initialisation,
     judgement: Judgement,
 ) -> Solved:
-    """Minimise from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss."""
+    """Minimise from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
+
+    Raises SingularMatrixError where the edges leave a pose free, and the optimiser minds.
+    """
     trusted = config.robust == "none" or not is_loop.any()
     guess, source = first_guess(problem, poses, initialise, trusted=trusted)
     shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     minimiser = Minimiser(problem, is_loop, config.optimiser)
-    try:
-        minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance, judgement)
-    except SingularMatrixError as error:
-        raise undetermined(int(problem.free[error.variable])) from error
+    minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance, judgement)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
     found[fixed] = poses[fixed]
-    limit = np.inf if config.robust == "none" else rejection_limit(config.robust_scale, problem.freedom)
-    rejected = is_loop & ((minimum.weights == 0.0) | (minimum.estimate.chi2 > limit))
-    return Solved(found, minimum, rejected, source)
+    return Solved(found, minimum, source)
 
 
 def _orthonormal(poses: Matrix) -> Matrix:

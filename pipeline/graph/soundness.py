@@ -11,6 +11,7 @@ from pipeline.data import Matrix
 from pipeline.errors import InputError
 from pipeline.kernels.graph_soundness import judge_matrices
 
+_NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
 
 
@@ -37,37 +38,50 @@ def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     return result
 
 
-def check_connected(
-    edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64] | None = None
-) -> None:
+def nearest_semidefinite(information: Matrix) -> Matrix:
+    """The positive semidefinite matrix nearest to each symmetric one (E, k, k), V max(Λ, 0) Vᵀ (Higham 1988)."""
+    values, vectors = np.linalg.eigh(information)
+    projected = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return 0.5 * (projected + np.swapaxes(projected, 1, 2))
+
+
+def ranks(information: Matrix) -> NDArray[np.int64]:
+    """Rank of each of the positive semidefinite matrices (E, k, k), whatever their units, (E,)."""
+    k = information.shape[-1]
+    diagonal = np.einsum("eaa->ea", information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    correlation = scale[:, :, None] * information * scale[:, None, :]
+    is_full = np.empty(len(information), np.bool_)
+    judge_matrices(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
+    result = np.full(len(information), k, np.int64)
+    result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
+    return result
+
+
+def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
     """Refuse a graph with poses that no chain of edges joins to a fixed one; ``names`` (K,) are the poses'."""
     if not len(fixed):
         raise InputError("the pose graph has no poses; add some before optimising")
-    n, loose = len(fixed), _loose(edges, fixed)
-    if len(loose):
-        called = loose if names is None else names[loose]
-        listed = ", ".join(map(str, called[:8].tolist())) + (", ..." if len(loose) > 8 else "")
+    apart = loose(edges, fixed)
+    if len(apart):
         raise InputError(
-            f"pose graph: {len(loose)} of {n} poses are not joined to a fixed one: {listed};"
-            " add edges to them or fix one of them"
+            f"pose graph: {len(apart)} of {len(fixed)} poses are not joined to a fixed one:"
+            f" {listed(names[apart])}; add edges to them whose information is not zero, or fix one of them"
         )
 
 
 def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
     """Whether a chain of these edges joins every pose to a fixed one."""
-    return not len(_loose(edges, fixed))
+    return not len(loose(edges, fixed))
 
 
-def _loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Poses that no chain of edges joins to a fixed one."""
     links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(fixed), len(fixed)))
     _, part = connected_components(links, directed=False)
     return np.flatnonzero(~np.isin(part, part[fixed]))
 
 
-def undetermined(pose: int) -> InputError:
-    """The error for a pose that its edges leave free in some direction."""
-    return InputError(
-        f"pose graph: the edges leave pose {pose} free in some direction (singular information);"
-        " give its edges full information matrices, or use levenberg-marquardt"
-    )
+def listed(names: NDArray[np.int64]) -> str:
+    """The first of these names, for people."""
+    return ", ".join(map(str, names[:8].tolist())) + (", ..." if len(names) > 8 else "")

@@ -126,7 +126,8 @@ class _Model:
         try:
             return self._solver.solve(self._problem.damped(self._system, damping * self.diagonal)).x
         except UndeterminedError as error:
-            raise SingularMatrixError(int(error.columns[0])) from error
+            column = int(error.columns[0])
+            raise SingularMatrixError(column, column) from error
 
     def bend(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
         return self._system.A.T @ (self._system.A @ step)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from pipeline.data import State, Trajectory, Verdict
+from pipeline.data import State, Trajectory, Verdict, fit_text
 from pipeline.errors import InputError
 from pipeline.evaluate import absolute_error_on_any_course, kitti_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
@@ -48,7 +48,8 @@ class GroundTruth(Struct, frozen=True):
 class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
-    Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
+    Of the closures tried, some were verified by matching; of those the optimised graph accepted some and rejected
+    the others. ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     """
 
     scans: int
@@ -67,9 +68,11 @@ class Metrics(Struct, frozen=True):
     closures_tried: int
     closures_verified: int
     closures_accepted: int
+    closures_rejected: int
     map_points: int
     moving_points_removed: int
     chi2: float
+    degrees_of_freedom: int
     median_ms: dict[str, float]
     p95_ms: dict[str, float]
     median_inlier_share: float
@@ -81,6 +84,11 @@ class Metrics(Struct, frozen=True):
     def residual(self) -> str:
         """Of matching, in words."""
         return "–" if self.median_residual_m is None else f"{1e3 * self.median_residual_m:.1f} mm"
+
+    @property
+    def fit(self) -> str:
+        """Of the pose graph, in words."""
+        return fit_text(self.chi2, self.degrees_of_freedom, self.closures_rejected)
 
     def write(self, path: Path) -> None:
         """Write as JSON; what is not finite becomes null."""
@@ -120,9 +128,11 @@ def measure(
         closures_tried=len(judged),
         closures_verified=sum(item.closure.verdict is Verdict.ACCEPTED for item in judged),
         closures_accepted=sum(item.verdict is Verdict.ACCEPTED for item in judged),
+        closures_rejected=sum(item.verdict is not item.closure.verdict for item in judged),
         map_points=len(cloud.points),
         moving_points_removed=cloud.removed,
         chi2=result.state.chi2,
+        degrees_of_freedom=result.state.degrees_of_freedom,
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
         median_inlier_share=float(np.median([match.inlier_share for match in matches])),
@@ -150,7 +160,8 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"{m.lost:,} lost{dropped}",
         f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
         f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
-        f"accepted; chi2 {m.chi2:.4g}",
+        "accepted",
+        f"pose graph     {m.fit}",
         f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {m.median_iterations:.0f} iterations (medians)",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import Config, MapsConfig
 from pipeline.data import Points, Pose
-from pipeline.graph.g2o_write import write_g2o
+from pipeline.graph.g2o_write import rejected_path, write_g2o
 from pipeline.maps import (
     OccupancyGrid,
     View,
@@ -30,6 +30,8 @@ from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_kitti, write_tum
 
+GRAPH_FILE = "graph.g2o"  # what is in force; rejected edges stand in graph_rejected.g2o, if there are any
+
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
@@ -46,7 +48,9 @@ def write_results(
     write_tum(folder / "trajectory.tum", result.trajectory)
     write_tum(folder / "odometry.tum", result.odometry)
     write_kitti(folder / "trajectory.kitti.txt", result.trajectory)
-    write_g2o(folder / "graph.g2o", result.graph)
+    write_g2o(folder / GRAPH_FILE, result.graph)
+    if result.graph.is_rejected.any():
+        write_g2o(rejected_path(folder / GRAPH_FILE), result.graph, edges="rejected")
     indices = np.arange(len(result.trajectory), dtype=np.int64)
     recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
     recording.log_closures([replace(item.closure, verdict=item.verdict) for item in judged], result.state)

@@ -6,9 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.data import Closure, GraphState, Verdict
-
-_REJECTED_WEIGHT = 0.1  # robust weight below which an edge has no say
+from pipeline.data import REJECTED_WEIGHT, Closure, GraphState, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +31,9 @@ def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Judg
         verdict, reason, weight, chi2 = closure.verdict, closure.reason, 0.0, float("nan")
         if verdict is Verdict.ACCEPTED:
             weight, chi2 = edges[closure.target, closure.source].popleft()
-            if weight < _REJECTED_WEIGHT:
+            if weight < REJECTED_WEIGHT:
                 verdict = Verdict.REJECTED
-                reason = f"contradicts the rest of the graph: robust weight {weight:.3f} < {_REJECTED_WEIGHT}"
+                reason = f"contradicts the rest of the graph, χ² {chi2:.4g}"
         judged.append(JudgedClosure(closure, verdict, reason, weight, chi2))
     return tuple(judged)
 
