@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pipeline import lie
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
 from pipeline.errors import InputError
+from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
 from viz.recording import Recording
 
@@ -89,8 +91,8 @@ def graph_of(steps, last_keyframe):
     )
 
 
-def record(path, steps, dimension, sinks=("save",), config=None, **ports):
-    """The recording after its end, with results of every kind."""
+def record(path, steps, dimension, sinks=("save",), config=None, final=None, **ports):
+    """The recording after its end, with results of every kind; the last graph of the steps is the final one."""
     config = config or RecordingConfig()
     recording = Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
     with recording:
@@ -99,8 +101,9 @@ def record(path, steps, dimension, sinks=("save",), config=None, **ports):
         poses = np.array([step.T_world_lidar for step in steps])
         stamps_ns = np.array([step.scan.stamp_ns for step in steps])
         recording.log_trajectory(stamps_ns, poses, np.arange(len(steps)))
-        graphs = [step.graph for step in steps if step.graph is not None]
-        recording.log_closures([closure for step in steps for closure in step.closures], graphs[-1])
+        graphs = [*(step.graph for step in steps if step.graph is not None), *([final] if final else [])]
+        closures = [closure for step in steps for closure in step.closures]
+        recording.log_closures(final_verdicts(closures, graphs[-1]), graphs[-1])
         if dimension == 2:
             recording.log_grid(np.full((30, 40), -1, np.int8), resolution_m=0.05, origin_m=(-1.0, -0.75))
         recording.log_map(np.concatenate([lie.transform(step.T_world_lidar, step.points) for step in steps]))
@@ -192,7 +195,42 @@ def test_states_are_recorded_where_they_change_and_say_why(tmp_path):
     assert states == [["ok"], ["degenerate"], ["lost"], ["ok"]]
     texts = [row[0] for row in column(tmp_path / "a.rrd", entities.EVENTS, "TextLog:text")]
     assert "lost: a reason" in texts
-    assert "closure 0 to 4 accepted: looked alike" in texts
+    assert "closure 1 (0 to 4) accepted: looked alike" in texts
+
+
+def test_what_the_back_end_rejects_and_accepts_again_is_told_when_it_does_so(tmp_path):
+    steps = drive(60, 2)
+    weights = {20: [0.05], 40: [0.9, 0.9]}  # of the closures of keyframes 4 and 8, as the steps optimize them
+    for i, weight in weights.items():
+        steps[i] = replace(steps[i], graph=weighed(steps[i].graph, weight))
+    record(tmp_path / "a.rrd", steps, 2, final=weighed(steps[40].graph, [0.9, 0.0]))
+    events = list(zip(*(column(tmp_path / "a.rrd", entities.EVENTS, name) for name in ("scan", "TextLog:text")),
+                      strict=True))  # fmt: skip
+    contradicts = "contradicts the rest of the graph: robust weight"
+    assert [(scan, text) for scan, (text,) in events if text.startswith("closure")] == [
+        (10, "closure 0 (0 to 2) rejected: looked alike"),
+        (20, "closure 1 (0 to 4) accepted: looked alike"),
+        (20, f"closure 1 (0 to 4) rejected: {contradicts} 0.050 < 0.1"),
+        (30, "closure 2 (0 to 6) rejected: looked alike"),
+        (40, "closure 3 (0 to 8) accepted: looked alike"),
+        (40, "closure 1 (0 to 4) accepted: looked alike"),
+        (50, "closure 4 (0 to 10) rejected: looked alike"),
+        (59, f"closure 3 (0 to 8) rejected: {contradicts} 0.000 < 0.1"),
+    ]
+    counts = list(zip(*(column(tmp_path / "a.rrd", entities.LOOPS, name) for name in ("scan", "Scalars:scalars")),
+                      strict=True))  # fmt: skip
+    told = [(0, 0, 0), (10, 0, 1), (20, 0, 2), (30, 0, 3), (40, 2, 2), (50, 2, 3), (59, 1, 4)]
+    assert counts == [(scan, [accepted, rejected]) for scan, accepted, rejected in told]
+    for entity, edges in ((entities.ACCEPTED, 1), (entities.REJECTED, 4)):
+        assert len(column(tmp_path / "a.rrd", entity, "LineStrips3D:strips")[-1]) == edges
+        assert column(tmp_path / "a.rrd", entity, "scan")[-1] == 59
+
+
+def weighed(graph, weights):
+    """The graph with these robust weights of its loop edges."""
+    weight = graph.weight.copy()
+    weight[graph.is_loop] = weights
+    return replace(graph, weight=weight)
 
 
 def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_amber(tmp_path):
@@ -387,10 +425,8 @@ print(record(Path(sys.argv[1]), drive(300, 3, points=8000), 3).warnings)
 
 
 def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
-    import dataclasses
-
     steps = drive(60, 2)
-    steps[30] = dataclasses.replace(steps[30], T_world_lidar=np.eye(7))
+    steps[30] = replace(steps[30], T_world_lidar=np.eye(7))
     recording = Recording(
         tmp_path / "a.rrd", dimension=2, name="t", sinks=frozenset({"save"}), config=RecordingConfig()
     )

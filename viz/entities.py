@@ -35,6 +35,7 @@ INLIER_SHARE = "plots/inlier_share"
 RESIDUAL = "plots/residual"
 OBSERVABILITY = "plots/observability"
 ITERATIONS = "plots/iterations"
+LOOPS = "plots/loops"
 STATE = "state"
 EVENTS = "events"
 LEGEND = "legend"
@@ -112,8 +113,16 @@ def _series() -> list[Message]:
     return [
         Message(TIME, rr.SeriesLines(names=stages, colors=colours)),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),
+        Message(LOOPS, _steps(["accepted", "rejected"], [GREEN, RED])),
         Message(STATE, states),
     ]
+
+
+def _steps(names: list[str], colours: list[tuple[int, int, int]]) -> rr.SeriesLines:
+    """Series that hold their value until the next."""
+    return rr.SeriesLines(
+        names=names, colors=colours, interpolation_mode=rr.components.InterpolationMode.StepAfter
+    )
 
 
 def pixels(radius: float) -> float:
