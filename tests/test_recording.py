@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from pipeline import lie
@@ -17,6 +18,7 @@ from pipeline.data import Closure, GraphState, Match, Scan, State, Step, Timing,
 from pipeline.errors import InputError
 from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
+from viz.blueprint import blueprint
 from viz.recording import Recording
 
 START_NS = 976_052_857_000_000_000
@@ -350,6 +352,7 @@ from pathlib import Path
 from test_recording import drive, free_port
 from pipeline.config import RecordingConfig
 from viz import sinks, viewer
+from viz.blueprint import blueprint
 from viz.recording import Recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
@@ -390,6 +393,7 @@ import os, signal, sys, time
 from pathlib import Path
 from test_recording import drive
 from pipeline.config import RecordingConfig
+from viz.blueprint import blueprint
 from viz.recording import Recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
@@ -454,3 +458,24 @@ def test_without_sinks_nothing_is_kept_and_nothing_written(tmp_path):
 def test_a_blueprint_lies_in_the_file(tmp_path):
     record(tmp_path / "a.rrd", drive(60, 2), 2)
     assert RrdReader(str(tmp_path / "a.rrd")).blueprints()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_viewer_opens_on_observability_residual_and_loops_and_times_stand_behind(dimension):
+    _, side = blueprint(dimension).root_container.contents
+    *plots, state, tabs = side.contents
+    assert [view.origin for view in plots] == [entities.OBSERVABILITY, entities.RESIDUAL, entities.LOOPS]
+    assert state.origin == entities.STATE
+    assert isinstance(tabs, rrb.Tabs) and tabs.active_tab is None  # the first is
+    origins = [view.origin for view in tabs.contents]
+    assert origins[0] == entities.LEGEND and entities.TIME in origins
+
+
+def test_the_legend_has_no_table_whose_lines_the_viewer_would_cut_off(tmp_path):
+    record(tmp_path / "a.rrd", drive(60, 2), 2)
+    texts = [
+        chunk.to_record_batch().column("TextDocument:text")[0].as_py()[0]
+        for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()
+        if chunk.entity_path == f"/{entities.LEGEND}"
+    ]
+    assert len(texts) == 1 and "red edges" in texts[0] and "|" not in texts[0]
