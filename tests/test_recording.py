@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from killing import same_recording
 from rerun.chunk import RrdReader
 
 from pipeline import lie
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
 from pipeline.errors import InputError
+from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
 from viz.blueprint import blueprint
@@ -438,6 +440,60 @@ def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
         for step in steps:
             recording.log(step)
     assert recording.warnings and "the recording lacks something" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_path, dimension):
+    steps, port = drive(300, dimension), free_port()
+    whole, begun, again = (tmp_path / name for name in ("whole.rrd", "begun.rrd", "again.rrd"))
+    options = {"dimension": dimension, "name": "test", "config": RecordingConfig(local_map_every=2)}
+    closures = [closure for step in steps for closure in step.closures]
+    last = next(step for step in reversed(steps[:200]) if step.graph is not None)
+    rows = rows_of_steps(steps[: last.scan.index + 1])
+
+    def finish(recording, rest):
+        for step in rest:
+            recording.log(step)
+        recording.log_closures(final_verdicts(closures, steps[280].graph), steps[280].graph)
+        recording.log_map(np.concatenate([step.points for step in steps]))
+
+    with Recording(whole, sinks=frozenset({"save"}), **options) as recording:
+        finish(recording, steps)
+    with Recording(begun, sinks=frozenset({"save"}), **options) as recording:
+        for step in steps[: len(rows)]:
+            recording.log(step)
+        secured = recording.secure()
+        finish(recording, steps[len(rows) : 250])  # what a process records that is killed after its checkpoint
+    os.truncate(begun, secured)
+    server = viewer.start_web(port, free_port())
+    try:
+        with Recording(again, sinks=frozenset({"save", "connect"}), port=port, **options) as recording:
+            known = [closure for step in steps[: len(rows)] for closure in step.closures]
+            recording.go_on(begun, rows, known, last.graph)
+            finish(recording, steps[len(rows) :])
+    finally:
+        viewer.stop(server)
+    assert recording.warnings == []
+    same_recording(again, whole)
+
+
+def rows_of_steps(steps):
+    table = StepTable()
+    return [table.append(step) for step in steps]
+
+
+def test_what_lacks_something_is_not_secured(tmp_path):
+    without = Recording(None, dimension=2, name="t", sinks=frozenset(), config=RecordingConfig())
+    with without as recording:
+        assert recording.secure() == 0
+    steps, saved = drive(21, 2), frozenset({"save"})
+    with Recording(tmp_path / "a.rrd", dimension=2, name="t", sinks=saved, config=RecordingConfig()) as recording:
+        recording.log(steps[0])
+        assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
+        (tmp_path / "b.rrd").write_bytes(b"no recording")
+        recording.go_on(tmp_path / "b.rrd", rows_of_steps(steps), [], steps[20].graph)
+        assert recording.secure() == 0
+    assert "a.rrd is incomplete, the run goes on without it" in recording.warnings[0]
 
 
 def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
