@@ -8,6 +8,7 @@ import tomllib
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 from scenes import ROOT
@@ -15,9 +16,10 @@ from scenes import ROOT
 from pipeline.graph.g2o import read_g2o
 from pipeline.maps import read_map, read_ply
 from pipeline.runs.checkpoint import read_checkpoint
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.trajectory import read_kitti, read_tum
+from viz import entities
 
 _KILLS_A_RUN = 3  # then it may go on to its end
 COLUMNS = ["index", "stamp_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "odom_x", "odom_qz", "covariance", "state",
@@ -56,8 +58,32 @@ def same_result(a, b):
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
     tables = [pq.read_table(folder / "steps.parquet", columns=COLUMNS) for folder in (a, b)]
     assert tables[0].equals(tables[1])
-    assert {path.name for path in b.iterdir()} <= {path.name for path in a.iterdir()}
-    assert not list(a.glob("*.new"))
+    names_a, names_b = ({path.name for path in folder.iterdir()} for folder in (a, b))
+    assert names_a - {RECORDING_FILE} == names_b - {RECORDING_FILE}
+    if RECORDING_FILE in names_a & names_b:
+        same_recording(a / RECORDING_FILE, b / RECORDING_FILE)
+
+
+def same_recording(a, b):
+    """Every component of every entity holds the same at the same moments; what was measured by the clock aside."""
+    recorded = [_recorded(path) for path in (a, b)]
+    assert recorded[0].keys() == recorded[1].keys()
+    for key, values in recorded[0].items():
+        others = recorded[1][key]
+        is_equal = values.equals(others) or repr(values.to_pylist()) == repr(others.to_pylist())  # a NaN is none
+        assert is_equal, f"{key}: {len(values)} rows, {len(others)} rows"
+
+
+def _recorded(path):
+    """Columns of a recording by entity and name, row by row as written; of what never changes, the last."""
+    columns = {}
+    for chunk in RrdReader(str(path)).stream():
+        batch, entity = chunk.to_record_batch(), chunk.entity_path.lstrip("/")
+        for name in () if entity in ("__properties", entities.TIME) else batch.schema.names:
+            if not name.endswith("RowId"):
+                columns.setdefault((entity, chunk.is_static, name), []).append(batch.column(name))
+    arrays = {key: pa.chunked_array(parts) for key, parts in columns.items()}
+    return {key: rows[-1:] if key[1] else rows for key, rows in arrays.items()}
 
 
 def assert_readable(folder):

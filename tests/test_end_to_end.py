@@ -389,6 +389,24 @@ def test_the_recorded_poses_are_those_of_the_trajectories(drive):
     assert [inliers[i][0] for i in range(len(steps["index"]))] == steps["inliers"].tolist()
 
 
+def test_events_edges_counts_and_the_table_agree_on_the_verdict_of_every_closure(drive):
+    path, table = drive.folder / "recording.rrd", drive.table("loops").to_pylist()
+    said = {}
+    for (text,) in column(path, entities.EVENTS, "TextLog:text"):
+        if found := re.match(r"closure (\d+) \((\d+) to (\d+)\) (accepted|rejected): (.+)", text):
+            said[int(found[1])] = (int(found[2]), int(found[3]), found[4], found[5])
+    rows = {
+        number: (row["target"], row["source"], row["verdict"], row["reason"]) for number, row in enumerate(table)
+    }
+    assert said == rows
+    accepted = sum(row["verdict"] == "accepted" for row in table)
+    counts = [accepted, len(table) - accepted]
+    assert column(path, entities.LOOPS, "Scalars:scalars")[-1] == counts
+    edges = [column(path, entity, "LineStrips3D:strips")[-1] for entity in (entities.ACCEPTED, entities.REJECTED)]
+    assert [len(strips) for strips in edges] == counts
+    assert drive.metrics["closures_accepted"] == accepted
+
+
 def optimised_strips(path):
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()

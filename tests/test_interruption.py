@@ -14,19 +14,22 @@ import pyarrow.parquet as pq
 import pytest
 from killing import assert_readable, kill_at_random, partial, same_result, start, steps_on_disk
 from scenes import ROOT, configured, shared_data
+from test_recording import column
 
 from pipeline.errors import InputError
 from pipeline.logs import open_log
 from pipeline.runs.checkpoint import _CLASSES, Checkpoints, read_checkpoint
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
 from pipeline.simulate import simulate
 from pipeline.slam import Slam
 from pipeline.trajectory import read_tum
+from viz import entities
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-RECORDED = ("--checkpoint", "0.2")
+LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
+RECORDED = (*LOOPING, "--checkpoint", "0.2")
 LIVELY = (*RECORDED, "--rerun", "off")
 
 
@@ -42,7 +45,7 @@ def office(tmp_path_factory):
 def whole(office, tmp_path_factory):
     """A run of it that nobody disturbed."""
     out = tmp_path_factory.mktemp("whole") / "run"
-    assert start(office, out, *LIVELY).wait() == 0
+    assert start(office, out, *RECORDED).wait() == 0
     return out
 
 
@@ -53,7 +56,7 @@ def undisturbed(request, office, whole, tmp_path_factory):
         return office, whole
     log, out = (tmp_path_factory.mktemp("town") / name for name in ("town.mcap", "run"))
     simulate("town", log, duration_s=18.0, sensor="vlp-16")
-    assert start(log, out, *LIVELY).wait() == 0
+    assert start(log, out, *RECORDED).wait() == 0
     return log, out
 
 
@@ -93,6 +96,69 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
     assert len(killed) == 6
 
 
+def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was_not(undisturbed, tmp_path):
+    log, whole = undisturbed
+    out, count = tmp_path / "run", len(read_tum(whole / "trajectory.tum"))
+    assert pq.read_table(whole / "loops.parquet").num_rows > 0
+    reached = []
+    for interruption, share in ((signal.SIGKILL, 0.3), (signal.SIGINT, 0.5), (signal.SIGKILL, 0.7)):
+        child = start(log, out, *RECORDED, "--resume")
+        while steps_on_disk(out) < share * count or not (partial(out) / CHECKPOINT_FILE).exists():
+            assert child.poll() is None
+        child.send_signal(interruption)
+        child.wait()
+        reached.append(read_checkpoint(partial(out)).scans)
+        assert (partial(out) / RECORDING_FILE).exists()
+    assert 0 < reached[0] < reached[1] <= reached[2] < count
+    assert start(log, out, *RECORDED, "--resume").wait() == 0
+    same_result(out, whole)
+
+
+@pytest.mark.parametrize(
+    "module, kind, method",
+    [("viz.recording", "Recording", "go_on"), ("pipeline.runs.checkpoint", "Checkpoints", "write")],
+)
+def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
+    office, whole, tmp_path, module, kind, method
+):
+    out = tmp_path / "run"
+    child = start(office, out, *RECORDED)
+    while steps_on_disk(out) < 100 or not (partial(out) / CHECKPOINT_FILE).exists():
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    dying = f"""
+import os, signal, sys
+from pipeline.__main__ import main
+from {module} import {kind}
+act = {kind}.{method}
+def dying(self, *values):
+    act(self, *values)
+    os.kill(os.getpid(), signal.SIGKILL)
+{kind}.{method} = dying
+sys.exit(main(sys.argv[1:]))
+"""
+    words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
+    assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
+    assert list(partial(out).glob("recording.part_*.rrd"))
+    assert start(office, out, *RECORDED, "--resume").wait() == 0
+    same_result(out, whole)
+
+
+def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, *LIVELY)
+    while steps_on_disk(out) < 150 or not (partial(out) / CHECKPOINT_FILE).exists():
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    assert start(office, out, *RECORDED, "--resume").wait() == 0
+    assert "the recording begins there" in (out / "summary.txt").read_text()
+    assert "the recording lacks something" not in (out / "summary.txt").read_text()
+    for entity, name in ((entities.KEYFRAMES, "Points3D:positions"), (entities.REJECTED, "LineStrips3D:strips")):
+        assert column(out / RECORDING_FILE, entity, name)[-1] == column(whole / RECORDING_FILE, entity, name)[-1]
+
+
 @pytest.mark.parametrize(
     "name, count, changes",
     [
@@ -115,7 +181,7 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         assert a.match.information.tobytes() == b.match.information.tobytes()
         if scan.index in breaks:
-            Checkpoints(tmp_path, 10.0, 0.0).write(broken)
+            Checkpoints(tmp_path, 10.0).write(broken)
             broken = read_checkpoint(tmp_path).slam
             broken.points.reopen(points_file)
     a, b = straight.finish(), broken.finish()
@@ -157,7 +223,7 @@ def test_every_step_is_on_disk_within_a_second(office, tmp_path):
 
 def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path):
     out = tmp_path / "run"
-    child = start(office, out, "--checkpoint", "1000", "--rerun", "off", stderr=subprocess.PIPE)
+    child = start(office, out, *LOOPING, "--checkpoint", "1000", "--rerun", "off", stderr=subprocess.PIPE)
     while steps_on_disk(out) < 30:
         assert child.poll() is None
     child.send_signal(signal.SIGINT)
@@ -172,7 +238,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path
 
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
     out = tmp_path / "run"
-    words = ["run", str(office), "--out", str(out), "--checkpoint", "0", "--rerun", "off"]
+    words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
     child = subprocess.Popen(
         [sys.executable, "-c", waiting_at(100), *words],
         cwd=ROOT,

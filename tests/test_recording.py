@@ -4,17 +4,23 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
+from killing import same_recording
 from rerun.chunk import RrdReader
 
 from pipeline import lie
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
 from pipeline.errors import InputError
+from pipeline.runs.step_table import StepTable
+from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
+from viz.blueprint import blueprint
 from viz.recording import Recording
 
 START_NS = 976_052_857_000_000_000
@@ -90,8 +96,8 @@ def graph_of(steps, last_keyframe):
     )
 
 
-def record(path, steps, dimension, sinks=("save",), config=None, **ports):
-    """The recording after its end, with results of every kind."""
+def record(path, steps, dimension, sinks=("save",), config=None, final=None, **ports):
+    """The recording after its end, with results of every kind; the last graph of the steps is the final one."""
     config = config or RecordingConfig()
     recording = Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
     with recording:
@@ -100,8 +106,9 @@ def record(path, steps, dimension, sinks=("save",), config=None, **ports):
         poses = np.array([step.T_world_lidar for step in steps])
         stamps_ns = np.array([step.scan.stamp_ns for step in steps])
         recording.log_trajectory(stamps_ns, poses, np.arange(len(steps)))
-        graphs = [step.graph for step in steps if step.graph is not None]
-        recording.log_closures([closure for step in steps for closure in step.closures], graphs[-1])
+        graphs = [*(step.graph for step in steps if step.graph is not None), *([final] if final else [])]
+        closures = [closure for step in steps for closure in step.closures]
+        recording.log_closures(final_verdicts(closures, graphs[-1]), graphs[-1])
         if dimension == 2:
             recording.log_grid(np.full((30, 40), -1, np.int8), resolution_m=0.05, origin_m=(-1.0, -0.75))
         recording.log_map(np.concatenate([lie.transform(step.T_world_lidar, step.points) for step in steps]))
@@ -193,7 +200,42 @@ def test_states_are_recorded_where_they_change_and_say_why(tmp_path):
     assert states == [["ok"], ["degenerate"], ["lost"], ["ok"]]
     texts = [row[0] for row in column(tmp_path / "a.rrd", entities.EVENTS, "TextLog:text")]
     assert "lost: a reason" in texts
-    assert "closure 0 to 4 accepted: looked alike" in texts
+    assert "closure 1 (0 to 4) accepted: looked alike" in texts
+
+
+def test_what_the_back_end_rejects_and_accepts_again_is_told_when_it_does_so(tmp_path):
+    steps = drive(60, 2)
+    weights = {20: [0.05], 40: [0.9, 0.9]}  # of the closures of keyframes 4 and 8, as the steps optimize them
+    for i, weight in weights.items():
+        steps[i] = replace(steps[i], graph=weighed(steps[i].graph, weight))
+    record(tmp_path / "a.rrd", steps, 2, final=weighed(steps[40].graph, [0.9, 0.0]))
+    events = list(zip(*(column(tmp_path / "a.rrd", entities.EVENTS, name) for name in ("scan", "TextLog:text")),
+                      strict=True))  # fmt: skip
+    contradicts = "contradicts the rest of the graph: robust weight"
+    assert [(scan, text) for scan, (text,) in events if text.startswith("closure")] == [
+        (10, "closure 0 (0 to 2) rejected: looked alike"),
+        (20, "closure 1 (0 to 4) accepted: looked alike"),
+        (20, f"closure 1 (0 to 4) rejected: {contradicts} 0.050 < 0.1"),
+        (30, "closure 2 (0 to 6) rejected: looked alike"),
+        (40, "closure 3 (0 to 8) accepted: looked alike"),
+        (40, "closure 1 (0 to 4) accepted: looked alike"),
+        (50, "closure 4 (0 to 10) rejected: looked alike"),
+        (59, f"closure 3 (0 to 8) rejected: {contradicts} 0.000 < 0.1"),
+    ]
+    counts = list(zip(*(column(tmp_path / "a.rrd", entities.LOOPS, name) for name in ("scan", "Scalars:scalars")),
+                      strict=True))  # fmt: skip
+    told = [(0, 0, 0), (10, 0, 1), (20, 0, 2), (30, 0, 3), (40, 2, 2), (50, 2, 3), (59, 1, 4)]
+    assert counts == [(scan, [accepted, rejected]) for scan, accepted, rejected in told]
+    for entity, edges in ((entities.ACCEPTED, 1), (entities.REJECTED, 4)):
+        assert len(column(tmp_path / "a.rrd", entity, "LineStrips3D:strips")[-1]) == edges
+        assert column(tmp_path / "a.rrd", entity, "scan")[-1] == 59
+
+
+def weighed(graph, weights):
+    """The graph with these robust weights of its loop edges."""
+    weight = graph.weight.copy()
+    weight[graph.is_loop] = weights
+    return replace(graph, weight=weight)
 
 
 def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_amber(tmp_path):
@@ -313,6 +355,7 @@ from pathlib import Path
 from test_recording import drive, free_port
 from pipeline.config import RecordingConfig
 from viz import sinks, viewer
+from viz.blueprint import blueprint
 from viz.recording import Recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
@@ -353,6 +396,7 @@ import os, signal, sys, time
 from pathlib import Path
 from test_recording import drive
 from pipeline.config import RecordingConfig
+from viz.blueprint import blueprint
 from viz.recording import Recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
@@ -388,10 +432,8 @@ print(record(Path(sys.argv[1]), drive(300, 3, points=8000), 3).warnings)
 
 
 def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
-    import dataclasses
-
     steps = drive(60, 2)
-    steps[30] = dataclasses.replace(steps[30], T_world_lidar=np.eye(7))
+    steps[30] = replace(steps[30], T_world_lidar=np.eye(7))
     recording = Recording(
         tmp_path / "a.rrd", dimension=2, name="t", sinks=frozenset({"save"}), config=RecordingConfig()
     )
@@ -399,6 +441,60 @@ def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
         for step in steps:
             recording.log(step)
     assert recording.warnings and "the recording lacks something" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_path, dimension):
+    steps, port = drive(300, dimension), free_port()
+    whole, begun, again = (tmp_path / name for name in ("whole.rrd", "begun.rrd", "again.rrd"))
+    options = {"dimension": dimension, "name": "test", "config": RecordingConfig(local_map_every=2)}
+    closures = [closure for step in steps for closure in step.closures]
+    last = next(step for step in reversed(steps[:200]) if step.graph is not None)
+    rows = rows_of_steps(steps[: last.scan.index + 1])
+
+    def finish(recording, rest):
+        for step in rest:
+            recording.log(step)
+        recording.log_closures(final_verdicts(closures, steps[280].graph), steps[280].graph)
+        recording.log_map(np.concatenate([step.points for step in steps]))
+
+    with Recording(whole, sinks=frozenset({"save"}), **options) as recording:
+        finish(recording, steps)
+    with Recording(begun, sinks=frozenset({"save"}), **options) as recording:
+        for step in steps[: len(rows)]:
+            recording.log(step)
+        secured = recording.secure()
+        finish(recording, steps[len(rows) : 250])  # what a process records that is killed after its checkpoint
+    os.truncate(begun, secured)
+    server = viewer.start_web(port, free_port())
+    try:
+        with Recording(again, sinks=frozenset({"save", "connect"}), port=port, **options) as recording:
+            known = [closure for step in steps[: len(rows)] for closure in step.closures]
+            recording.go_on(begun, rows, known, last.graph)
+            finish(recording, steps[len(rows) :])
+    finally:
+        viewer.stop(server)
+    assert recording.warnings == []
+    same_recording(again, whole)
+
+
+def rows_of_steps(steps):
+    table = StepTable()
+    return [table.append(step) for step in steps]
+
+
+def test_what_lacks_something_is_not_secured(tmp_path):
+    without = Recording(None, dimension=2, name="t", sinks=frozenset(), config=RecordingConfig())
+    with without as recording:
+        assert recording.secure() == 0
+    steps, saved = drive(21, 2), frozenset({"save"})
+    with Recording(tmp_path / "a.rrd", dimension=2, name="t", sinks=saved, config=RecordingConfig()) as recording:
+        recording.log(steps[0])
+        assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
+        (tmp_path / "b.rrd").write_bytes(b"no recording")
+        recording.go_on(tmp_path / "b.rrd", rows_of_steps(steps), [], steps[20].graph)
+        assert recording.secure() == 0
+    assert "a.rrd is incomplete, the run goes on without it" in recording.warnings[0]
 
 
 def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
@@ -419,3 +515,24 @@ def test_without_sinks_nothing_is_kept_and_nothing_written(tmp_path):
 def test_a_blueprint_lies_in_the_file(tmp_path):
     record(tmp_path / "a.rrd", drive(60, 2), 2)
     assert RrdReader(str(tmp_path / "a.rrd")).blueprints()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_viewer_opens_on_observability_residual_and_loops_and_times_stand_behind(dimension):
+    _, side = blueprint(dimension).root_container.contents
+    *plots, state, tabs = side.contents
+    assert [view.origin for view in plots] == [entities.OBSERVABILITY, entities.RESIDUAL, entities.LOOPS]
+    assert state.origin == entities.STATE
+    assert isinstance(tabs, rrb.Tabs) and tabs.active_tab is None  # the first is
+    origins = [view.origin for view in tabs.contents]
+    assert origins[0] == entities.LEGEND and entities.TIME in origins
+
+
+def test_the_legend_has_no_table_whose_lines_the_viewer_would_cut_off(tmp_path):
+    record(tmp_path / "a.rrd", drive(60, 2), 2)
+    texts = [
+        chunk.to_record_batch().column("TextDocument:text")[0].as_py()[0]
+        for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()
+        if chunk.entity_path == f"/{entities.LEGEND}"
+    ]
+    assert len(texts) == 1 and "red edges" in texts[0] and "|" not in texts[0]

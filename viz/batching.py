@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
@@ -10,7 +11,9 @@ import rerun as rr
 
 from pipeline import lie
 from pipeline.data import Match, Matrix, State, Step
+from pipeline.runs.step_table import StepRow
 from viz import entities, shapes
+from viz.keyframe_graph import Verdicts
 from viz.messages import Message, Times
 
 _MAX_SCANS = 256
@@ -25,6 +28,7 @@ class Batcher:
 
     def __init__(self, dimension: int) -> None:
         self.steps: list[Step] = []
+        self.verdicts: list[Verdicts] = []  # of each step
         self.bytes = 0
         self.scans = 0
         self.points = 0
@@ -34,12 +38,23 @@ class Batcher:
         self.T_world_odom: Matrix = lie.identity(dimension)
         self.has_odom = False
         self.state: State | None = None
+        self.closures: tuple[int, int] | None = None
 
-    def add(self, step: Step) -> None:
-        """Take in one step."""
+    def restore(self, rows: Sequence[StepRow], verdicts: Verdicts) -> None:
+        """Restore the state after the steps of ``rows`` from the verdicts at that time."""
+        last = rows[-1]
+        self.scans, self.points = len(rows), sum(row.match.points for row in rows)
+        self._frame(shapes.positions(np.array([row.T_world_lidar for row in rows])))
+        self.T_odom_before = last.T_odom_lidar
+        self.has_odom, self.T_world_odom = True, last.T_world_lidar @ lie.inverse(last.T_odom_lidar)
+        self.state, self.closures = last.state, (verdicts.accepted, verdicts.rejected)
+
+    def add(self, step: Step, verdicts: Verdicts) -> None:
+        """Take in one step with the verdicts of that moment."""
         if not self.steps:
             self.started_s = perf_counter()
         self.steps.append(step)
+        self.verdicts.append(verdicts)
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
         self.scans += 1
@@ -56,6 +71,7 @@ class Batcher:
     def messages(self) -> list[Message]:
         """Everything the gathered steps say, scan by scan; the batch is empty afterwards."""
         steps, self.steps, self.bytes = self.steps, [], 0
+        verdicts, self.verdicts = self.verdicts, []
         if not steps:
             return []
         times = Times(
@@ -71,7 +87,15 @@ class Batcher:
             *self._trails(times, odom, world),
             *_matches([step.match for step in steps], times),
             Message(entities.TIME, _times_by_stage(steps), times),
-            *self._states(steps, times),
+            *self._judged(steps, verdicts, times),
+        ]
+
+    def settled(self, verdicts: Verdicts, times: Times) -> list[Message]:
+        """The verdicts after the last step, whose ``times`` these are; the numbers in any case, up to there."""
+        self.closures = None
+        return [
+            *_events([[(_INFORMATION, text) for text in verdicts.events]], times),
+            *self._counts([verdicts], times),
         ]
 
     def _frame(self, positions: shapes.Floats) -> None:
@@ -103,31 +127,41 @@ class Batcher:
             messages.append(Message(entities.ODOM, shapes.transforms(corrections[changed]), times[changed]))
         return messages
 
-    def _states(self, steps: list[Step], times: Times) -> list[Message]:
-        """The state where it changes, and as events why, with what became of the loop closures."""
+    def _judged(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
+        """The state where it changes, and as events why, with the verdicts on loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state
-        rows: list[int] = []
-        texts: list[str] = []
-        levels: list[str] = []
-        for row, step in enumerate(steps):
-            if changed[row] and step.state is not State.OK:
-                rows.append(row)
-                texts.append(f"{step.state}: {step.reason}")
-                levels.append(_WARNING)
-            for closure in step.closures:
-                rows.append(row)
-                texts.append(f"closure {closure.target} to {closure.source} {closure.verdict}: {closure.reason}")
-                levels.append(_INFORMATION)
-        messages = []
+        events: list[list[tuple[str, str]]] = []
+        for step, is_new, judged in zip(steps, changed, verdicts, strict=True):
+            why = [(_WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
+            events.append([*why, *((_INFORMATION, text) for text in judged.events)])
+        messages = [*_events(events, times), *self._counts(verdicts, times)]
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
             messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
-        if rows:
-            columns = rr.TextLog.columns(text=texts, level=levels)
-            messages.append(Message(entities.EVENTS, columns, times[np.array(rows)]))
         return messages
+
+    def _counts(self, verdicts: list[Verdicts], times: Times) -> list[Message]:
+        """How many closures are accepted and rejected, where that changes."""
+        counts = [(judged.accepted, judged.rejected) for judged in verdicts]
+        before = [self.closures, *counts[:-1]]
+        changed = np.array([now != then for now, then in zip(counts, before, strict=True)])
+        self.closures = counts[-1]
+        if not changed.any():
+            return []
+        columns = rr.Scalars.columns(scalars=np.array(counts, np.float64)[changed].reshape(-1))
+        return [Message(entities.LOOPS, columns.partition([2] * int(changed.sum())), times[changed])]
+
+
+def _events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
+    """The events of each row of ``times``, level and text."""
+    rows = [row for row, of_row in enumerate(events) for _ in of_row]
+    if not rows:
+        return []
+    levels, texts = zip(*(event for of_row in events for event in of_row), strict=True)
+    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
+    return [Message(entities.EVENTS, columns, times[np.array(rows)])]
 
 
 def _scans(steps: list[Step]) -> rr.ComponentColumnList:

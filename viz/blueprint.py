@@ -1,4 +1,4 @@
-"""How the viewer lays a recording out: the scene, the plots in tabs, the state over time."""
+"""How the viewer lays a recording out: the scene, how well it is known over time, everything else in tabs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,8 @@ from viz.shapes import Floats
 
 _PLAY_S = 30.0
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
-_PLOTS = {
-    "inliers": entities.INLIERS,
-    "inlier share": entities.INLIER_SHARE,
-    "residual": entities.RESIDUAL,
-    "observability": entities.OBSERVABILITY,
-    "iterations": entities.ITERATIONS,
-}
+_FIRST = {"log10 observability": entities.OBSERVABILITY, "residual [m]": entities.RESIDUAL}
+_BEHIND = {"inliers": entities.INLIERS, "inlier share": entities.INLIER_SHARE, "iterations": entities.ITERATIONS}
 
 
 def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.Blueprint:
@@ -28,22 +23,35 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     """
     whole = whole_log()
     ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
-    plots = rrb.Tabs(
-        rrb.TimeSeriesView(origin=entities.TIME, name="time by stage", axis_x=whole, axis_y=ordinary_ms),
-        *(rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole) for name, entity in _PLOTS.items()),
-    )
-    texts = rrb.Tabs(
+    tabs = rrb.Tabs(
         rrb.TextDocumentView(origin=entities.LEGEND, name="legend"),
         rrb.TextLogView(origin=entities.EVENTS, name="events"),
+        *_plots(_BEHIND),
+        rrb.TimeSeriesView(origin=entities.TIME, name="time", axis_x=whole, axis_y=ordinary_ms),
+    )
+    loops = rrb.TimeSeriesView(
+        origin=entities.LOOPS,
+        name="loop closures",
+        axis_x=whole,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),  # there are few at first
     )
     state = rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole)
-    side = rrb.Vertical(plots, state, texts, row_shares=[4, 1, 3])
+    side = rrb.Vertical(*_plots(_FIRST), loops, state, tabs, row_shares=[3, 3, 3, 2, 6])
     return rrb.Blueprint(
         rrb.Horizontal(_scene(dimension, box), side, column_shares=[5, 3]),
         time_panel(scans),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _plots(entity_by_name: dict[str, str]) -> list[rrb.TimeSeriesView]:
+    """Plots of one series each, which need no legend."""
+    hidden = rrb.PlotLegend(visible=False)
+    return [
+        rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole_log(), plot_legend=hidden)
+        for name, entity in entity_by_name.items()
+    ]
 
 
 def whole_log() -> rrb.TimeAxis:

@@ -35,6 +35,7 @@ INLIER_SHARE = "plots/inlier_share"
 RESIDUAL = "plots/residual"
 OBSERVABILITY = "plots/observability"
 ITERATIONS = "plots/iterations"
+LOOPS = "plots/loops"
 STATE = "state"
 EVENTS = "events"
 LEGEND = "legend"
@@ -50,22 +51,23 @@ _HEIGHT_COLOURS = np.array(
     [(50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230)], np.float64
 )
 
+# a list, since the viewer wraps its lines; those of a table it cuts off
 _LEGEND = f"""
-| drawn | is |
-|---|---|
-| yellow points | the scan, deskewed and downsampled, as it was matched |
-| grey points | the local map it was matched against |
-| orange line | the way by odometry alone: smooth, drifts |
-| blue line | the way as known at the time: each piece placed by the closures known then |
-| cyan line | the way after the last optimisation, over all scans |
-| violet dots, grey edges | keyframes and the odometry between them |
-| green edges | loop closures that were accepted; amber where the back end lowered their weight below ½ |
-| red edges | loop closures that were rejected |
-| violet ellipsoid | standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large |
+- **yellow points**: the scan, deskewed and downsampled, as it was matched
+- **gray points**: the local map it was matched against
+- **orange line**: trajectory by odometry alone; smooth, drifts
+- **blue line**: trajectory as known at the time, every scan placed by the closures known then
+- **cyan line**: trajectory after the last optimization, over all scans
+- **violet dots, gray edges**: keyframes and the odometry between them
+- **green edges**: accepted loop closures; amber where the back end lowered their weight below ½
+- **red edges**: loop closures that the matcher or, later, the back end rejected
+- **violet ellipsoid**: standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large
 
-Timelines: `scan` counts the scans in the order of the log, `sensor_time` is the header stamp, which may step back.
-Observability is how many times the least that it takes is known of the worst direction; below 1 (log10 below 0)
-a scan is degenerate.
+**Observability** is the information along the least constrained direction over the least that is required: below 1
+(log10 below 0) a scan is degenerate.
+
+**Timelines**: `scan` counts the scans in the order of the log, `sensor_time` is the header stamp, which may step
+back.
 """
 
 
@@ -112,8 +114,16 @@ def _series() -> list[Message]:
     return [
         Message(TIME, rr.SeriesLines(names=stages, colors=colours)),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),
+        Message(LOOPS, _steps(["accepted", "rejected"], [GREEN, RED])),
         Message(STATE, states),
     ]
+
+
+def _steps(names: list[str], colours: list[tuple[int, int, int]]) -> rr.SeriesLines:
+    """Series that hold their value until the next."""
+    return rr.SeriesLines(
+        names=names, colors=colours, interpolation_mode=rr.components.InterpolationMode.StepAfter
+    )
 
 
 def pixels(radius: float) -> float:

@@ -1,14 +1,18 @@
-"""The keyframe graph as it grows: nodes, odometry edges, loop closures by verdict."""
+"""The keyframe graph as it grows: nodes, odometry edges, loop closures by their latest verdict."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from pipeline.data import Closure, GraphState, Step, Verdict
+from pipeline.runs.step_table import StepRow
+from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from viz import entities, shapes
 from viz.messages import Message, Times
 
@@ -16,40 +20,62 @@ _GROWTH = 1.05  # drawn anew when it grew by this factor: the recording stays li
 _DOUBT = 0.5  # robust weight below which the back end disagrees with a closure's verdict
 
 
+@dataclass(frozen=True, slots=True)
+class Verdicts:
+    """Of a step: an event for each closure whose verdict is new, and how many are accepted and rejected since."""
+
+    events: Sequence[str]
+    accepted: int
+    rejected: int
+
+
 class KeyframeGraph:
-    """Feeds on steps; gives messages when the graph grew enough since it was drawn."""
+    """Takes in every step; tells the verdicts on closures, and draws the graph when it has grown enough."""
 
     def __init__(self) -> None:
         self.positions: list[NDArray[np.float32]] = []
-        self.closures: list[Closure] = []
+        self.judged: list[JudgedClosure] = []
         self.graph: GraphState | None = None
+        self.counts = (0, 0)
         self.drawn = 0
         self.is_current = True
-        self.times = Times.at(0, 0)
 
-    def add(self, step: Step) -> list[Message]:
-        """Take in a step; those without a keyframe may be left out."""
+    def add(self, step: Step) -> Verdicts:
+        """Take in a step; its closures are judged by the matcher first, then all of them by the back end."""
         if step.keyframe >= 0:
             self.positions.append(shapes.positions(step.T_world_lidar[None])[0])
             self.is_current = False
+        events: list[str] = []
         if step.closures:
-            self.closures.extend(step.closures)
-            self.is_current = False
+            events += self._judge([*self.judged, *(_as_found(closure) for closure in step.closures)])
         if step.graph is not None:
             self.graph = step.graph
-            self.is_current = False
-        if self.is_current:
-            return []
-        self.times = Times.at(step.scan.index, step.scan.stamp_ns)
-        return self.draw() if len(self.positions) > _GROWTH * self.drawn else []
+            events += self._judge(final_verdicts([item.closure for item in self.judged], step.graph))
+        return Verdicts(events, *self.counts)
 
-    def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[Message]:
-        """The final graph with every closure tried; drawn at the last scan."""
-        self.closures, self.graph = list(closures), graph
+    def settle(self, judged: Sequence[JudgedClosure], graph: GraphState) -> Verdicts:
+        """Take in the final graph with every closure tried."""
+        self.graph = graph
         self.is_current = False
-        return self.draw()
+        return Verdicts(self._judge(judged), *self.counts)
 
-    def draw(self) -> list[Message]:
+    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> Verdicts:
+        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
+        poses = np.array([row.T_world_lidar for row in rows if row.keyframe >= 0])
+        self.positions = list(shapes.positions(poses))
+        self.graph = graph
+        self._judge(final_verdicts(closures, graph))
+        for count in range(1, len(self.positions) + 1):
+            self.drawn = count if count > _GROWTH * self.drawn else self.drawn
+        self.is_current = self.drawn == len(self.positions)
+        return Verdicts((), *self.counts)
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether it is time to draw it."""
+        return len(self.positions) > _GROWTH * self.drawn
+
+    def draw(self, times: Times) -> list[Message]:
         """The graph as it is known, unless it is drawn already."""
         if self.is_current or not self.positions:
             return []
@@ -57,36 +83,44 @@ class KeyframeGraph:
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
-        accepted = [closure for closure in self.closures if closure.verdict is Verdict.ACCEPTED]
-        rejected = [closure for closure in self.closures if closure.verdict is Verdict.REJECTED]
-        colours = _colours(accepted, self.graph)
+        accepted = [item for item in self.judged if item.verdict is Verdict.ACCEPTED]
+        rejected = [item for item in self.judged if item.verdict is Verdict.REJECTED]
+        colours = [entities.ORANGE if item.weight < _DOUBT else entities.GREEN for item in accepted]
         return [
-            Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), self.times),
-            self._strips(entities.ODOMETRY_EDGES, nodes[None]),
-            self._strips(entities.ACCEPTED, _edges(nodes, accepted), colours),
-            self._strips(entities.REJECTED, _edges(nodes, rejected)),
+            Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), times),
+            _strips(entities.ODOMETRY_EDGES, nodes[None], times),
+            _strips(entities.ACCEPTED, _edges(nodes, accepted), times, colours),
+            _strips(entities.REJECTED, _edges(nodes, rejected), times),
         ]
 
-    def _strips(
-        self, entity: str, strips: NDArray[np.float32], colours: Sequence[tuple[int, int, int]] = ()
-    ) -> Message:
-        columns = [*rr.LineStrips3D.columns(strips=strips).partition([len(strips)])]
-        if colours:
-            columns += [*rr.LineStrips3D.columns(colors=list(colours)).partition([len(colours)])]
-        return Message(entity, rr.ComponentColumnList(columns), self.times)
+    def _judge(self, judged: Sequence[JudgedClosure]) -> list[str]:
+        """Keep the verdicts; a line for each that is new, the number being the closure's row in loops.parquet."""
+        before = [item.verdict for item in self.judged]
+        self.judged = list(judged)
+        counts = Counter(item.verdict for item in judged)
+        self.counts = (counts[Verdict.ACCEPTED], counts[Verdict.REJECTED])
+        return [
+            f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
+            for number, item in enumerate(judged)
+            if number >= len(before) or item.verdict is not before[number]
+        ]
 
 
-def _edges(nodes: NDArray[np.float32], closures: list[Closure]) -> NDArray[np.float32]:
+def _as_found(closure: Closure) -> JudgedClosure:
+    """By the matcher alone, before the graph has a say."""
+    return JudgedClosure(closure, closure.verdict, closure.reason, 1.0, float("nan"))
+
+
+def _strips(
+    entity: str, strips: NDArray[np.float32], times: Times, colours: Sequence[tuple[int, int, int]] = ()
+) -> Message:
+    columns = [*rr.LineStrips3D.columns(strips=strips).partition([len(strips)])]
+    if colours:
+        columns += [*rr.LineStrips3D.columns(colors=list(colours)).partition([len(colours)])]
+    return Message(entity, rr.ComponentColumnList(columns), times)
+
+
+def _edges(nodes: NDArray[np.float32], judged: list[JudgedClosure]) -> NDArray[np.float32]:
     """Line strips (E, 2, 3) between the keyframes of closures."""
-    pairs = np.array([(closure.target, closure.source) for closure in closures], np.int64).reshape(-1, 2)
+    pairs = np.array([(item.closure.target, item.closure.source) for item in judged], np.int64).reshape(-1, 2)
     return nodes[pairs]
-
-
-def _colours(closures: list[Closure], graph: GraphState | None) -> list[tuple[int, int, int]]:
-    """Green, or amber where the optimiser left an edge less than half of its weight."""
-    if graph is None:
-        return [entities.GREEN] * len(closures)
-    pairs, weights = graph.edges[graph.is_loop].tolist(), graph.weight[graph.is_loop].tolist()
-    weight = {(i, j): w for (i, j), w in zip(pairs, weights, strict=True)}
-    doubted = [weight.get((closure.target, closure.source), 1.0) < _DOUBT for closure in closures]
-    return [entities.ORANGE if doubt else entities.GREEN for doubt in doubted]

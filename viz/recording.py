@@ -20,6 +20,8 @@ from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
 from pipeline.errors import InputError
 from pipeline.runs.recorder import SinkName
+from pipeline.runs.step_table import StepRow
+from pipeline.runs.verdicts import JudgedClosure
 from viz import entities, shapes, viewer
 from viz.batching import Batcher
 from viz.blueprint import blueprint
@@ -59,16 +61,19 @@ class Recording:
         self.web_port = web_port
         self.web_address = ""
         self.sinks: list[Sink] = []
+        self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher(dimension)
         self.graph = KeyframeGraph()
+        self.now = Times.at(0, 0)
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
         recording_id = uuid4()
         if "save" in self.wanted and self.path is not None:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.sinks.append(file_sink(self.path, stream, blueprint(self.dimension)))
+            self.file = file_sink(self.path, stream, blueprint(self.dimension))
+            self.sinks.append(self.file)
         address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
         if address:
             stream = open_stream(self.name, self.dimension, recording_id)
@@ -86,12 +91,31 @@ class Recording:
         """What went wrong so far, a line each."""
         return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
 
+    def go_on(
+        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+    ) -> None:
+        """Go on after the steps of ``rows``, with all closures tried by then and the graph as it was.
+
+        before : the recording up to there, which is copied; without one, the recording begins here
+        """
+        self.now = Times.at(rows[-1].index, rows[-1].stamp_ns)
+        self._guard(lambda: self.batcher.restore(rows, self.graph.restore(rows, closures, graph)))
+        if before is not None:
+            for sink in self.sinks:
+                sink.send(before)
+        for sink in self.sinks:
+            sink.settle()
+
+    def secure(self) -> int:
+        """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
+        self._send(self.batcher.messages)
+        if self.path is None or self.file is None or not self.file.settle():
+            return 0
+        return self.path.stat().st_size
+
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        if not self.sinks:
-            return
-        self.batcher.add(step)
-        if step.keyframe >= 0 or step.graph is not None or self.batcher.is_due:
+        if self.sinks:
             self._send(lambda: self._step(step))
 
     def log_trajectory(
@@ -100,9 +124,9 @@ class Recording:
         """Record the way after optimisation: poses (N, d+1, d+1) of the scans ``indices``."""
         self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimised))
 
-    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
-        """Record the final graph and what became of every closure."""
-        self._send(lambda: self.graph.settle(closures, graph))
+    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
+        """Record the final graph and the final verdict on every closure, at the last scan."""
+        self._send(lambda: self._settled(judged, graph))
 
     def log_map(self, points: NDArray[np.floating]) -> None:
         """Record the finished map (N, d); thinned to a third of the points that the scans took."""
@@ -120,7 +144,7 @@ class Recording:
 
     def close(self) -> None:
         """Write what is gathered, frame the view, and let go of file and viewer; once is enough."""
-        self._send(lambda: [*self.batcher.messages(), *self.graph.draw()])
+        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(self.now)])
         layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
         for sink in self.sinks:
             sink.send(layout)
@@ -157,12 +181,19 @@ class Recording:
         return viewer.grpc_address(self.port)
 
     def _step(self, step: Step) -> list[Message]:
-        messages = self.graph.add(step)
+        self.now = Times.at(step.scan.index, step.scan.stamp_ns)
+        self.batcher.add(step, self.graph.add(step))
+        messages = self.graph.draw(self.now) if self.graph.has_grown else []
         if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
             columns = rr.Points3D.columns(positions=points).partition([len(points)])
-            messages.append(Message(entities.LOCAL_MAP, columns, Times.at(step.scan.index, step.scan.stamp_ns)))
+            messages.append(Message(entities.LOCAL_MAP, columns, self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
+
+    def _settled(self, judged: Sequence[JudgedClosure], graph: GraphState) -> list[Message]:
+        verdicts = self.graph.settle(judged, graph)
+        messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
+        return [*messages, *self.graph.draw(self.now)]
 
     def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
         path = shapes.positions(poses)

@@ -11,17 +11,23 @@ import contextlib
 import ctypes
 import queue
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter
 from uuid import UUID
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from pipeline.errors import InputError
 from viz.messages import Message
 
 _QUEUED_BATCHES = 16
+_COPIED_CHUNKS = 64  # that are in memory at a time when a recording is copied
+_LOOK_EVERY_S = 0.1
 _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
 
@@ -51,13 +57,19 @@ class Sink:
         self.is_lossless = is_lossless
         self.warnings: list[str] = []
         self.dropped = 0
+        self.flushes = 0
         self.lock = threading.Lock()
-        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | None] = queue.Queue(_QUEUED_BATCHES)
+        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | Path | threading.Event | None] = queue.Queue(
+            _QUEUED_BATCHES
+        )
         self.thread = threading.Thread(target=self._serve, name=f"recording to {name}", daemon=True)
         self.thread.start()
 
-    def send(self, item: list[Message] | rrb.Blueprint) -> None:
-        """Hand over a batch, or a blueprint to replace the one before; what goes wrong ends up in ``warnings``."""
+    def send(self, item: list[Message] | rrb.Blueprint | Path) -> None:
+        """Hand over a batch, a blueprint to replace the one before, or a recording whose rows are to be copied.
+
+        What goes wrong ends up in ``warnings``.
+        """
         if self.warnings:
             return
         try:
@@ -66,6 +78,20 @@ class Sink:
             self.dropped += 1
             if self.is_lossless:
                 self._give_up("it takes no more data")
+
+    def settle(self) -> bool:
+        """Wait until everything handed over is where it goes; whether it is."""
+        settled = threading.Event()
+        if not self.warnings:
+            with contextlib.suppress(queue.Full):
+                self.waiting.put(settled, timeout=self.patience_s)
+            flushes, since_s = self.flushes, perf_counter()
+            while not settled.wait(_LOOK_EVERY_S) and not self.warnings:
+                if flushes != self.flushes:
+                    flushes, since_s = self.flushes, perf_counter()
+                elif perf_counter() - since_s > self.patience_s:
+                    self._give_up("it takes no more data")
+        return not self.warnings
 
     def close(self) -> None:
         """Give it time to take the rest, then go on without it."""
@@ -82,15 +108,35 @@ class Sink:
         try:
             self.connect()
             while (item := self.waiting.get()) is not None:
-                if isinstance(item, list):
-                    for message in item:
-                        message.send(self.stream)
-                else:
-                    self.stream.send_blueprint(item)
-                self.stream.flush(timeout_sec=self.patience_s)
+                match item:
+                    case threading.Event():
+                        item.set()
+                        continue
+                    case Path():
+                        self._copy(item)
+                    case list():
+                        for message in item:
+                            message.send(self.stream)
+                    case _:
+                        self.stream.send_blueprint(item)
+                self._flush()
             self.stream.disconnect()
         except Exception as error:
             self._give_up(str(error))
+
+    def _copy(self, path: Path) -> None:
+        """Pass on a recording but for what is static, which is sent anew."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RerunWarning)  # what a killed process wrote lacks rerun's index
+            chunks = RrdReader(path).stream().filter(is_static=False)
+        for number, chunk in enumerate(chunks, start=1):
+            rr.send_chunks(chunk, recording=self.stream)
+            if number % _COPIED_CHUNKS == 0:
+                self._flush()
+
+    def _flush(self) -> None:
+        self.stream.flush(timeout_sec=self.patience_s)
+        self.flushes += 1
 
     def _give_up(self, why: str) -> None:
         """Say so, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""

@@ -50,10 +50,16 @@ def _version() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The chain after ``scans`` scans, which took ``run_s`` seconds."""
+    """The chain after ``scans`` scans, which took ``run_s`` seconds.
+
+    The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
+    numbers the processes that wrote to the run directory, from 0.
+    """
 
     scans: int
     run_s: float
+    process: int
+    recorded_bytes: int
     slam: Slam
 
 
@@ -79,9 +85,10 @@ _CLASSES = Classes(
 class Checkpoints:
     """Writes the chain down every so often, and so rarely that it takes a twentieth of the time at the most."""
 
-    def __init__(self, folder: Path, every_s: float, run_s: float) -> None:
-        """run_s : that earlier processes took up to the checkpoint gone on from."""
+    def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
+        """run_s : that the ``process`` earlier processes took up to the checkpoint gone on from."""
         self.path = folder / CHECKPOINT_FILE
+        self.process = process
         self.every_s = every_s
         self.began_s = perf_counter() - run_s
         self.next_s = perf_counter() + every_s
@@ -90,10 +97,12 @@ class Checkpoints:
         """Whether it is time for the next."""
         return perf_counter() >= self.next_s
 
-    def write(self, slam: Slam) -> None:
+    def write(self, slam: Slam, recorded_bytes: int = 0) -> None:
         """Write one. Raises OSError on a full disk; the last one stays."""
         started = perf_counter()
-        write_snapshot(self.path, Checkpoint(len(slam.stamps_ns), started - self.began_s, slam), _CLASSES)
+        run_s = started - self.began_s
+        checkpoint = Checkpoint(len(slam.stamps_ns), run_s, self.process, recorded_bytes, slam)
+        write_snapshot(self.path, checkpoint, _CLASSES)
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 

@@ -17,6 +17,7 @@ from pipeline.errors import InputError
 
 RUN_FILE = "run.json"
 CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
+RECORDING_FILE = "recording.rrd"
 POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _UNFINISHED = "unfinished"
 

@@ -12,14 +12,14 @@ from pipeline.data import Scan
 from pipeline.logs import Log
 from pipeline.runs.checkpoint import Checkpoints
 from pipeline.runs.closure_table import write_closures
-from pipeline.runs.directory import POINTS_FILE, RunDirectory
+from pipeline.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE, Journal
 from pipeline.runs.progress import Progress
 from pipeline.runs.recorder import OpenRecorder, Recorder
 from pipeline.runs.results import Cloud, write_results
 from pipeline.runs.results_mcap import write_results_mcap
-from pipeline.runs.resuming import Left, after, set_aside
+from pipeline.runs.resuming import Left, after, go_on_recording, set_aside
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
@@ -47,12 +47,11 @@ def process(
     left: Left | None,
 ) -> Processed:
     """Place every scan, from the first on or from where the run left off, and write the results."""
-    slam, scans, notes = _begin(log, config, directory.path, steps, left)
+    slam, scans, checkpoints = _begin(job, log, config, directory.path, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
-    checkpoints = Checkpoints(directory.path, job.checkpoint_s, 0.0 if left is None else left.checkpoint.run_s)
     with (
         record(
-            directory.path / "recording.rrd",
+            directory.path / RECORDING_FILE,
             dimension=log.dimension,
             name=job.out.resolve().name,
             sinks=job.sinks,
@@ -62,13 +61,14 @@ def process(
     ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
+        notes = () if left is None else (go_on_recording(directory.path, left, recording, checkpoints),)
         for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
             recording.log(step)
             journal.append(steps.append(step))
             if checkpoints.are_due():
-                checkpoints.write(slam)
+                checkpoints.write(slam, recording.secure())
         if progress.stopped:
-            checkpoints.write(slam)
+            checkpoints.write(slam, recording.secure())
         progress.say("optimising and writing")
         result = slam.finish()
         judged = final_verdicts(result.closures, result.state)
@@ -84,15 +84,18 @@ def process(
 
 
 def _begin(
-    log: Log, config: Config, folder: Path, steps: StepTable, left: Left | None
-) -> tuple[Slam, Iterator[Scan], tuple[str, ...]]:
-    """The chain, new or as it was left, the scans that it has not seen, and what to say of that."""
+    job: Job, log: Log, config: Config, folder: Path, left: Left | None
+) -> tuple[Slam, Iterator[Scan], Checkpoints]:
+    """The chain, new or as it was left, the scans that it has not seen, and what writes it down."""
     if left is None:
-        return Slam(config, log.T_base_lidar, folder / POINTS_FILE), log.scans(), ()
-    slam = left.checkpoint.slam
-    slam.points.reopen(folder / POINTS_FILE)
-    scans = after(tuple(steps.rows), log.scans(), left.folder)
-    return slam, scans, set_aside(folder, left.checkpoint.scans)
+        slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)
+        return slam, log.scans(), Checkpoints(folder, job.checkpoint_s)
+    checkpoint = left.checkpoint
+    checkpoint.slam.points.reopen(folder / POINTS_FILE)
+    scans = after(tuple(left.steps.rows), log.scans(), left.folder)
+    set_aside(folder, checkpoint)
+    checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
+    return checkpoint.slam, scans, checkpoints
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
+from pipeline.runs.step_table import StepRow
+from pipeline.runs.verdicts import JudgedClosure
 
 if TYPE_CHECKING:
     from pipeline.batch.task import Row
@@ -41,6 +43,19 @@ class Recorder(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
+    def go_on(
+        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+    ) -> None:
+        """Go on after the steps of ``rows``, with all closures tried by then and the graph as it was.
+
+        before : the recording up to there, which is copied; without one, the recording begins here
+        """
+        ...
+
+    def secure(self) -> int:
+        """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
+        ...
+
     def log(self, step: Step) -> None:
         """Record one step."""
         ...
@@ -51,8 +66,8 @@ class Recorder(Protocol):
         """Record the optimised way: poses (N, d+1, d+1) of the scans ``indices``."""
         ...
 
-    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
-        """Record the final graph and what became of every closure."""
+    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
+        """Record the final graph and the final verdict on every closure."""
         ...
 
     def log_map(self, points: NDArray[np.floating]) -> None:

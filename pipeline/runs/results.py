@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -53,7 +53,7 @@ def write_results(
         write_g2o(rejected_path(folder / GRAPH_FILE), result.graph, edges="rejected")
     indices = np.arange(len(result.trajectory), dtype=np.int64)
     recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
-    recording.log_closures([replace(item.closure, verdict=item.verdict) for item in judged], result.state)
+    recording.log_closures(judged, result.state)
     dimension = result.trajectory.dimension
     cloud = cloud_of(result, config)
     write_ply(folder / "map.ply", cloud.points)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.data import Scan
 from pipeline.errors import InputError
-from pipeline.runs.checkpoint import Checkpoint, read_checkpoint
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, left_behind
+from pipeline.runs.checkpoint import Checkpoint, Checkpoints, read_checkpoint
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
+from pipeline.runs.recorder import Recorder
 from pipeline.runs.step_table import StepRow, StepTable
 
 _REMEDY = "run without --resume"
@@ -53,19 +55,43 @@ def after(rows: Sequence[StepRow], scans: Iterator[Scan], folder: Path) -> Itera
     return scans
 
 
-def set_aside(folder: Path, scans: int) -> tuple[str, ...]:
-    """Keep the recording up to the checkpoint under another name, and nothing else that will be made anew.
+def set_aside(folder: Path, checkpoint: Checkpoint) -> None:
+    """Remove what will be made anew, but for the recording, which only gets another name.
 
-    What to say of a run that goes on after so many scans.
+    The name tells which process wrote it: one killed before its own first checkpoint leaves it to the next.
     """
+    before, recording = _recorded_by(checkpoint.process, folder), folder / RECORDING_FILE
+    if recording.is_file() and not before.exists():
+        recording.rename(before)
+    if checkpoint.recorded_bytes:  # of what the process before recorded, too
+        _recorded_by(checkpoint.process - 1, folder).unlink(missing_ok=True)
     for path in folder.iterdir():
-        if path.name not in _NEEDED and not path.name.startswith("recording.") and not path.is_dir():
+        if path.name not in _NEEDED and not path.match("recording.part_*.rrd") and not path.is_dir():
             path.unlink()
-    recording, before = folder / "recording.rrd", ""
-    if recording.is_file():
-        number = len(list(folder.glob("recording.part_*.rrd")))
-        before = recording.rename(folder / f"recording.part_{number}.rrd").name
-    return (f"went on after {scans:,} scans" + (f"; the recording up to there is {before}" if before else ""),)
+
+
+def go_on_recording(folder: Path, left: Left, recording: Recorder, checkpoints: Checkpoints) -> str:
+    """Let the recorder go on where the last checkpoint left it, and take over from there; what to say of it."""
+    checkpoint, slam = left.checkpoint, left.checkpoint.slam
+    before = _recorded_by(checkpoint.process, folder)
+    is_whole = 0 < checkpoint.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
+    if is_whole:
+        os.truncate(before, checkpoint.recorded_bytes)
+    recording.go_on(before if is_whole else None, left.steps.rows, slam.closures, slam.graph.state())
+    recorded_bytes = recording.secure()
+    checkpoints.write(slam, recorded_bytes)
+    note = f"went on after {checkpoint.scans:,} scans"
+    if recorded_bytes and is_whole:
+        before.unlink()
+    elif before.exists():
+        note += f"; the recording up to there is {before.name}{'' if is_whole else ', which lacks something'}"
+    elif recorded_bytes:
+        note += "; the recording begins there"
+    return note
+
+
+def _recorded_by(process: int, folder: Path) -> Path:
+    return folder / f"recording.part_{process}.rrd"
 
 
 def _facts(scan: Scan) -> tuple[int, int, int, int]:

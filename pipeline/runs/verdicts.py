@@ -1,4 +1,4 @@
-"""What the optimised graph says of the loop closures that went into it."""
+"""The verdict of the optimized graph on the loop closures that went into it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pipeline.data import REJECTED_WEIGHT, Closure, GraphState, Verdict
 class JudgedClosure:
     """A closure with its last word: by the matcher, or by the graph that it contradicts.
 
-    ``weight`` and ``chi2_after`` are what the optimiser left to its edge: 0 and NaN if it never became one.
+    ``weight`` and ``chi2_after`` are what the optimiser left to its edge: 0 and NaN if it never became one, 1 and
+    NaN until it is optimized.
     """
 
     closure: Closure
@@ -24,13 +25,17 @@ class JudgedClosure:
 
 
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[JudgedClosure, ...]:
-    """Every closure with what became of its edge; those the graph contradicts are rejected after all."""
+    """Every closure with what became of its edge; those the graph contradicts are rejected after all.
+
+    A closure accepted since the optimization that ``state`` comes from stays accepted.
+    """
     edges = _loop_edges(state)
     judged = []
     for closure in closures:
         verdict, reason, weight, chi2 = closure.verdict, closure.reason, 0.0, float("nan")
         if verdict is Verdict.ACCEPTED:
-            weight, chi2 = edges[closure.target, closure.source].popleft()
+            between = edges[closure.target, closure.source]
+            weight, chi2 = between.popleft() if between else (1.0, float("nan"))
             if weight < REJECTED_WEIGHT:
                 verdict = Verdict.REJECTED
                 reason = f"contradicts the rest of the graph, χ² {chi2:.4g}"
