@@ -26,6 +26,7 @@ from naive_logs import (
 from scenes import ROOT, configured
 
 from pipeline.__main__ import scanchain
+from pipeline.commands.override_command import OnceCommand
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
 
@@ -353,14 +354,74 @@ def test_start_end_and_every_choose_scans(call, tmp_path, office):
     assert (values["log.start_s"], values["log.end_s"], values["log.every"]) == (1.0, 3.0, 2)
 
 
-def test_the_short_flags_stand_for_keys_and_the_keys_beat_them(call, tmp_path, office):
+def test_the_short_flags_stand_for_keys(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     assert call("run", office, *out, "--matcher", "svd", "--no-loops", "--topic", "/scan")[0] == 0
     expected = {"matching.matcher": "svd", "loops.enabled": False, "log.topic": "/scan"}
     assert config(tmp_path / "a") == flatten(configured(2)) | expected
-    words = ["--matching.matcher", "plicp", "--loops.enabled=true", "--local_map.voxel_size_m", "0.15"]
-    assert call("run", office, *words, *out, "--matcher", "svd", "--no-loops")[0] == 0
-    assert config(tmp_path / "a") == flatten(configured(2)) | {"local_map.voxel_size_m": 0.15}
+    words = ["--matching.matcher", "svd", "--loops.enabled=true", "--local_map.voxel_size_m", "0.15"]
+    assert call("run", office, *words, *out)[0] == 0
+    expected = {"matching.matcher": "svd", "local_map.voxel_size_m": 0.15}
+    assert config(tmp_path / "a") == flatten(configured(2)) | expected
+
+
+def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_force(call, tmp_path, office):
+    words = ["--log.point_times", "clockwise", "--log.rate_hz=5", "--recording.local_map_every", "5"]
+    code, output, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", *words)
+    assert code == 0
+    (line,) = [line for line in output.splitlines() if line.startswith("configuration")]
+    assert line.endswith("chosen because the log is 2D")
+    for said, why in (
+        ("point_times clockwise", "laser scan"),
+        ("rate_hz 5", "stamps"),
+        ("every 5", "no recording"),
+    ):
+        (warning,) = [line for line in errors.splitlines() if said in line]
+        says(warning, "has no effect", why)
+    _, output, _ = call("doctor", office, "--log.point_times", "clockwise")
+    says(output, "--log.point_times clockwise has no effect")
+
+
+def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
+    out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
+    says(
+        call("run", office, *out)[1].splitlines()[0],
+        "(wheels /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
+    )
+    _, output, _ = call("run", office, *out, "--odometry.prior", "constant-velocity")
+    says(output.splitlines()[0], "wheels /odom, not used: odometry.prior is constant-velocity;")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "--topic", "/scan", "--topic", "/other"], ["--topic is given 2 times"]),
+        (["run", "--log.every", "2", "--log.every=3"], ["--log.every is given twice (2, 3)"]),
+        (
+            ["run", "--matcher", "svd", "--matching.matcher", "plicp"],
+            ["--matcher and --matching.matcher both set"],
+        ),
+        (["run", "--no-loops", "--loops.enabled", "true"], ["--no-loops and --loops.enabled both set"]),
+        (["run", "--gt", "/truth", "--log.ground_truth_topic", "/odom"], ["--gt and --log.ground_truth_topic"]),
+        (["run", "--out", "b"], ["--out is given 2 times"]),
+        (["compare", "--methods", "svd", "--methods", "plicp"], ["--methods is given 2 times"]),
+        (["doctor", "--topic", "/scan", "--log.topic", "/scan"], ["--topic and --log.topic"]),
+        (["info", "--log.topic", "/scan", "--log.topic", "/scan"], ["--log.topic is given twice"]),
+        (["batch", "--workers", "1", "--workers", "2"], ["--workers is given 2 times"]),
+    ],
+)
+def test_what_has_one_value_is_given_once(refused, tmp_path, office, words, said):
+    command, *flags = words
+    out = ["--out", tmp_path / "a"] if command in ("run", "compare", "batch") else []
+    says(refused(command, office, *out, *flags), *said)
+
+
+def test_every_command_refuses_an_option_given_twice_and_takes_a_flag_twice(call, tmp_path):
+    leaves = [(words, command) for words, command in commands() if not isinstance(command, click.Group)]
+    assert all(isinstance(command, OnceCommand) for _, command in leaves)
+    assert call("config", "show", "--json", "--json")[0] == 0
+    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--seed", "1", "--seed", "2")
+    assert code == 2 and "--seed is given 2 times" in errors
 
 
 def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):

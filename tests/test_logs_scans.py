@@ -332,6 +332,38 @@ def test_the_mounting_is_the_identity_where_no_chain_joins_the_frames(tmp_path):
     np.testing.assert_array_equal(T, np.eye(3))
 
 
+def test_without_a_base_link_the_root_of_the_static_tree_is_the_base_and_said_to_be(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("imu_link", "mast", 1.0, 0.0, np.pi / 2, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+    assert log.mounting.base == "imu_link"
+    assert log.notes == ["the log has no transform from base_link to laser: imu_link is taken as the base"]
+
+
+def test_the_frame_of_the_wheels_is_the_base_before_the_root_is(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, child="chassis")),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.base == "chassis" and log.T_base_lidar[0, 2] == 0.5 and log.notes == []
+
+
+def test_a_frame_of_the_world_is_never_the_base(tmp_path):
+    T, _ = mounted(tmp_path / "a.mcap", ("map", "mast", 9.0, 0.0, 0.0, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0))
+    assert T[0, 2] == 0.5
+
+
 def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     yaw, x, y = 0.4, 0.2, -0.1
     T, points = mounted(tmp_path / "a.mcap", ("base_link", "laser", x, y, yaw, np.pi))
@@ -407,6 +439,13 @@ def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
             rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
             assert message.log_time == scan.log_time_ns
             assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
+
+
+def test_the_mounting_of_a_real_lidar_on_its_imu_is_read():
+    files = [shared_data("3d/kitti_0005_first60.mcap"), shared_data("3d/kitti_0005_first60_imu_gnss.mcap")]
+    log = open_log(files)
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [0.811, -0.307, 0.802], atol=1e-3)
+    assert log.mounting.base == "imu_link" and "imu_link is taken as the base" in log.notes[0]
 
 
 def test_kitti_ground_truth_is_that_of_the_published_file():

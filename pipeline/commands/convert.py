@@ -8,11 +8,12 @@ from pathlib import Path
 import click
 
 from pipeline.commands.log_type import LOG
+from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 from pipeline.source import Source
 
 
-@click.command()
+@click.command(cls=OnceCommand)
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
 @click.option(

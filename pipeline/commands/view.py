@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import Viewing
 
 
-@click.command()
+@click.command(cls=OnceCommand)
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option(

@@ -27,6 +27,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
     files = _files(folder)
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
     index = made_index(folder, number)
+    index.takes_rate = True
     channel = made_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
         made_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
