@@ -27,6 +27,7 @@ from naive_logs import (
 from scenes import shared_data
 
 from pipeline import lie
+from pipeline.__main__ import main
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
@@ -388,6 +389,120 @@ def test_a_cloud_keeps_the_full_mounting(tmp_path):
     np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
     np.testing.assert_allclose(log.T_base_lidar[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
     np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
+
+
+# a mounting that /tf tells
+
+
+def joined(at, *entries):
+    """A message of /tf, logged at its stamp."""
+    stamp_ns = STAMP_NS + round(at * SECOND)
+    return transforms_said(stamp_ns, transforms(*entries, stamp_ns=stamp_ns), "/tf")
+
+
+def swinging(roll, *, parent="base_link", yaw=lambda at: 0.0, seconds=2.0, extra=()):
+    """Scans at 10 Hz of a lidar whose joint is told at 20 Hz, ``roll`` and ``yaw`` of the seconds."""
+    said = [*extra]
+    for k in range(round(20 * seconds)):
+        at = k / 20
+        said.append(joined(at, (parent, "laser", 0.2, 0.0, yaw(at), roll(at))))
+        said += [] if k % 2 else [one_scan(at, at)]
+    return said
+
+
+def tilt(at):
+    return 0.7 * np.sin(2.0 * np.pi * at)
+
+
+@pytest.mark.parametrize("parent", ["base_link", "torso"])
+def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_path, capfd, parent):
+    path = write(tmp_path / "a.mcap", swinging(tilt, parent=parent))
+    with pytest.raises(InputError) as caught:
+        open_log(path)
+    for part in (
+        f"{parent} → laser in /tf turns from -40 to 40 deg about its x axis",
+        "--topic",
+        "/scan",
+        "--end",
+    ):
+        assert part in str(caught.value)
+    for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
+        assert main([str(word) for word in words]) == 2
+        assert capfd.readouterr().err == f"error: {caught.value}\n"
+    assert main(["info", str(path)]) == 0
+    assert f"problem   {caught.value}" in capfd.readouterr().out
+
+
+def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0))))
+    log, scans = read(path, end_s=0.95)
+    assert len(scans) == 10 and log.mounting.motion is None
+    with pytest.raises(InputError, match="does not stay in one plane"):
+        open_log(path)
+
+
+def test_a_planar_lidar_that_leaves_its_plane_where_nobody_looked_before_is_refused_there(tmp_path):
+    said = swinging(lambda at: 0.5 if 1.05 < at < 1.25 else 0.0, seconds=40.0)
+    path = write(tmp_path / "a.mcap", said, chunk_size=300)
+    log = open_log(path)
+    assert log.mounting.motion is None
+    with pytest.raises(InputError, match="laser has turned by 29 deg in /tf at scan 11"):
+        list(log.scans())
+
+
+@pytest.mark.parametrize("seconds", [2.0, 40.0])
+def test_a_transform_of_tf_that_repeats_itself_is_a_static_mounting(tmp_path, seconds):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.0, yaw=lambda at: 0.4, seconds=seconds))
+    log, _ = read(path)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.4), atol=1e-12)
+    assert log.mounting.motion is None and log.notes == []
+    assert log.mounting.source == "by transforms of /tf, which do not change"
+
+
+def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
+    fixed = transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.0, 0.0, 0.0)))
+    for name, mount in (("static", [fixed]), ("none", [])):
+        said = [*mount]
+        for k in range(20):
+            robot = ("odom", "base_link" if mount else "laser", 0.1 * k, 0.0, 0.1 * k, 0.0)
+            said += [joined(k / 10, ("map", "odom", 0.0, 0.01 * k, 0.0, 0.0), robot), one_scan(k / 10, k / 10)]
+        log, scans = read(write(tmp_path / f"{name}.mcap", said))
+        assert log.mounting.motion is None and len(scans) == 20 and log.notes == []
+        assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
+
+
+def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
+    said = []
+    for k in range(20):
+        said += [joined(k / 10, ("start", "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
+def test_wheels_are_carried_over_to_a_lidar_that_pans_by_tf_at_the_stamp(tmp_path):
+    yaw = {0.0: 0.0, 0.1: 0.2, 0.2: 0.4}
+    said = []
+    for at, turn in yaw.items():
+        said += [joined(at, ("base_link", "laser", 0.2, 0.0, turn, 0.0)), *wheels((at, at, 10.0 * at))]
+    said += [one_scan(0.21, 0.0), one_scan(0.22, 0.05), one_scan(0.23, 0.1)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert "base_link → laser in /tf turns from 0 to 23 deg about its z axis" in log.notes[0]
+    for scan, at in zip(scans, (0.0, 0.05, 0.1), strict=True):
+        expected = lie.pose_2d(10.0 * at, 0.0, 0.0) @ lie.pose_2d(0.2, 0.0, 2.0 * at)
+        np.testing.assert_allclose(scan.T_odom_base @ log.T_base_lidar, expected, atol=1e-9)
+
+
+def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
+    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = []
+    for k in range(20):
+        time_ns = STAMP_NS + k * SECOND // 10
+        said += [joined(k / 10, ("base_link", "lidar", 0.0, 0.0, 0.0, tilt(k / 10)))]
+        said += [*wheels((k / 10, k / 10, 0.0)), cloud_said(time_ns, point_cloud(time_ns, rows))]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion.leaves_plane and "poses are the lidar's" in log.notes[0]
+    turned = [lie.apart(log.T_base_lidar, scan.T_odom_base @ log.T_base_lidar)[1] for scan in scans]
+    np.testing.assert_allclose(turned, np.abs([tilt(k / 10) for k in range(20)]), atol=1e-9)
 
 
 # real logs

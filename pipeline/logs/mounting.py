@@ -29,6 +29,7 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_FRAMES = ("map", "odom", "odom_combined", "world", "earth", "camera_init")
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # by more than this a mount moves
 _TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # by more than this a planar lidar leaves its plane
+_FULL_TURN_DEG = 360.0
 _MOUNT_M = 1.0  # a sensor moves by less on a robot; a frame above which it moves by more is no part of it
 
 Edge = tuple[str, str]  # parent and child
@@ -46,7 +47,8 @@ class Motion(NamedTuple):
 
     def __str__(self) -> str:
         low, high = np.degrees((self.least_rad, self.most_rad))
-        turn = f"turns from {low:.0f} to {high:.0f} deg about its {self.axis} axis"
+        angles = f"from {low:.0f} to {high:.0f} deg" if high - low < _FULL_TURN_DEG else "round and round"
+        turn = f"turns {angles} about its {self.axis} axis"
         shift = f" and shifts by {self.shift_m:.2f} m" if self.shift_m > _SHIFT_M else ""
         return f"{self.joint[0]} → {self.joint[1]} in /tf {turn}{shift}"
 
@@ -182,7 +184,7 @@ def _motion(joint: Edge, T_base_lidar: Matrix) -> Motion | None:
     turns = lie.log(lie.between(np.broadcast_to(T_base_lidar[0], T_base_lidar.shape), T_base_lidar))[:, 3:]
     axis = np.linalg.svd(turns)[2][0] if len(turns) > 1 else np.eye(3)[2]
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    angles_rad = turns @ axis
+    angles_rad = np.unwrap(turns @ axis)
     shift_m = float(np.ptp(T_base_lidar[:, :3, 3], axis=0).max())
     if not any(is_moved(T_base_lidar[0], T) for T in T_base_lidar):
         return None
