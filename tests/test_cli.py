@@ -27,6 +27,7 @@ from scenes import ROOT, configured
 
 from pipeline.__main__ import scanchain
 from pipeline.commands.override_command import OnceCommand
+from pipeline.logs.write import LogWriter
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
 
@@ -318,6 +319,33 @@ def test_json_prints_the_metrics_and_nothing_else(call, tmp_path, office):
     assert (code, errors) == (0, "")
     assert json.loads(output) == json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert json.loads(output)["scans"] == 60
+
+
+def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_results_written(call, tmp_path):
+    path, out = tmp_path / "radar.mcap", tmp_path / "a"
+    rng = np.random.default_rng(0)
+    with LogWriter(path) as log:
+        for k in range(20):
+            log.point_cloud("/radar", k * SECOND // 10 + STAMP_NS, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
+    code, output, errors = call("run", path, "--out", out, "--rerun", "off")
+    assert code == 1 and len(errors.splitlines()) == 1
+    metrics = json.loads((out / "metrics.json").read_text())
+    says(metrics["unreliable"], f"{metrics['degenerate']} of 20 scans are degenerate and {metrics['lost']} lost")
+    says(metrics["unreliable"], "scans have 12 valid points", "radar", "--topic")
+    assert errors.splitlines()[0] == f"error: {out}: {metrics['unreliable']}"
+    for summary in (output, (out / "summary.txt").read_text()):
+        assert summary.splitlines()[0] == f"UNRELIABLE     {metrics['unreliable']}"
+        assert summary.splitlines()[1].startswith(f"{path} /radar")
+    says((out / "report.html").read_text(), metrics["unreliable"].replace("'", "&#39;"))
+    assert json.loads((out / "run.json").read_text())["complete"] and (out / "map.ply").exists()
+    code, output, errors = call("run", path, "--out", out, "--force", "--rerun", "off", "--json")
+    assert code == 1 and json.loads(output)["unreliable"] == metrics["unreliable"]
+    assert errors.startswith(f"error: {out}: {metrics['unreliable']}\n")
+
+
+def test_a_run_of_the_office_is_reliable(call, tmp_path, office):
+    code, output, _ = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--json")
+    assert code == 0 and json.loads(output)["unreliable"] == ""
 
 
 def test_rerun_off_leaves_out_the_recording_alone(call, tmp_path, office):

@@ -391,6 +391,45 @@ def test_a_cloud_keeps_the_full_mounting(tmp_path):
     np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
 
 
+# clouds of planar scanners
+
+
+def cloud_of(k, points):
+    rows = np.zeros(len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
+    for name, column in zip("xyz", np.transpose(points), strict=True):
+        rows[name] = column
+    rows["t"] = np.arange(len(points)) * 1_000_000
+    stamp_ns = STAMP_NS + k * SECOND // 10
+    return cloud_said(stamp_ns, point_cloud(stamp_ns, rows))
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.3])
+def test_clouds_with_all_points_at_one_height_are_a_planar_log(tmp_path, height_m):
+    said = [cloud_of(k, [(1, 2, height_m), (3, 4, height_m), (5, 6, height_m)]) for k in range(3)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.dimension == 2 and log.T_base_lidar.shape == (3, 3)
+    assert f"the clouds of /points are planar (z = {height_m:g} m everywhere): read as a 2D log" in log.notes
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points, [(1, 2), (3, 4), (5, 6)])
+        np.testing.assert_allclose(scan.times_s, [0.0, 1e-3, 2e-3])
+        assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "points", [[(1, 2, 0)], [(1, 2, 0), (3, 4, 0), (5, 6, 0.01)], [(1, 0, 2), (3, 0, 4), (5, 0, 6)]]
+)
+def test_clouds_of_other_points_or_too_few_to_tell_are_not_planar(tmp_path, points):
+    log, _ = read(write(tmp_path / "a.mcap", [cloud_of(k, points) for k in range(5)]))
+    assert log.dimension == 3
+
+
+def test_a_cloud_that_leaves_the_plane_of_those_before_is_malformed(tmp_path):
+    flat = [(x, y, 0.0) for x, y in np.random.default_rng(0).uniform(1, 9, (1100, 2))]
+    path = write(tmp_path / "a.mcap", [cloud_of(0, flat), cloud_of(1, [*flat[:-1], (1, 1, 1)])])
+    with pytest.raises(InputError, match=r"scan 1 .* a point lies 1 m off the plane z = 0 m"):
+        read(path)
+
+
 # a mounting that /tf tells
 
 

@@ -109,6 +109,9 @@ def run(
     viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
         finished = run_log(job, viewing.record, terminal, viewing.report)
+    unreliable = finished.metrics.unreliable
+    if unreliable:
+        click.echo(f"error: {finished.path}: {unreliable}", err=True)
     for warning in finished.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
@@ -116,6 +119,8 @@ def run(
         raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}")
     if not as_json:
         click.echo(f"written        {out}")
+    if unreliable:
+        ctx.exit(1)
 
 
 _KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}

@@ -24,7 +24,7 @@ from pipeline.logs.mounting import (
     leaves_plane,
 )
 from pipeline.logs.opening import index_files
-from pipeline.logs.point_cloud import PointCloudDecoder
+from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
 from pipeline.logs.records import FileIndex
@@ -55,7 +55,7 @@ class Log:
     Attributes
     ----------
     paths : its files
-    topic, dimension : the lidar's topic; 2 for laser scans, 3 for clouds
+    topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
     mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
@@ -77,7 +77,8 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        self.dimension = 2 if is_scan(lidar) else 3
+        self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
+        self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
         self.duration_s = whole.duration_s
         self.span = chosen_span(whole, config)
@@ -149,7 +150,7 @@ class Log:
         self._truth = poses.ground_truth()
         self.scans_with_wheels = index - tally.without_wheels
         self.damage += [*tally.losses(), *poses.complaints()]
-        self.notes += [*([times.assumed] if self.dimension == 3 else []), *tally.notes()]
+        self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
@@ -201,12 +202,12 @@ class Log:
         return beside.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
 
     def assumed_point_times(self) -> str:
-        """What a run assumes about per-point times, by the first scan that has returns; empty for a planar log."""
+        """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
         times = PointTimes(self.config)
-        if self.dimension == 3:
+        if not is_scan(self.lidar):
             returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
             next((each for each in returns if len(each.points)), None)
-        return times.assumed if self.dimension == 3 else ""
+        return "" if is_scan(self.lidar) else times.assumed
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
@@ -235,9 +236,22 @@ class Log:
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
         """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        if self.dimension == 2:
+        if is_scan(self.lidar):
             return LaserScanDecoder(limits, scan_reader(self.lidar))
-        return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
+        if self.plane_height_m is None:
+            return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
+        return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
+
+    def _plane_height_m(self) -> float | None:
+        """The height of all points of the first clouds, None where it is not one."""
+        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
+        decoder = PointCloudDecoder(limits, PointTimes(self.config), cloud_reader(self.lidar))
+        height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
+        if height_m is not None:
+            self.notes.append(
+                f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
+            )
+        return height_m
 
     def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: ToldPoses) -> bool:
         first = waiting[0].value
