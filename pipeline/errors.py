@@ -1,5 +1,7 @@
 """The errors a user can cause or meet; the command line prints each as one line."""
 
+import errno
+
 
 class ScanchainError(Exception):
     """A run failed for a reason its message names: what, where, what to do. Exit code 1."""
@@ -14,3 +16,19 @@ class MissingExtraError(InputError):
 
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(f"{package} is not installed; install it with: pip install 'scanchain[{extra}]'")
+
+
+_NO_SPACE = "the disk is full; free some space on it, or write to another one"
+_REMEDIES = {
+    errno.ENOSPC: _NO_SPACE,
+    errno.EDQUOT: "the quota of the disk is used up; free some space on it, or write to another one",
+    errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes a part); shorten it",
+    errno.EROFS: "the file system is read-only; write to another one",
+    errno.EACCES: "access is denied; check the permissions",
+}
+
+
+def told(error: OSError) -> str:
+    """What the system refused and what to do, on one line; empty where it is not known what to do."""
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    return f"{error.filename}: {remedy}" if error.filename and remedy else remedy

@@ -1,11 +1,14 @@
 """The command line: what it prints where, its exit codes, and one line for everything that can go wrong."""
 
+import errno
+import io
 import json
 import math
 import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import click
 import numpy as np
@@ -141,6 +144,96 @@ def test_a_topic_that_is_not_there_or_no_lidar_lists_those_to_choose_from(refuse
     for topic in ("/nope", "/odom"):
         text = refused("run", office, "--out", tmp_path / "a", "--topic", topic)
         says(text, office, topic, "choose --topic from", "/scan (sensor_msgs/msg/LaserScan)")
+
+
+def test_a_topic_that_is_no_lidar_is_answered_with_the_lidars_alone(refused, tmp_path):
+    stamp_ns = STAMP_NS
+    lidars = [scan_said(stamp_ns, laser_scan(stamp_ns, [1.0] * 9), topic) for topic in ("/front", "/rear")]
+    others = [odometry_said(stamp_ns, odometry(stamp_ns, 0, 0), f"/wheel_{k}") for k in range(12)]
+    path = write(tmp_path / "x.mcap", [*lidars, *others])
+    text = refused("run", path, "--out", tmp_path / "a", "--topic", "/wheel_3")
+    says(text, "topic /wheel_3 (nav_msgs/msg/Odometry) is no lidar's; choose --topic from: /front")
+    assert "/rear" in text and "/wheel_4" not in text and len(text) < 300
+    path = write(tmp_path / "y.mcap", others)
+    says(refused("run", path, "--out", tmp_path / "a"), "/wheel_0", "4 more, see scanchain info")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "LONG", "--out", "a"],
+        ["run", "office", "--out", "LONG"],
+        ["run", "office", "--out", "a", "--gt", "LONG.tum"],
+        ["info", "LONG"],
+        ["convert", "LONG", "a.mcap"],
+        ["simulate", "office", "LONG.mcap"],
+        ["view", "LONG"],
+        ["evaluate", "LONG", "LONG"],
+    ],
+)
+def test_a_name_of_260_bytes_is_one_line_with_what_to_do(refused, tmp_path, office, words):
+    long = str(tmp_path / ("x" * 260))
+    places = {"office": str(office)} if words[0] == "run" else {}
+    places |= {"a": str(tmp_path / "a")}
+    text = refused(*(places.get(word, word.replace("LONG", long)) for word in words))
+    says(text, long, "longer than the file system takes (255 bytes a part); shorten it")
+    assert "Errno" not in text
+
+
+FULL = "the disk is full; free some space on it, or write to another one"
+
+
+class _FullDisk(io.RawIOBase):
+    """A file on a disk that takes so many bytes."""
+
+    def __init__(self, room):
+        self.room = room
+
+    def writable(self):
+        return True
+
+    def seekable(self):
+        return True
+
+    def tell(self):
+        return 0
+
+    def write(self, data):
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return len(data)
+
+
+@pytest.mark.parametrize("room", [10_000, 60_000])
+def test_a_full_disk_is_one_line_with_what_to_do_and_nothing_is_left(call, monkeypatch, tmp_path, room):
+    opened = Path.open
+
+    def open_there(path, *words, **options):
+        file = opened(path, *words, **options)
+        return io.BufferedWriter(_FullDisk(room)) if path.suffix == ".partial" else file
+
+    monkeypatch.setattr(Path, "open", open_there)
+    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--duration", "3")
+    assert code == 1
+    assert errors == f"error: {tmp_path / 'a.mcap'}: {FULL}\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fills_up_during_a_run_is_told_once_with_what_to_do(call, monkeypatch, tmp_path, office):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pipeline.runs.processing.write_results", fail)
+    code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off")
+    assert code == 1 and "Errno" not in errors and errors.count("full") == 1
+    assert errors.startswith(f"error: {tmp_path / 'a'}: {FULL}; ")
+    says(errors, "60 scans until then are in")
+
+
+def test_view_of_a_directory_that_is_not_there_says_so(refused, tmp_path):
+    for more in ([], ["--png", tmp_path / "a.png"]):
+        says(refused("view", tmp_path / "absent", *more), tmp_path / "absent", "no such directory")
 
 
 def test_several_lidars_ask_for_a_choice(refused, tmp_path):
