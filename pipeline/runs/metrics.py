@@ -141,8 +141,10 @@ def _unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
     degenerate, lost = states[State.DEGENERATE], states[State.LOST]
     if 2 * (degenerate + lost) <= len(points):
         return ""
-    line = f"{degenerate:,} of {len(points):,} scans are degenerate and {lost:,} lost: most of the trajectory is "
-    line += "predicted, not measured"
+    line = (
+        f"{degenerate:,} of {len(points):,} scans are degenerate and {lost:,} lost: most poses are predicted, not "
+    )
+    line += "measured, in at least one direction"
     if np.median(points) < _FEW_POINTS:
         few = f"scans have {np.median(points):.0f} valid points (median)"
         return f"{line}; {few}, as a radar's have: choose a lidar with --topic"
