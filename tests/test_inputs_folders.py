@@ -288,6 +288,16 @@ def test_folders_of_arrays_open_whatever_their_columns_and_say_what_was_found(
     assert f"{len(clouds[0])} points in 0{suffix}" in log.notes[0]
 
 
+@pytest.mark.parametrize("hole", [0.0, np.nan, np.inf])
+def test_raw_rows_of_three_numbers_are_not_taken_for_six_where_they_are_flat(tmp_path, hole):
+    cloud = swept(0)[:, :3].astype("float32")
+    cloud[:, 2] = 1.5
+    cloud[7] = hole
+    cloud.tofile(tmp_path / "1.0.bin")
+    log, (scan,) = read(tmp_path)
+    assert scan.points.shape == (299, 2) and "files of x y z, float32" in log.notes[0]
+
+
 @pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])
 def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind):
     cloud = np.rint(swept(1)[:, :3]).astype(kind)

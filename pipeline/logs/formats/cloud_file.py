@@ -18,6 +18,7 @@ _LIKELY_COLUMNS = (4, 3, 5, 6)  # of .bin files; the first where nothing speaks 
 _SAMPLE_BYTES = 1 << 20
 _SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # sizes of numbers that are plausible, and how many must be
 _FEWEST_ROWS = 20  # that tell columns apart
+_ALIKE, _HARDLY = 0.5, 0.05  # differences of columns, in spreads of the two, and of all, that are none
 _NOTHING = 0.1  # a contrast that speaks for no layout
 _XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
@@ -109,8 +110,7 @@ def _are_plausible(values: NDArray[np.floating]) -> bool:
 
 def _contrast(values: NDArray[np.floating], columns: int) -> float:
     """How far columns differ in mean and spread, in spreads of all numbers."""
-    rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
-    rows = rows[np.isfinite(rows).all(axis=1)]
+    rows = _finite_rows(values, columns)
     if len(rows) < _FEWEST_ROWS:
         return 0.0
     spread = float(rows.std()) or 1.0
@@ -119,10 +119,15 @@ def _contrast(values: NDArray[np.floating], columns: int) -> float:
 
 def _repeats(values: NDArray[np.floating]) -> bool:
     """Whether rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
-    rows = values[: len(values) - len(values) % 6].astype(np.float64).reshape(-1, 6)
-    mean, spread = np.nanmean(rows, axis=0).reshape(2, 3), np.nanstd(rows, axis=0).reshape(2, 3)
-    largest = np.maximum(spread.max(axis=0), _SMALLEST)
-    return bool((np.ptp(mean, axis=0) < 0.5 * largest).all() and (spread.min(axis=0) > 0.5 * largest).all())
+    rows = _finite_rows(values, 6)
+    mean, spread = rows.mean(axis=0).reshape(2, 3), rows.std(axis=0).reshape(2, 3)
+    near = _ALIKE * spread.max(axis=0) + _HARDLY * rows.std()
+    return bool(((np.ptp(mean, axis=0) <= near) & (np.ptp(spread, axis=0) <= near)).all())
+
+
+def _finite_rows(values: NDArray[np.floating], columns: int) -> NDArray[np.float64]:
+    rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
+    return rows[np.isfinite(rows).all(axis=1)]
 
 
 def _columns(kind: np.dtype[np.generic], count: int) -> np.dtype[np.void]:
