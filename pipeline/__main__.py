@@ -47,7 +47,8 @@ def scanchain() -> None:
       scanchain run office.mcap --out runs/office
       scanchain view runs/office
 
-    Exit codes: 0 done, 1 the run failed or was stopped, 2 bad input or arguments.
+    Exit codes: 0 done, 1 the run failed, was stopped, or most of its scans are degenerate or lost,
+    2 bad input or arguments.
     """
 
 

@@ -510,6 +510,12 @@ def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
         assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
 
 
+@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world"])
+def test_a_robot_that_turns_on_the_spot_in_a_frame_of_the_world_is_no_mount(tmp_path, frame):
+    log, _ = read(write(tmp_path / "a.mcap", swinging(tilt, parent=frame)))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
 def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
     said = []
     for k in range(20):

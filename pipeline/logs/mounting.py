@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from pipeline.logs.selection import Span
 from pipeline.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_WORLD_FRAMES = ("map", "odom", "odom_combined", "world", "earth", "camera_init")
+_WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # by more than this a mount moves
 _TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # by more than this a planar lidar leaves its plane
 _FULL_TURN_DEG = 360.0
@@ -107,8 +108,9 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, frame, T_base_lidar)
-    worlds = {*_WORLD_FRAMES, "" if told is None else told.parent.lstrip("/")}
+    worlds = {"" if told is None else told.parent.lstrip("/")}
     seen = _moving_transforms(indexes, topics, span)
+    worlds |= {name for each in (*seen, *map(edge, fixed)) for name in each if _is_of_the_world(name)}
     moving = {joint: poses for joint, poses in seen.items() if not worlds & set(joint)}
     tree = [*fixed, *(poses[0] for poses in moving.values())]
     base = next((base for base in bases if chain(tree, base, frame) is not None), "")
@@ -141,6 +143,11 @@ def _moving_transforms(
             for each in transforms:
                 found.setdefault(edge(each), []).append(each)
     return found
+
+
+def _is_of_the_world(frame: str) -> bool:
+    """Whether a frame is called as those are in which robots move: map, robot_1/odom, camera_init."""
+    return bool(_WORLD_WORDS & set(re.split(r"[/_]", frame.lower())))
 
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
