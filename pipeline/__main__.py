@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import os
 import sys
@@ -26,7 +27,7 @@ from pipeline.commands.sequence import sequence
 from pipeline.commands.simulate import simulate
 from pipeline.commands.view import view
 from pipeline.config import RecordingConfig
-from pipeline.errors import InputError, ScanchainError
+from pipeline.errors import InputError, ScanchainError, told
 from pipeline.runs.recorder import Recorder, SinkName, Viewing
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ def scanchain() -> None:
       scanchain run office.mcap --out runs/office
       scanchain view runs/office
 
-    Exit codes: 0 done, 1 the run failed or was stopped, 2 bad input or arguments.
+    Exit codes: 0 done, 1 the run failed, was stopped, or most of its scans are degenerate or lost,
+    2 bad input or arguments.
     """
 
 
@@ -85,9 +87,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        if os.environ.get("SCANCHAIN_DEBUG"):
-            raise
-        return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows where it happened", 1)
+        return _unforeseen(error)
+
+
+def _unforeseen(error: Exception) -> int:
+    """What nobody raised on purpose: a remedy where the system refused something, else the way to the place."""
+    if os.environ.get("SCANCHAIN_DEBUG"):
+        raise error
+    if isinstance(error, OSError) and told(error):
+        return _fail(told(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
+    return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows where it happened", 1)
 
 
 def _fail(message: str, code: int) -> int:

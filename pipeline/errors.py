@@ -1,5 +1,7 @@
 """The errors a user can cause or meet; the command line prints each as one line."""
 
+import errno
+
 
 class ScanchainError(Exception):
     """A run failed for a reason its message names: what, where, what to do. Exit code 1."""
@@ -23,3 +25,19 @@ def shown(value: object) -> str:
         return f"an array of the shape {shape}"
     text = repr(value)
     return text if len(text) <= 40 and text.isprintable() else f"a {type(value).__name__}"
+
+
+_NO_SPACE = "the disk is full; free some space on it, or write to another one"
+_REMEDIES = {
+    errno.ENOSPC: _NO_SPACE,
+    errno.EDQUOT: "the quota of the disk is used up; free some space on it, or write to another one",
+    errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes a part); shorten it",
+    errno.EROFS: "the file system is read-only; write to another one",
+    errno.EACCES: "access is denied; check the permissions",
+}
+
+
+def told(error: OSError) -> str:
+    """What the system refused and what to do, on one line; empty where it is not known what to do."""
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    return f"{error.filename}: {remedy}" if error.filename and remedy else remedy

@@ -16,6 +16,15 @@ from pipeline.config_keys import Value, config_keys, find_key
 from pipeline.errors import InputError
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
+_WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
+_REVOLUTION_KEYS = ("log.revolution_s", "log.revolution_start_rad")
+_PLACE_KEYS = (
+    "loops.place_radius_m", "loops.place_drift", "loops.min_likeness", "loops.min_place_overlap",
+    "loops.min_place_information", "loops.min_agreement",
+)  # fmt: skip
+_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m", "loops.recognise_places", *_PLACE_KEYS)
+_PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
+_NOTHING: Mapping[str, str] = {}
 _ORDERED = (
     ("log.start_s", "log.end_s"),
     ("log.min_range_m", "log.max_range_m"),
@@ -36,17 +45,30 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A configuration and where it came from, in words."""
+    """A configuration.
+
+    Attributes
+    ----------
+    config : the whole tree
+    source : where it came from, in words; of the flags, those that have an effect
+    without_effect : a line for each setting of the file or the flags that has none, with the reason
+    """
 
     config: Config
     source: str
+    without_effect: tuple[str, ...] = ()
 
 
 def load_settings(
-    dimension: int | None = None, *, file: Path | None = None, overrides: Sequence[Override] = ()
+    dimension: int | None = None,
+    *,
+    file: Path | None = None,
+    overrides: Sequence[Override] = (),
+    idle: Mapping[str, str] = _NOTHING,
 ) -> Settings:
     """Defaults < the preset for logs of this dimension, if it is known < ``file`` < ``overrides``.
 
+    idle : keys that have no effect on the log at hand, and why
     Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
     """
     layer: dict[str, Value] = {}
@@ -55,17 +77,52 @@ def load_settings(
         dimension = checks.dimension(dimension)
         layer = read_layer(preset_path(PRESETS[dimension]))
         source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
-    if file is not None:
-        layer |= read_layer(file)
-        source += f", {file}"
-    values = {key: spec.default for key, spec in config_keys().items()} | layer
+    source += "" if file is None else f", {file}"
+    preset = {key: spec.default for key, spec in config_keys().items()} | layer
+    values = preset | ({} if file is None else read_layer(file))
+    origins = {key: str(file) for key in values if values[key] != preset[key]}
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
     flags = {override.key: override.flag for override in overrides}
     is_final = dimension is not None  # else a preset may still change all but log.*
     _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
-    changed = "".join(f", {key} {values[key]}" for key in flags)
-    return Settings(msgspec.convert(_tree(values), Config), source + changed)
+    unused = {**_idle_keys(values, dimension), **idle} if is_final else {}
+    changed = "".join(f", {key} {values[key]}" for key in flags if key not in unused)
+    without_effect = tuple(
+        f"{_named(key, values[key], origin)} has no effect: {unused[key]}"
+        for key, origin in (origins | flags).items()
+        if key in unused
+    )
+    return Settings(msgspec.convert(_tree(values), Config), source + changed, without_effect)
+
+
+def _named(key: str, value: Value, origin: str) -> str:
+    """A setting as the user wrote it."""
+    text = str(value).lower() if isinstance(value, bool) else value
+    return f"{origin} {text}" if origin.startswith("--") else f"{origin}: {key} {text}"
+
+
+def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:
+    """The keys that other keys, or the kind of log, leave without an effect, and why."""
+    reasons = {
+        "the log is 3D, and it is of planar logs": _PLANAR_KEYS if dimension == 3 else (),
+        "the log is 2D, and it is of 3D logs": _SPATIAL_KEYS if dimension == 2 else (),
+        "loops.recognise_places is false": () if values["loops.recognise_places"] else _PLACE_KEYS,
+        "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
+        "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
+        "matching.matcher is svd": ("matching.optimiser",) if values["matching.matcher"] == "svd" else (),
+        "log.point_times is not clockwise or counterclockwise": (
+            () if values["log.point_times"] in ("clockwise", "counterclockwise") else _REVOLUTION_KEYS
+        ),
+        "odometry.prior is constant-velocity": (
+            _WHEEL_KEYS if values["odometry.prior"] == "constant-velocity" else ()
+        ),
+    }
+    return {key: reason for reason, keys in reasons.items() for key in keys}
+
+
+def _keys_of(section: str, *exceptions: str) -> tuple[str, ...]:
+    return tuple(key for key in config_keys() if key.startswith(f"{section}.") and key not in exceptions)
 
 
 def read_layer(file: Path) -> dict[str, Value]:

@@ -92,14 +92,21 @@ def parse_stamp_ns(text: str, place: str) -> int:
     try:
         seconds = Decimal(text)
     except InvalidOperation:
-        raise InputError(f"{place} has the stamp {text!r}; it must be a number of seconds") from None
+        raise InputError(
+            f"{place} has the stamp {text!r}; it must be a number of seconds (begin a line of column names with #)"
+        ) from None
     if not seconds.is_finite() or abs(seconds) > 9_000_000_000:
-        raise InputError(f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds")
+        raise InputError(
+            f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds; give it in seconds"
+        )
     return int(seconds.scaleb(9).to_integral_value())
 
 
 def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
-    """Place (file:line) and words of every line that is neither empty nor a comment."""
+    """Place (file:line) and words of every line that is neither empty nor a comment.
+
+    Words are separated by spaces, commas or semicolons.
+    """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -112,7 +119,7 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
     for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
+        words = line.replace(",", " ").replace(";", " ").split()
         if words and not words[0].startswith("#"):
             yield f"{path}:{number}", words
 

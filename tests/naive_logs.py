@@ -105,11 +105,11 @@ def odometry(stamp_ns, x, y, yaw=0.0, *, z=0.0, frame="odom", child="base_link",
     return bytes(cdr.put("d", *[0.0] * (36 + 6 + 36)))
 
 
-def transforms(*entries, order="<"):
+def transforms(*entries, order="<", stamp_ns=0):
     """A TFMessage of (parent, child, x, y, yaw, roll)."""
     cdr = Cdr(order).put("I", len(entries))
     for parent, child, x, y, yaw, roll in entries:
-        cdr.header(0, parent).string(child).pose(x, y, yaw, 0.5, roll)
+        cdr.header(stamp_ns, parent).string(child).pose(x, y, yaw, 0.5, roll)
     return bytes(cdr)
 
 

@@ -105,6 +105,25 @@ def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(dra
     assert len(made(out)) == 3 and "0 results were there before" in capfd.readouterr()[0].splitlines()[-1]
 
 
+def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
+    radar, out = tmp_path / "radar.mcap", tmp_path / "out"
+    rng = np.random.default_rng(0)
+    with LogWriter(radar) as log:
+        for k in range(20):
+            log.point_cloud("/radar", 10**18 + k * 10**8, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
+    words = ["batch", str(radar), str(drawers / "log_03.mcap"), "--out", str(out)]
+    assert main(words) == 1
+    output, errors = capfd.readouterr()
+    rows, first = table(out), made(out)
+    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("unreliable", "done")
+    assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
+    assert len(first) == 2 and "2: 1 done, 1 unreliable" in output
+    assert errors == f"error: of 1 most scans are degenerate or lost; {out}/summary.txt says why\n"
+    assert f"{radar} is unreliable" in (out / "report.html").read_text()
+    assert main(words) == 1
+    assert made(out) == first and "2 results were there before" in capfd.readouterr()[0]
+
+
 def test_a_result_that_was_thrown_away_is_missing(drawers, tmp_path):
     words = ["batch", str(drawers / "log_02.mcap"), "--out", str(tmp_path / "out")]
     assert main(words) == 0

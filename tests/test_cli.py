@@ -1,11 +1,14 @@
 """The command line: what it prints where, its exit codes, and one line for everything that can go wrong."""
 
+import errno
+import io
 import json
 import math
 import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import click
 import numpy as np
@@ -26,7 +29,9 @@ from naive_logs import (
 from scenes import ROOT, configured
 
 from pipeline.__main__ import scanchain
+from pipeline.commands.override_command import OnceCommand
 from pipeline.graph.g2o import read_g2o
+from pipeline.logs.write import LogWriter
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
 
@@ -140,6 +145,96 @@ def test_a_topic_that_is_not_there_or_no_lidar_lists_those_to_choose_from(refuse
     for topic in ("/nope", "/odom"):
         text = refused("run", office, "--out", tmp_path / "a", "--topic", topic)
         says(text, office, topic, "choose --topic from", "/scan (sensor_msgs/msg/LaserScan)")
+
+
+def test_a_topic_that_is_no_lidar_is_answered_with_the_lidars_alone(refused, tmp_path):
+    stamp_ns = STAMP_NS
+    lidars = [scan_said(stamp_ns, laser_scan(stamp_ns, [1.0] * 9), topic) for topic in ("/front", "/rear")]
+    others = [odometry_said(stamp_ns, odometry(stamp_ns, 0, 0), f"/wheel_{k}") for k in range(12)]
+    path = write(tmp_path / "x.mcap", [*lidars, *others])
+    text = refused("run", path, "--out", tmp_path / "a", "--topic", "/wheel_3")
+    says(text, "topic /wheel_3 (nav_msgs/msg/Odometry) is no lidar's; choose --topic from: /front")
+    assert "/rear" in text and "/wheel_4" not in text and len(text) < 300
+    path = write(tmp_path / "y.mcap", others)
+    says(refused("run", path, "--out", tmp_path / "a"), "/wheel_0", "4 more, see scanchain info")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "LONG", "--out", "a"],
+        ["run", "office", "--out", "LONG"],
+        ["run", "office", "--out", "a", "--gt", "LONG.tum"],
+        ["info", "LONG"],
+        ["convert", "LONG", "a.mcap"],
+        ["simulate", "office", "LONG.mcap"],
+        ["view", "LONG"],
+        ["evaluate", "LONG", "LONG"],
+    ],
+)
+def test_a_name_of_260_bytes_is_one_line_with_what_to_do(refused, tmp_path, office, words):
+    long = str(tmp_path / ("x" * 260))
+    places = {"office": str(office)} if words[0] == "run" else {}
+    places |= {"a": str(tmp_path / "a")}
+    text = refused(*(places.get(word, word.replace("LONG", long)) for word in words))
+    says(text, long, "longer than the file system takes (255 bytes a part); shorten it")
+    assert "Errno" not in text
+
+
+FULL = "the disk is full; free some space on it, or write to another one"
+
+
+class _FullDisk(io.RawIOBase):
+    """A file on a disk that takes so many bytes."""
+
+    def __init__(self, room):
+        self.room = room
+
+    def writable(self):
+        return True
+
+    def seekable(self):
+        return True
+
+    def tell(self):
+        return 0
+
+    def write(self, data):
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return len(data)
+
+
+@pytest.mark.parametrize("room", [10_000, 60_000])
+def test_a_full_disk_is_one_line_with_what_to_do_and_nothing_is_left(call, monkeypatch, tmp_path, room):
+    opened = Path.open
+
+    def open_there(path, *words, **options):
+        file = opened(path, *words, **options)
+        return io.BufferedWriter(_FullDisk(room)) if path.suffix == ".partial" else file
+
+    monkeypatch.setattr(Path, "open", open_there)
+    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--duration", "3")
+    assert code == 1
+    assert errors == f"error: {tmp_path / 'a.mcap'}: {FULL}\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fills_up_during_a_run_is_told_once_with_what_to_do(call, monkeypatch, tmp_path, office):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pipeline.runs.processing.write_results", fail)
+    code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off")
+    assert code == 1 and "Errno" not in errors and errors.count("full") == 1
+    assert errors.startswith(f"error: {tmp_path / 'a'}: {FULL}; ")
+    says(errors, "60 scans until then are in")
+
+
+def test_view_of_a_directory_that_is_not_there_says_so(refused, tmp_path):
+    for more in ([], ["--png", tmp_path / "a.png"]):
+        says(refused("view", tmp_path / "absent", *more), tmp_path / "absent", "no such directory")
 
 
 def test_several_lidars_ask_for_a_choice(refused, tmp_path):
@@ -320,6 +415,33 @@ def test_json_prints_the_metrics_and_nothing_else(call, tmp_path, office):
     assert json.loads(output)["scans"] == 60
 
 
+def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_results_written(call, tmp_path):
+    path, out = tmp_path / "radar.mcap", tmp_path / "a"
+    rng = np.random.default_rng(0)
+    with LogWriter(path) as log:
+        for k in range(20):
+            log.point_cloud("/radar", k * SECOND // 10 + STAMP_NS, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
+    code, output, errors = call("run", path, "--out", out, "--rerun", "off")
+    assert code == 1 and len(errors.splitlines()) == 1
+    metrics = json.loads((out / "metrics.json").read_text())
+    says(metrics["unreliable"], f"{metrics['degenerate']} of 20 scans are degenerate and {metrics['lost']} lost")
+    says(metrics["unreliable"], "scans have 12 valid points", "radar", "--topic")
+    assert errors.splitlines()[0] == f"error: {out}: {metrics['unreliable']}"
+    for summary in (output, (out / "summary.txt").read_text()):
+        assert summary.splitlines()[0] == f"UNRELIABLE     {metrics['unreliable']}"
+        assert summary.splitlines()[1].startswith(f"{path} /radar")
+    says((out / "report.html").read_text(), metrics["unreliable"].replace("'", "&#39;"))
+    assert json.loads((out / "run.json").read_text())["complete"] and (out / "map.ply").exists()
+    code, output, errors = call("run", path, "--out", out, "--force", "--rerun", "off", "--json")
+    assert code == 1 and json.loads(output)["unreliable"] == metrics["unreliable"]
+    assert errors.startswith(f"error: {out}: {metrics['unreliable']}\n")
+
+
+def test_a_run_of_the_office_is_reliable(call, tmp_path, office):
+    code, output, _ = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--json")
+    assert code == 0 and json.loads(output)["unreliable"] == ""
+
+
 def test_rerun_off_leaves_out_the_recording_alone(call, tmp_path, office):
     call("run", office, "--out", tmp_path / "with")
     call("run", office, "--out", tmp_path / "without", "--rerun", "off")
@@ -354,14 +476,74 @@ def test_start_end_and_every_choose_scans(call, tmp_path, office):
     assert (values["log.start_s"], values["log.end_s"], values["log.every"]) == (1.0, 3.0, 2)
 
 
-def test_the_short_flags_stand_for_keys_and_the_keys_beat_them(call, tmp_path, office):
+def test_the_short_flags_stand_for_keys(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     assert call("run", office, *out, "--matcher", "svd", "--no-loops", "--topic", "/scan")[0] == 0
     expected = {"matching.matcher": "svd", "loops.enabled": False, "log.topic": "/scan"}
     assert config(tmp_path / "a") == flatten(configured(2)) | expected
-    words = ["--matching.matcher", "plicp", "--loops.enabled=true", "--local_map.voxel_size_m", "0.15"]
-    assert call("run", office, *words, *out, "--matcher", "svd", "--no-loops")[0] == 0
-    assert config(tmp_path / "a") == flatten(configured(2)) | {"local_map.voxel_size_m": 0.15}
+    words = ["--matching.matcher", "svd", "--loops.enabled=true", "--local_map.voxel_size_m", "0.15"]
+    assert call("run", office, *words, *out)[0] == 0
+    expected = {"matching.matcher": "svd", "local_map.voxel_size_m": 0.15}
+    assert config(tmp_path / "a") == flatten(configured(2)) | expected
+
+
+def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_force(call, tmp_path, office):
+    words = ["--log.point_times", "clockwise", "--log.rate_hz=5", "--recording.local_map_every", "5"]
+    code, output, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", *words)
+    assert code == 0
+    (line,) = [line for line in output.splitlines() if line.startswith("configuration")]
+    assert line.endswith("chosen because the log is 2D")
+    for said, why in (
+        ("point_times clockwise", "laser scan"),
+        ("rate_hz 5", "stamps"),
+        ("every 5", "no recording"),
+    ):
+        (warning,) = [line for line in errors.splitlines() if said in line]
+        says(warning, "has no effect", why)
+    _, output, _ = call("doctor", office, "--log.point_times", "clockwise")
+    says(output, "--log.point_times clockwise has no effect")
+
+
+def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
+    out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
+    says(
+        call("run", office, *out)[1].splitlines()[0],
+        "(wheels /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
+    )
+    _, output, _ = call("run", office, *out, "--odometry.prior", "constant-velocity")
+    says(output.splitlines()[0], "wheels /odom, not used: odometry.prior is constant-velocity;")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "--topic", "/scan", "--topic", "/other"], ["--topic is given 2 times"]),
+        (["run", "--log.every", "2", "--log.every=3"], ["--log.every is given twice (2, 3)"]),
+        (
+            ["run", "--matcher", "svd", "--matching.matcher", "plicp"],
+            ["--matcher and --matching.matcher both set"],
+        ),
+        (["run", "--no-loops", "--loops.enabled", "true"], ["--no-loops and --loops.enabled both set"]),
+        (["run", "--gt", "/truth", "--log.ground_truth_topic", "/odom"], ["--gt and --log.ground_truth_topic"]),
+        (["run", "--out", "b"], ["--out is given 2 times"]),
+        (["compare", "--methods", "svd", "--methods", "plicp"], ["--methods is given 2 times"]),
+        (["doctor", "--topic", "/scan", "--log.topic", "/scan"], ["--topic and --log.topic"]),
+        (["info", "--log.topic", "/scan", "--log.topic", "/scan"], ["--log.topic is given twice"]),
+        (["batch", "--workers", "1", "--workers", "2"], ["--workers is given 2 times"]),
+    ],
+)
+def test_what_has_one_value_is_given_once(refused, tmp_path, office, words, said):
+    command, *flags = words
+    out = ["--out", tmp_path / "a"] if command in ("run", "compare", "batch") else []
+    says(refused(command, office, *out, *flags), *said)
+
+
+def test_every_command_refuses_an_option_given_twice_and_takes_a_flag_twice(call, tmp_path):
+    leaves = [(words, command) for words, command in commands() if not isinstance(command, click.Group)]
+    assert all(isinstance(command, OnceCommand) for _, command in leaves)
+    assert call("config", "show", "--json", "--json")[0] == 0
+    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--seed", "1", "--seed", "2")
+    assert code == 2 and "--seed is given 2 times" in errors
 
 
 def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):

@@ -1,6 +1,7 @@
 """Conversion to MCAP: the same scans out of it as out of the source, and what can go wrong."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -124,14 +125,32 @@ def test_a_rate_gives_stamps_to_files_that_are_only_numbered(tmp_path, capfd):
     for k, cloud in enumerate(recorders.clouds()):
         xyzi(cloud).tofile(tmp_path / "scans" / f"{k}.bin")
     words = ["convert", str(tmp_path / "scans"), str(tmp_path / "out.mcap")]
-    assert main(words) == 2 and "--rate 10" in capfd.readouterr().err
-    assert main([*words, "--rate", "-1"]) == 2 and "--rate is -1" in capfd.readouterr().err
+    assert main(words) == 2 and "--log.rate_hz 10" in capfd.readouterr().err
+    assert main([*words, "--rate", "-1"]) == 2 and "--rate: log.rate_hz is -1" in capfd.readouterr().err
+    assert main([*words, "--log.rate_hz", "4", "--rate", "4"]) == 2
+    assert "--rate and --log.rate_hz both set" in capfd.readouterr().err
     assert not (tmp_path / "out.mcap").exists()
-    assert main([*words, "--rate", "4", "--json"]) == 0
+    assert main([*words, "--log.rate_hz", "4", "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     assert said["messages"] == {"/points": 3} and said["damage"] == []
     direct = open_log(tmp_path / "scans", LogConfig(rate_hz=4.0))
     assert_same_log(open_log(tmp_path / "out.mcap"), direct)
+
+
+def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd):
+    said = [*office(20), *(replace(each, topic="/rear") for each in office(20) if each.topic == "/scan")]
+    source = write(tmp_path / "in.mcap", sorted(said, key=lambda each: each.log_ns))
+    keys = {"topic": "/rear", "start_s": 0.5, "end_s": 1.5, "every": 3}
+    flags = [f"--log.{key}={value}" for key, value in keys.items()]
+    assert main(["convert", str(source), str(tmp_path / "out.mcap"), *flags]) == 0
+    assert "/scan" not in capfd.readouterr().out
+    assert_same_log(open_log(tmp_path / "out.mcap"), open_log(source, LogConfig(**keys)))
+
+
+def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
+    words = ["convert", str(tmp_path), str(tmp_path / "out.mcap"), "--log.min_range_m", "1"]
+    assert main(words) == 2
+    assert "--log.min_range_m has no meaning for convert; its keys are log.rate_hz" in capfd.readouterr().err
 
 
 def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capfd):

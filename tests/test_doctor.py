@@ -191,6 +191,17 @@ def test_wheels_without_a_mounting_are_told(tmp_path):
     assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
 
 
+def test_a_lidar_that_pans_is_told_with_its_joint_and_range(tmp_path):
+    said = drive(mounted=False, wheels=True)
+    for k in range(40):
+        time_ns = STAMP_NS + k * STEP_NS
+        turn = ("base_link", "laser", 0.2, 0.0, 0.1 * k, 0.0)
+        said.append(transforms_said(time_ns, transforms(turn, stamp_ns=time_ns), "/tf"))
+    finding = diagnose(saved(tmp_path, said))["mounting"]
+    assert finding.severity == "note" and "wheels are carried over" in finding.effect
+    assert "base_link → laser in /tf turns from 0 to 223 deg about its z axis" in finding.found
+
+
 def test_scans_of_several_frames_on_one_topic_are_a_problem(tmp_path):
     said = [*drive(20, frame="left"), *drive(20, frame="right", mounted=False)]
     finding = diagnose(saved(tmp_path, said))["mounting"]

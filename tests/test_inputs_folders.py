@@ -189,6 +189,7 @@ def test_a_ply_may_be_in_any_byte_order_with_other_fields_and_elements(tmp_path,
     order = ">" if "big" in form else "<"
     rows = np.zeros(4, [("x", order + "f8"), ("y", order + "f4"), ("z", order + "f4"), ("ring", "u1")])
     rows["x"], rows["y"], rows["ring"] = [1, 2, 3, 4], [0.5, 1.5, 2.5, 3.5], [9, 8, 7, 6]
+    rows["z"] = [4, 3, 2, 1]
     body = rows.tobytes() + b"\x03" + bytes(12)
     if form == "ascii":
         body = b"".join(b" ".join(str(value).encode() for value in row) + b"\n" for row in rows) + b"3 0 1 2\n"
@@ -222,7 +223,7 @@ def test_files_that_are_only_numbered_need_a_rate(tmp_path):
     said = recorders.clouds(12)
     for k, cloud in enumerate(said):
         xyzi(cloud).tofile(tmp_path / f"scan{k}.bin")
-    with pytest.raises(InputError, match=r"scan0\.bin tell no stamp.*--log\.rate_hz 10.*--rate 10"):
+    with pytest.raises(InputError, match=r"scan0\.bin tell no stamp.*--log\.rate_hz 10"):
         read(tmp_path)
     log, scans = read(tmp_path, rate_hz=20.0)
     assert_points(scans, said)  # scan2 comes before scan10
@@ -257,6 +258,77 @@ def test_a_file_that_is_broken_is_left_out_and_told(tmp_path, name, content):
     log, scans = read(tmp_path)
     assert [scan.stamp_ns for scan in scans] == [2 * SECOND]
     assert name in log.damage[0] and "left out" in log.damage[0]
+
+
+def swept(k, count=300):
+    """Points (N, 6) as a lidar sees them, flat and wide, with intensity, ring and time."""
+    rng = np.random.default_rng(k)
+    columns = [rng.normal(0.0, 20.0, count), rng.normal(0.0, 20.0, count), rng.normal(-1.0, 0.7, count)]
+    return np.column_stack([*columns, rng.uniform(0, 1, count), rng.integers(0, 32, count), np.zeros(count)])
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin"])
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.parametrize("count", [300, None])
+def test_folders_of_arrays_open_whatever_their_columns_and_say_what_was_found(
+    tmp_path, suffix, columns, kind, count
+):
+    clouds = [swept(k, count or 250 + 37 * k)[:, :columns].astype(kind) for k in range(6)]
+    for k, cloud in enumerate(clouds):
+        if suffix == ".npy":
+            np.save(tmp_path / f"{k}.npy", cloud)
+        else:
+            cloud.tofile(tmp_path / f"{k}.bin")
+    log, scans = read(tmp_path, rate_hz=10.0)
+    for scan, cloud in zip(scans, clouds, strict=True):
+        np.testing.assert_array_equal(scan.points, cloud[:, :3].astype(np.float32))
+    names = " ".join(["x", "y", "z", "intensity", "column_5", "column_6"][:columns])
+    assert f"6 {suffix} files of {names}, {kind}" in log.notes[0]
+    assert f"{len(clouds[0])} points in 0{suffix}" in log.notes[0]
+
+
+@pytest.mark.parametrize("hole", [0.0, np.nan, np.inf])
+def test_raw_rows_of_three_numbers_are_not_taken_for_six_where_they_are_flat(tmp_path, hole):
+    cloud = swept(0)[:, :3].astype("float32")
+    cloud[:, 2] = 1.5
+    cloud[7] = hole
+    cloud.tofile(tmp_path / "1.0.bin")
+    log, (scan,) = read(tmp_path)
+    assert scan.points.shape == (299, 2) and "files of x y z, float32" in log.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])
+def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind):
+    cloud = np.rint(swept(1)[:, :3]).astype(kind)
+    np.save(tmp_path / "1.0.npy", cloud)
+    named = np.rec.fromarrays(list(cloud.T[::-1]), names="z,y,x")
+    np.save(tmp_path / "2.0.npy", named)
+    np.save(tmp_path / "3.0.npy", np.asfortranarray(cloud))
+    for scan in read(tmp_path)[1]:
+        np.testing.assert_array_equal(scan.points, cloud[np.any(cloud, axis=1)].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.ones((3, 900)), "is an array (3, 900) of float64; give numbers (N, 3), (N, 4)"),
+        (np.ones(900), "is an array (900,) of float64"),
+        (np.ones((9, 2)), "is an array (9, 2) of float64"),
+        (np.array([[{}, 1, 2]]), "is no .npy array of numbers"),
+    ],
+)
+def test_an_array_that_is_no_cloud_is_left_out_with_its_shape(tmp_path, array, said):
+    np.save(tmp_path / "1.0.npy", array, allow_pickle=True)
+    np.save(tmp_path / "2.0.npy", swept(0))
+    log, scans = read(tmp_path)
+    assert len(scans) == 1 and said in log.damage[0]
+
+
+def test_raw_bytes_that_are_no_rows_of_numbers_are_refused_with_what_to_do(tmp_path):
+    (tmp_path / "1.0.bin").write_bytes(np.random.default_rng(0).bytes(4800))
+    with pytest.raises(InputError, match=r"neither float32 nor float64.*save clouds as \.npy, PCD or PLY"):
+        read(tmp_path)
 
 
 def test_a_folder_of_nothing_that_is_known_says_what_is(tmp_path):

@@ -27,6 +27,7 @@ from naive_logs import (
 from scenes import shared_data
 
 from pipeline import lie
+from pipeline.__main__ import main
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
@@ -332,6 +333,38 @@ def test_the_mounting_is_the_identity_where_no_chain_joins_the_frames(tmp_path):
     np.testing.assert_array_equal(T, np.eye(3))
 
 
+def test_without_a_base_link_the_root_of_the_static_tree_is_the_base_and_said_to_be(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("imu_link", "mast", 1.0, 0.0, np.pi / 2, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+    assert log.mounting.base == "imu_link"
+    assert log.notes == ["the log has no transform from base_link to laser: imu_link is taken as the base"]
+
+
+def test_the_frame_of_the_wheels_is_the_base_before_the_root_is(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, child="chassis")),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.base == "chassis" and log.T_base_lidar[0, 2] == 0.5 and log.notes == []
+
+
+def test_a_frame_of_the_world_is_never_the_base(tmp_path):
+    T, _ = mounted(tmp_path / "a.mcap", ("map", "mast", 9.0, 0.0, 0.0, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0))
+    assert T[0, 2] == 0.5
+
+
 def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     yaw, x, y = 0.4, 0.2, -0.1
     T, points = mounted(tmp_path / "a.mcap", ("base_link", "laser", x, y, yaw, np.pi))
@@ -356,6 +389,165 @@ def test_a_cloud_keeps_the_full_mounting(tmp_path):
     np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
     np.testing.assert_allclose(log.T_base_lidar[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
     np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
+
+
+# clouds of planar scanners
+
+
+def cloud_of(k, points):
+    rows = np.zeros(len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
+    for name, column in zip("xyz", np.transpose(points), strict=True):
+        rows[name] = column
+    rows["t"] = np.arange(len(points)) * 1_000_000
+    stamp_ns = STAMP_NS + k * SECOND // 10
+    return cloud_said(stamp_ns, point_cloud(stamp_ns, rows))
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.3])
+def test_clouds_with_all_points_at_one_height_are_a_planar_log(tmp_path, height_m):
+    said = [cloud_of(k, [(1, 2, height_m), (3, 4, height_m), (5, 6, height_m)]) for k in range(3)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.dimension == 2 and log.T_base_lidar.shape == (3, 3)
+    assert f"the clouds of /points are planar (z = {height_m:g} m everywhere): read as a 2D log" in log.notes
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points, [(1, 2), (3, 4), (5, 6)])
+        np.testing.assert_allclose(scan.times_s, [0.0, 1e-3, 2e-3])
+        assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "points", [[(1, 2, 0)], [(1, 2, 0), (3, 4, 0), (5, 6, 0.01)], [(1, 0, 2), (3, 0, 4), (5, 0, 6)]]
+)
+def test_clouds_of_other_points_or_too_few_to_tell_are_not_planar(tmp_path, points):
+    log, _ = read(write(tmp_path / "a.mcap", [cloud_of(k, points) for k in range(5)]))
+    assert log.dimension == 3
+
+
+def test_a_cloud_that_leaves_the_plane_of_those_before_is_malformed(tmp_path):
+    flat = [(x, y, 0.0) for x, y in np.random.default_rng(0).uniform(1, 9, (1100, 2))]
+    path = write(tmp_path / "a.mcap", [cloud_of(0, flat), cloud_of(1, [*flat[:-1], (1, 1, 1)])])
+    with pytest.raises(InputError, match=r"scan 1 .* a point lies 1 m off the plane z = 0 m"):
+        read(path)
+
+
+# a mounting that /tf tells
+
+
+def joined(at, *entries):
+    """A message of /tf, logged at its stamp."""
+    stamp_ns = STAMP_NS + round(at * SECOND)
+    return transforms_said(stamp_ns, transforms(*entries, stamp_ns=stamp_ns), "/tf")
+
+
+def swinging(roll, *, parent="base_link", yaw=lambda at: 0.0, seconds=2.0, extra=()):
+    """Scans at 10 Hz of a lidar whose joint is told at 20 Hz, ``roll`` and ``yaw`` of the seconds."""
+    said = [*extra]
+    for k in range(round(20 * seconds)):
+        at = k / 20
+        said.append(joined(at, (parent, "laser", 0.2, 0.0, yaw(at), roll(at))))
+        said += [] if k % 2 else [one_scan(at, at)]
+    return said
+
+
+def tilt(at):
+    return 0.7 * np.sin(2.0 * np.pi * at)
+
+
+@pytest.mark.parametrize("parent", ["base_link", "torso"])
+def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_path, capfd, parent):
+    path = write(tmp_path / "a.mcap", swinging(tilt, parent=parent))
+    with pytest.raises(InputError) as caught:
+        open_log(path)
+    for part in (
+        f"{parent} → laser in /tf turns from -40 to 40 deg about its x axis",
+        "--topic",
+        "/scan",
+        "--end",
+    ):
+        assert part in str(caught.value)
+    for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
+        assert main([str(word) for word in words]) == 2
+        assert capfd.readouterr().err == f"error: {caught.value}\n"
+    assert main(["info", str(path)]) == 0
+    assert f"problem   {caught.value}" in capfd.readouterr().out
+
+
+def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0))))
+    log, scans = read(path, end_s=0.95)
+    assert len(scans) == 10 and log.mounting.motion is None
+    with pytest.raises(InputError, match="does not stay in one plane"):
+        open_log(path)
+
+
+def test_a_planar_lidar_that_leaves_its_plane_where_nobody_looked_before_is_refused_there(tmp_path):
+    said = swinging(lambda at: 0.5 if 1.05 < at < 1.25 else 0.0, seconds=40.0)
+    path = write(tmp_path / "a.mcap", said, chunk_size=300)
+    log = open_log(path)
+    assert log.mounting.motion is None
+    with pytest.raises(InputError, match="laser has turned by 29 deg in /tf at scan 11"):
+        list(log.scans())
+
+
+@pytest.mark.parametrize("seconds", [2.0, 40.0])
+def test_a_transform_of_tf_that_repeats_itself_is_a_static_mounting(tmp_path, seconds):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.0, yaw=lambda at: 0.4, seconds=seconds))
+    log, _ = read(path)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.4), atol=1e-12)
+    assert log.mounting.motion is None and log.notes == []
+    assert log.mounting.source == "by transforms of /tf, which do not change"
+
+
+def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
+    fixed = transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.0, 0.0, 0.0)))
+    for name, mount in (("static", [fixed]), ("none", [])):
+        said = [*mount]
+        for k in range(20):
+            robot = ("odom", "base_link" if mount else "laser", 0.1 * k, 0.0, 0.1 * k, 0.0)
+            said += [joined(k / 10, ("map", "odom", 0.0, 0.01 * k, 0.0, 0.0), robot), one_scan(k / 10, k / 10)]
+        log, scans = read(write(tmp_path / f"{name}.mcap", said))
+        assert log.mounting.motion is None and len(scans) == 20 and log.notes == []
+        assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
+
+
+@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world"])
+def test_a_robot_that_turns_on_the_spot_in_a_frame_of_the_world_is_no_mount(tmp_path, frame):
+    log, _ = read(write(tmp_path / "a.mcap", swinging(tilt, parent=frame)))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
+def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
+    said = []
+    for k in range(20):
+        said += [joined(k / 10, ("start", "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
+def test_wheels_are_carried_over_to_a_lidar_that_pans_by_tf_at_the_stamp(tmp_path):
+    yaw = {0.0: 0.0, 0.1: 0.2, 0.2: 0.4}
+    said = []
+    for at, turn in yaw.items():
+        said += [joined(at, ("base_link", "laser", 0.2, 0.0, turn, 0.0)), *wheels((at, at, 10.0 * at))]
+    said += [one_scan(0.21, 0.0), one_scan(0.22, 0.05), one_scan(0.23, 0.1)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert "base_link → laser in /tf turns from 0 to 23 deg about its z axis" in log.notes[0]
+    for scan, at in zip(scans, (0.0, 0.05, 0.1), strict=True):
+        expected = lie.pose_2d(10.0 * at, 0.0, 0.0) @ lie.pose_2d(0.2, 0.0, 2.0 * at)
+        np.testing.assert_allclose(scan.T_odom_base @ log.T_base_lidar, expected, atol=1e-9)
+
+
+def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
+    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = []
+    for k in range(20):
+        time_ns = STAMP_NS + k * SECOND // 10
+        said += [joined(k / 10, ("base_link", "lidar", 0.0, 0.0, 0.0, tilt(k / 10)))]
+        said += [*wheels((k / 10, k / 10, 0.0)), cloud_said(time_ns, point_cloud(time_ns, rows))]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion.leaves_plane and "poses are the lidar's" in log.notes[0]
+    turned = [lie.apart(log.T_base_lidar, scan.T_odom_base @ log.T_base_lidar)[1] for scan in scans]
+    np.testing.assert_allclose(turned, np.abs([tilt(k / 10) for k in range(20)]), atol=1e-9)
 
 
 # real logs
@@ -407,6 +599,13 @@ def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
             rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
             assert message.log_time == scan.log_time_ns
             assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
+
+
+def test_the_mounting_of_a_real_lidar_on_its_imu_is_read():
+    files = [shared_data("3d/kitti_0005_first60.mcap"), shared_data("3d/kitti_0005_first60_imu_gnss.mcap")]
+    log = open_log(files)
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [0.811, -0.307, 0.802], atol=1e-3)
+    assert log.mounting.base == "imu_link" and "imu_link is taken as the base" in log.notes[0]
 
 
 def test_kitti_ground_truth_is_that_of_the_published_file():

@@ -44,14 +44,14 @@ def room(folder):
     """A lidar, mounted off the base, that drives through a square room."""
     mounting = transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))
     said = [transforms_said(STAMP_NS, mounting)]
-    angles = -3.0 + 0.05 * np.arange(120)
+    angles = -3.0 + 0.0125 * np.arange(480)
     for k in range(8):
         stamp_ns = STAMP_NS + k * SECOND // 10
         x = 0.05 * k
         with np.errstate(divide="ignore"):
             along = np.where(np.cos(angles) > 0, (4.0 - x) / np.cos(angles), (-5.0 - x) / np.cos(angles))
             across = np.where(np.sin(angles) > 0, 3.0 / np.sin(angles), -2.0 / np.sin(angles))
-        scan = laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.05)
+        scan = laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.0125)
         said.append(scan_said(stamp_ns + 5_000_000, scan))
     return write(folder / "room.mcap", said)
 

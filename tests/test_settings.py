@@ -36,6 +36,40 @@ def says(text, *parts):
     assert not missing, f"{missing} not in: {text}"
 
 
+# what has no effect
+
+
+@pytest.mark.parametrize(
+    ("dimension", "key", "text", "why"),
+    [
+        (2, "loops.place_drift", "0.2", "the log is 2D"),
+        (2, "maps.slice_min_z_m", "-1", "the log is 2D"),
+        (3, "loops.refine", "false", "the log is 3D"),
+        (3, "odometry.max_turn_rad_s", "3", "the log is 3D"),
+        (3, "log.revolution_s", "0.2", "log.point_times"),
+        (2, "graph.robust_scale", "2", "graph.robust"),
+    ],
+)
+def test_a_flag_without_effect_is_told_with_its_reason_and_not_as_in_force(dimension, key, text, why):
+    others = [flag("graph.robust", "none")]
+    settings = load_settings(dimension, overrides=[*others, flag(key, text)])
+    assert key not in settings.source and "graph.robust none" in settings.source
+    (line,) = settings.without_effect
+    says(line, f"--{key} {text}", "no effect", why)
+
+
+def test_what_a_file_sets_without_effect_is_told_too_and_what_it_repeats_is_not(tmp_path):
+    file = written(tmp_path, "[loops]\nenabled = false\ndrift = 0.2\nmin_travel_m = 10.0\n")
+    settings = load_settings(2, file=file)
+    assert settings.without_effect == (f"{file}: loops.drift 0.2 has no effect: loops.enabled is false",)
+    assert load_settings(2, overrides=[flag("loops.drift", "0.2")]).without_effect == ()
+
+
+def test_a_whole_configuration_given_back_has_only_settings_with_effect(tmp_path):
+    file = written(tmp_path, dump(configured(2)))
+    assert load_settings(2, file=file).without_effect == ()
+
+
 # what wins
 
 

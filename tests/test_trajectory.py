@@ -70,11 +70,22 @@ def test_comments_and_empty_lines_are_passed_over(tmp_path):
     np.testing.assert_allclose(trajectory.poses[1, :3, :3], np.eye(3))
 
 
+@pytest.mark.parametrize("mark", [",", ", ", ";", " ; "])
+def test_poses_may_be_separated_by_commas_or_semicolons(tmp_path, mark):
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["#stamp,x,y,z", mark.join(["1.5", "1", "2", "3", "0", "0", "0", "1"]), ""]))
+    trajectory = read_tum(path)
+    assert trajectory.stamps_ns.tolist() == [1500000000]
+    np.testing.assert_array_equal(trajectory.poses[0, :3, 3], [1, 2, 3])
+
+
 @pytest.mark.parametrize(
     ("line", "says"),
     [
         ("1.0 1 2 3 0 0 0", "7 fields"),
-        ("1.0,1,2,3,0,0,0,1", "1 fields"),
+        ("1.0,1,2,3,0,0,0", "7 fields"),
+        ("timestamp,tx,ty,tz,qx,qy,qz,qw", "begin a line of column names with #"),
+        ("1317042145963999987 1 2 3 0 0 0 1", "give it in seconds"),
         ("noon 1 2 3 0 0 0 1", "'noon'"),
         ("nan 1 2 3 0 0 0 1", "nan"),
         ("1e30 1 2 3 0 0 0 1", "64 bits"),

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.batch.table import totals
-from pipeline.batch.task import Row
+from pipeline.batch.task import Row, State
 from pipeline.runs.metrics import Metrics
 from pipeline.source import source_of, without_keys
 from pipeline.trajectory import read_tum
@@ -41,11 +41,13 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     """Draw and write the page; runs are looked up in the directory."""
     done = [row for row in rows if row.metrics is not None]
     missing = len(rows) - len(done)
+    unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
     page = Page(
         title=f"Batch of {len(rows):,} logs",
         subtitle="Each was run in a process of its own.",
         facts=tuple(totals(rows)),
-        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) if missing else (),
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
+        + tuple(unreliable),
         notes=(),
         sections=(_logs(rows), *_spread(done), *_ways(directory, done)),
         folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),

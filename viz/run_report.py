@@ -42,7 +42,7 @@ def write_run_report(directory: Path) -> None:
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
-        warnings=(made.stopped,) if made.stopped else (),
+        warnings=tuple(line for line in (metrics.unreliable, made.stopped) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         folds=(
@@ -55,7 +55,8 @@ def write_run_report(directory: Path) -> None:
 
 def _summary_lines(directory: Path) -> list[str]:
     """The summary's heading, then its notes."""
-    heading, *lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
+    lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
+    heading, *lines = [line for line in lines if not line.startswith("UNRELIABLE")]
     return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
 
 

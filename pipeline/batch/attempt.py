@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 from threading import Event
 
 import msgspec
@@ -40,13 +39,15 @@ def _tried(task: Task, stop: Event | None) -> Row:
         stop=stop,
     )
     state, reason = _verdict(task, ending)
-    metrics = None
-    if state is State.DONE:
-        metrics = msgspec.json.decode((task.run / "metrics.json").read_bytes(), type=Metrics)
+    metrics = _metrics(task) if state.has_result else None
     run = task.run.name if metrics is not None else ""
     return Row(
         task.name, task.sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics
     )
+
+
+def _metrics(task: Task) -> Metrics:
+    return msgspec.json.decode((task.run / "metrics.json").read_bytes(), type=Metrics)
 
 
 def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
@@ -60,15 +61,19 @@ def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
         case KilledFor.STOP:
             return State.NOT_RUN, "stopped by the user"
         case KilledFor.NOTHING:
-            return _own_ending(ending, task.said_file)
+            return _own_ending(ending, task)
 
 
-def _own_ending(ending: Ending, said_file: Path) -> tuple[State, str]:
-    """What the exit code and the last words mean."""
+def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
+    """What the exit code and what it said mean."""
     if ending.code == 0:
         return State.DONE, ""
-    said = said_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = task.said_file.read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(said) if line.startswith("error: ")), "")
+    if ending.code == 1 and (task.run / "metrics.json").is_file():
+        unreliable = _metrics(task).unreliable
+        if unreliable and error.endswith(unreliable):
+            return State.UNRELIABLE, unreliable
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:

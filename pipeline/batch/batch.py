@@ -69,9 +69,13 @@ class Batched:
     summary: str
 
     @property
-    def unfinished(self) -> int:
-        """How many logs have no result."""
-        return sum(row.state is not State.DONE for row in self.rows)
+    def failures(self) -> str:
+        """How many logs have no result, or one that is not reliable; empty where there are none."""
+        absent = sum(not row.state.has_result for row in self.rows)
+        unreliable = sum(row.state is State.UNRELIABLE for row in self.rows)
+        parts = [f"{absent:,} of {len(self.rows):,} logs have no result"] if absent else []
+        parts += [f"of {unreliable:,} most scans are degenerate or lost"] if unreliable else []
+        return ", ".join(parts)
 
 
 def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:

@@ -20,11 +20,17 @@ class State(StrEnum):
     """How a log ended."""
 
     DONE = "done"
+    UNRELIABLE = "unreliable"
     FAILED = "failed"
     CRASHED = "crashed"
     TIMED_OUT = "timed out"
     OUT_OF_MEMORY = "out of memory"
     NOT_RUN = "not run"
+
+    @property
+    def has_result(self) -> bool:
+        """Whether there is a run directory, even if most of its scans are degenerate or lost."""
+        return self in (State.DONE, State.UNRELIABLE)
 
 
 class Task(Struct, frozen=True):
@@ -99,7 +105,7 @@ def finished_row(task: Task) -> Row | None:
         row = msgspec.json.decode(task.row_file.read_bytes(), type=Row)
     except (OSError, msgspec.DecodeError):
         return None
-    is_done = row.state is State.DONE and (Path(task.out) / row.run / "metrics.json").is_file()
+    is_done = row.state.has_result and (Path(task.out) / row.run / "metrics.json").is_file()
     return msgspec.structs.replace(row, log=task.name) if is_done else None
 
 

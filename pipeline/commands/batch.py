@@ -97,11 +97,8 @@ def batch(
     viewing.present_batch(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
     click.echo(f"written        {out}: {files}; {batched.kept:,} results were there before")
-    if batched.unfinished:
-        total = len(batched.rows)
-        raise ScanchainError(
-            f"{batched.unfinished:,} of {total:,} logs have no result; {out}/summary.txt says why"
-        )
+    if batched.failures:
+        raise ScanchainError(f"{batched.failures}; {out}/summary.txt says why")
 
 
 def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:

@@ -11,9 +11,8 @@ import click
 from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.limit_options import limit_options
 from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.errors import ScanchainError
-from pipeline.settings import Override
 from pipeline.source import Source
 
 if TYPE_CHECKING:
@@ -88,13 +87,12 @@ def compare(
     from pipeline.compare.table import TABLE_FILE, text
 
     truth_file, truth_topic = ground_truth(gt)
-    shortcuts = (Override("log.topic", topic, "--topic"),) if topic else ()
     contest = Contest(
         logs=logs,
         out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         settings_file=settings,
-        overrides=(*shortcuts, *truth_topic, *overrides(ctx)),
+        overrides=overrides(ctx, [*alias("log.topic", topic, "--topic"), *truth_topic]),
         ground_truth=truth_file,
         relations=relations,
         repeat=repeat,

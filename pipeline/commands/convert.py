@@ -8,19 +8,24 @@ from pathlib import Path
 import click
 
 from pipeline.commands.log_type import LOG
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.errors import InputError
+from pipeline.settings import load_settings
 from pipeline.source import Source
 
+_KEYS = tuple(f"log.{name}" for name in ("rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks"))
 
-@click.command()
+
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
-@click.option(
-    "--rate", default=0.0, metavar="HZ", help="How often scans come whose files are not named by their stamps."
-)
+@click.option("--rate", metavar="HZ", help="Short for --log.rate_hz.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def convert(source: Source, destination: Path, rate: float, force: bool, as_json: bool) -> None:
+@click.pass_context
+def convert(
+    ctx: click.Context, source: Source, destination: Path, rate: str | None, force: bool, as_json: bool
+) -> None:
     """Write a log of another format as MCAP. The other commands take all of these as they are, too.
 
     \b
@@ -32,22 +37,30 @@ def convert(source: Source, destination: Path, rate: float, force: bool, as_json
       a KITTI raw drive   ..._sync, calib_imu_to_velo.txt beside it for the ground truth
       KITTI odometry      sequences/00, poses/00.txt beside sequences for the ground truth
       an address          https:// or s3://, of any of the files above
-      a folder of clouds  PCD, PLY, or .bin of float32 x y z intensity, named by their stamps, or with --rate
+      a folder of clouds  PCD, PLY, .npy or .bin of rows x y z (intensity ...), named by their stamps, or with
+                          --log.rate_hz
+
+    Messages stay as they are. Keys that choose some: --log.topic (one of several lidars), --log.start_s,
+    --log.end_s, --log.every.
 
     \b
     Examples:
       scanchain convert intel.clf.bz2 intel.mcap
       scanchain convert 2011_09_26/2011_09_26_drive_0001_sync kitti_0001.mcap
-      scanchain convert scans/ scans.mcap --rate 10
+      scanchain convert scans/ scans.mcap --log.rate_hz 10
+      scanchain convert drive.bag minute.mcap --log.start_s 60 --log.end_s 120
       scanchain convert drive.bag drive.mcap --json
     """
-    if rate < 0.0:
-        raise InputError(f"--rate is {rate:g} Hz; it must be positive")
+    chosen = overrides(ctx, alias("log.rate_hz", rate, "--rate"))
+    for override in chosen:
+        if override.key not in _KEYS:
+            raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")
+    config = load_settings(overrides=chosen).config.log
     from pipeline.commands.terminal import Terminal
     from pipeline.logs.convert import convert as convert_log
 
     with Terminal("messages") as terminal:
-        done = convert_log([source], destination, rate_hz=rate, force=force, progress=terminal.count)
+        done = convert_log([source], destination, config=config, force=force, progress=terminal.count)
     for line in done.damage:
         click.echo(f"warning: {line}", err=True)
     if as_json:

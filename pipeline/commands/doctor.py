@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import click
 
 from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, overrides
-from pipeline.settings import Override, load_settings
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
+from pipeline.settings import load_settings
 from pipeline.source import Source
 
 if TYPE_CHECKING:
@@ -36,13 +36,15 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_j
     from pipeline.commands.terminal import Terminal
     from pipeline.logs.doctor import examine
 
-    chosen = (*([Override("log.topic", topic, "--topic")] if topic else []), *overrides(ctx))
+    chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
     early = load_settings(overrides=chosen).config
 
     with Terminal("scans") as terminal:
         found = examine(
             logs, lambda dimension: load_settings(dimension, overrides=chosen).config, early.log, terminal.count
         )
+    idle = load_settings(found.dimension, overrides=chosen, idle=found.idle_keys).without_effect
+    found = replace(found, notes=(*found.notes, *idle))
     click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
 
 

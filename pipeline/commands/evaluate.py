@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 _PATH = click.Path(path_type=Path)
 
 
-@click.command()
+@click.command(cls=OnceCommand)
 @click.argument("estimate", metavar="EST.tum", type=_PATH)
 @click.argument("reference", metavar="[GT.tum]", required=False, type=_PATH)
 @click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")

@@ -52,7 +52,8 @@ def _text(log: LogInfo) -> str:
         x, y = (row[-1] for row in log.T_base_lidar[:2])
         lines += [
             f"lidar     {log.lidar}: {log.dimension}D, {log.scans:,} scans",
-            f"mounting  at x {x:.3f} m, y {y:.3f} m on the base",
+            f"mounting  at x {x:.3f} m, y {y:.3f} m on {log.base_frame or 'the base'}"
+            + (f" at first; {log.mount_motion}" if log.mount_motion else ""),
             f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
             *([f"times     {log.point_times.removeprefix('point times: ')}"] if log.point_times else []),
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -11,7 +12,7 @@ import click
 
 from pipeline.commands.graph_answer import Answer
 from pipeline.commands.outputs import check_output
-from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.errors import InputError
 from pipeline.settings import Override, load_settings
 
@@ -86,7 +87,7 @@ def optimize(
     """
     outputs = Outputs(out, marginals, png, recording)
     outputs.check(force)
-    settings = [*_shortcuts(shortcuts), *overrides(ctx)]
+    settings = overrides(ctx, _aliases(shortcuts))
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     file = _read(source, cast("Indefinite", indefinite), is_suspicious)
@@ -152,12 +153,12 @@ class Outputs:
         return written
 
 
-def _shortcuts(flags: dict[str, str | None]) -> list[Override]:
-    """The short flags as the keys they stand for; a ``--graph.key`` flag beats them."""
-    return [Override(f"graph.{name}", value, f"--{name}") for name, value in flags.items() if value is not None]
+def _aliases(options: dict[str, str | None]) -> list[Override]:
+    """The keys that the short options stand for."""
+    return [each for name, value in options.items() for each in alias(f"graph.{name}", value, f"--{name}")]
 
 
-def _config(settings: list[Override]) -> GraphConfig:
+def _config(settings: Sequence[Override]) -> GraphConfig:
     """The graph's branch of the configuration; nothing else means anything here."""
     for setting in settings:
         if not setting.key.startswith("graph."):

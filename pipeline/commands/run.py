@@ -11,7 +11,7 @@ import click
 
 from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
 from pipeline.source import Source
@@ -98,7 +98,7 @@ def run(
         logs=logs,
         out=out,
         config_file=config,
-        overrides=(*_shortcuts(shortcuts), *truth_topic, *overrides(ctx)),
+        overrides=overrides(ctx, [*_aliases(shortcuts), *truth_topic]),
         sinks=_sinks(rerun),
         ground_truth=truth_file,
         force=force,
@@ -109,6 +109,9 @@ def run(
     viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
         finished = run_log(job, viewing.record, terminal, viewing.report)
+    unreliable = finished.metrics.unreliable
+    if unreliable:
+        click.echo(f"error: {finished.path}: {unreliable}", err=True)
     for warning in finished.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
@@ -116,20 +119,18 @@ def run(
         raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}")
     if not as_json:
         click.echo(f"written        {out}")
+    if unreliable:
+        ctx.exit(1)
 
 
 _KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}
 
 
-def _shortcuts(flags: dict[str, str | bool | None]) -> list[Override]:
-    """The short flags as the keys they stand for; a ``--section.key`` flag beats them."""
+def _aliases(options: dict[str, str | bool | None]) -> list[Override]:
+    """The keys that the short options stand for."""
     keys = _KEYS | {"matcher": "matching.matcher"}
-    result = [
-        Override(key, value, f"--{name}")
-        for name, key in keys.items()
-        if isinstance(value := flags.get(name), str)
-    ]
-    if flags.get("no_loops"):
+    result = [each for name, key in keys.items() for each in alias(key, options.get(name), f"--{name}")]
+    if options.get("no_loops"):
         result.append(Override("loops.enabled", "false", "--no-loops"))
     return result
 

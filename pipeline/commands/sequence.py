@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from pipeline.commands.override_command import OnceCommand
+
 
 @click.group()
 def sequence() -> None:
@@ -19,7 +21,7 @@ def sequence() -> None:
     """
 
 
-@sequence.command("list")
+@sequence.command("list", cls=OnceCommand)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_sequences(as_json: bool) -> None:
     """List the catalogue.
@@ -43,7 +45,7 @@ def list_sequences(as_json: bool) -> None:
         click.echo(f"{name:<{width}}  {entry.dimension}D  {kind:<9}  {entry.title}")
 
 
-@sequence.command("get")
+@sequence.command("get", cls=OnceCommand)
 @click.argument("name", metavar="NAME")
 @click.option(
     "--out",

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
+from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
 
-@click.command()
+@click.command(cls=OnceCommand)
 @click.argument("world", metavar="WORLD")
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
 @click.option("--seed", default=0, show_default=True, metavar="N", help="The same seed, the same bytes.")

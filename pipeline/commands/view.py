@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import Viewing
 
 
-@click.command()
+@click.command(cls=OnceCommand)
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option(
@@ -31,6 +32,10 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
       scanchain view runs/log --web
       scanchain view runs/log --png log.png
     """
+    if not directory.exists():
+        raise InputError(
+            f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
+        )
     viewing: Viewing = ctx.obj
     if png is not None:
         viewing.draw(directory, png)
@@ -38,7 +43,9 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
     if not path.exists():
-        raise InputError(f"{path}: no such file; scanchain run writes it unless --rerun leaves out save")
+        raise InputError(
+            f"{directory}: holds no recording.rrd; scanchain run writes it unless --rerun leaves out save"
+        )
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
     viewing.show(path, web)

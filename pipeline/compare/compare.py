@@ -85,6 +85,8 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
     log = open_log(contest.logs, load_settings(overrides=contest.overrides).config.log)
     names = contest.methods or default_names(log.dimension)
     methods = resolve(names, log.dimension, file=contest.settings_file, overrides=contest.overrides)
+    for line in load_settings(log.dimension, overrides=contest.overrides, idle=log.idle_keys()).without_effect:
+        progress.tell(line)
     directory = RunDirectory(contest.out, force=contest.force)
     provenance = describe_start(contest.command, contest.logs, ", ".join(names))
     with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:

@@ -169,6 +169,13 @@ def _mounting(seen: Survey) -> Finding:
         remedy = "record /tf_static, or --odometry.prior constant-velocity"
         return Finding("mounting", Severity.WARNING, told, effect, remedy)
     place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
+    mounting = seen.log.mounting
+    if mounting.motion is not None:
+        effect = "trajectories are the lidar's, its motion on the robot included"
+        effect += "; wheels are carried over to it by /tf" if seen.log.has_odometry else ""
+        return Finding("mounting", Severity.NOTE, f"the lidar moves: {mounting.motion}", effect)
     if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
         return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not told")
-    return Finding("mounting", Severity.OK, f"lidar frame {frame}: at {place} m of the base, by static transforms")
+    return Finding(
+        "mounting", Severity.OK, f"lidar frame {frame}: at {place} m of {mounting.base_name}, {mounting.source}"
+    )

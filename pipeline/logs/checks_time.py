@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.logs.finding import Finding, Severity
+from pipeline.logs.readers import is_scan
 from pipeline.logs.survey import Survey
 
 _GAP_PERIODS = 2.5
@@ -28,7 +29,7 @@ def check_time(seen: Survey) -> Iterator[Finding]:
     yield _order(seen)
     yield _clock(seen)
     yield _wheels(seen)
-    if seen.log.dimension == 3:
+    if not is_scan(seen.log.lidar):
         yield _point_times(seen)
 
 

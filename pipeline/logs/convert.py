@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs.opening import index_files
 from pipeline.logs.records import FileIndex
-from pipeline.logs.selection import EVERYTHING
-from pipeline.logs.stream import decoded_messages
-from pipeline.logs.topics import topics_of
+from pipeline.logs.selection import EVERYTHING, chosen_span, whole_span
+from pipeline.logs.stream import Decoded, decoded_messages
+from pipeline.logs.topics import find_lidar, is_lidar, topics_of
 from pipeline.logs.write import LogWriter
 from pipeline.source import Source
 
-_AHEAD = 4  # blocks
+_DEFAULTS = LogConfig()
+_WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,26 +35,28 @@ def convert(
     sources: Sequence[Source],
     destination: Path,
     *,
-    rate_hz: float = 0.0,
+    config: LogConfig = _DEFAULTS,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Converted:
-    """Write every message of the sources, one log, by log time. ROS messages stay as they are, byte by byte.
+    """Write the messages of the sources, one log, by log time. ROS messages stay as they are, byte by byte.
 
-    rate_hz : as for ``index_files``. Raises InputError for what cannot be read or written.
+    config : what is left out: what lies before ``start_s`` and behind ``end_s``, the lidars beside ``topic``, all
+        but every ``every``-th scan; static transforms are kept, from the start on
+    Raises InputError for what cannot be read or written.
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
-    indexes = index_files(sources, rate_hz)
+    indexes = index_files(sources, config.rate_hz)
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
-    if len(indexes) == 1 and indexes[0].make is None and not is_folder:
+    is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
+    if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
     total = sum(sum(index.counts.values()) for index in indexes)
-    counts = dict.fromkeys(topics_of(indexes), 0)
+    counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
     damage = [line for index in indexes for line in index.damage]
     with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
-        decoders = dict.fromkeys(counts, bytes)
-        for message in decoded_messages(indexes, decoders, EVERYTHING, ahead=_AHEAD, damage=damage):
+        for message in _messages(indexes, counts, config, damage):
             assert isinstance(message.value, bytes)
             log.copy(message.channel, message.log_time_ns, message.value)
             counts[message.channel.topic] += 1
@@ -63,6 +68,29 @@ def convert(
             )
     notes = tuple(line for index in indexes for line in index.notes)
     return Converted(destination, counts, notes, tuple(damage))
+
+
+def _messages(
+    indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
+) -> Iterator[Decoded]:
+    """The messages to write. Static transforms come first, and none before the chosen part begins."""
+    span, ahead = chosen_span(whole_span(indexes), config), config.prefetch_chunks
+    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith("tf_static")}
+    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, ahead=ahead, damage=[]):
+        yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
+    others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
+    scans = Counter[str]()
+    for message in decoded_messages(indexes, others, span, ahead=ahead, damage=damage):
+        scans[message.channel.topic] += is_lidar(message.channel)
+        if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
+            yield message
+
+
+def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
+    """The topics to write: all, but of several lidars only the one that is asked for."""
+    lidar = find_lidar(indexes, topic) if topic else None
+    channels = topics_of(indexes)
+    return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]
 
 
 def _profile(indexes: Sequence[FileIndex]) -> str:

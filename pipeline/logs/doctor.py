@@ -18,13 +18,17 @@ _ORDER = tuple(reversed(Severity))
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The findings about a log, the gravest first; ``notes`` are what opening it assumed."""
+    """The findings about a log, the gravest first.
+
+    ``notes`` are what opening it assumed, ``idle_keys`` the settings that have no effect on it, and why.
+    """
 
     files: tuple[str, ...]
     topic: str
     dimension: int
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
+    idle_keys: dict[str, str]
 
 
 def examine(
@@ -42,4 +46,4 @@ def examine(
     seen = survey(log, progress)
     findings = [*check_time(seen), *check_scans(seen, config_of(log.dimension).preprocess)]
     ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
-    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes)
+    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())

@@ -1,4 +1,4 @@
-"""The first messages of a topic, before a log is read as a whole."""
+"""Some messages of a topic, the first or some from all over the log, before it is read as a whole."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TypeVar
 
 from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.counting import messages_of
-from pipeline.logs.records import FileIndex
+from pipeline.logs.records import Block, FileIndex
+from pipeline.logs.selection import EVERYTHING, Span
 
 T = TypeVar("T")
 
@@ -16,15 +17,43 @@ _BLOCKS = 8  # of a topic, from the first on, that are searched
 
 def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
     """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
+    yield from _decoded(indexes, _blocks(indexes, topic)[:_BLOCKS], topic, decode, EVERYTHING)
+
+
+def spread_messages(
+    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span
+) -> Iterator[T]:
+    """What a topic's messages in blocks from all over a span decode to; malformed ones are passed over."""
+    blocks = [block for block in _blocks(indexes, topic) if span.meets(block)]
+    chosen = (
+        blocks
+        if len(blocks) <= _BLOCKS
+        else [blocks[k * (len(blocks) - 1) // (_BLOCKS - 1)] for k in range(_BLOCKS)]
+    )
+    yield from _decoded(indexes, chosen, topic, decode, span)
+
+
+def _blocks(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
+    """Those that may hold messages of the topic, by time."""
     blocks = [
         block
         for index in indexes
         for block in index.blocks
         if index.may_hold(block, {n for n, channel in index.channels.items() if channel.topic == topic})
     ]
-    for block in sorted(blocks, key=lambda block: block.start_ns)[:_BLOCKS]:
+    return sorted(blocks, key=lambda block: block.start_ns)
+
+
+def _decoded(
+    indexes: Sequence[FileIndex],
+    blocks: Sequence[Block],
+    topic: str,
+    decode: Callable[[memoryview], T],
+    span: Span,
+) -> Iterator[T]:
+    for block in blocks:
         for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic:
+            if message.channel.topic == topic and span.begin_ns <= message.log_time_ns <= span.end_ns:
                 try:
                     yield decode(message.data)
                 except MalformedMessageError:

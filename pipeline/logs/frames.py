@@ -10,7 +10,7 @@ from pipeline import lie
 from pipeline.data import Pose
 from pipeline.logs.first_messages import first_messages
 from pipeline.logs.mounting import in_plane, root_frame, static_transforms
-from pipeline.logs.poses import chain
+from pipeline.logs.poses import StampedPose, chain
 from pipeline.logs.readers import cloud_reader, is_scan, scan_reader
 
 if TYPE_CHECKING:
@@ -25,10 +25,16 @@ class MovingFrame(NamedTuple):
 
 
 def moving_frame(log: Log) -> MovingFrame:
-    """The root of the fixed transforms above the lidar, the lidar's own frame where the log has none."""
+    """The root of the fixed transforms above the lidar, the lidar's own frame where the log has none.
+
+    Transforms of /tf that join it to the base and do not change are as good as fixed ones.
+    """
     read = scan_reader(log.lidar) if is_scan(log.lidar) else cloud_reader(log.lidar)
     lidar = next(first_messages(log.indexes, log.topic, lambda data: read(data).frame), "").lstrip("/") or "lidar"
     transforms = static_transforms(log.indexes)
+    mounting = log.mounting
+    if mounting.joints and mounting.motion is None:
+        transforms.append(StampedPose(0, mounting.base, lidar, mounting.T_base_lidar))
     root = root_frame(transforms, lidar)
     T_root_lidar = chain(transforms, root, lidar)
     T_root_lidar = np.eye(4) if T_root_lidar is None else T_root_lidar

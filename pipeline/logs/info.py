@@ -32,7 +32,8 @@ class LogInfo:
     """A log: its files and topics, what a run would take of it, and what is wrong with it.
 
     ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
-    nanoseconds; ``T_base_lidar`` row by row.
+    nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
+    ``base_frame`` is empty where the log does not tell it.
     """
 
     files: tuple[str, ...]
@@ -46,6 +47,8 @@ class LogInfo:
     odometry: str
     point_times: str
     T_base_lidar: tuple[tuple[float, ...], ...]
+    base_frame: str
+    mount_motion: str
     notes: tuple[str, ...]
     damage: tuple[str, ...]
     problem: str
@@ -69,6 +72,8 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         odometry="" if log is None else log.odometry_topic,
         point_times="" if log is None else log.assumed_point_times(),
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
+        base_frame="" if log is None else log.mounting.base,
+        mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
         notes=() if log is None else tuple(log.notes),
         damage=tuple(line for index in indexes for line in index.damage),
         problem=problem,

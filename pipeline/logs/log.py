@@ -8,29 +8,38 @@ from time import perf_counter
 
 import numpy as np
 
+from pipeline import lie
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
 from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
 from pipeline.logs.limits import RangeLimits, Returns
-from pipeline.logs.mounting import find_mounting, in_plane, is_upside_down
+from pipeline.logs.mounting import (
+    find_mounting,
+    in_plane,
+    is_moved,
+    is_upside_down,
+    joint_topics,
+    leaves_plane,
+)
 from pipeline.logs.opening import index_files
-from pipeline.logs.point_cloud import PointCloudDecoder
+from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from pipeline.logs.point_times import PointTimes
-from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader
+from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally
-from pipeline.logs.told_poses import ToldPoses
+from pipeline.logs.told_poses import Beside, ToldPoses
 from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
-from pipeline.logs.wheels import WheelTrack
 from pipeline.source import Source, source_of
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
+_POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start_rad")
+_WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 _REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --topic"
 
 
@@ -46,11 +55,12 @@ class Log:
     Attributes
     ----------
     paths : its files
-    topic, dimension : the lidar's topic; 2 for laser scans, 3 for clouds
-    T_base_lidar : (d+1, d+1) mounting from /tf_static, the identity where the log does not say
+    topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
+    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
     odometry_topic : whose poses the scans carry, empty where there is none
+    scans_with_wheels : how many scans had a reading of the wheels near; counted once ``scans`` is through
     notes : what was chosen or assumed
     damage : what could not be read; complete once ``scans`` is through
     """
@@ -67,12 +77,15 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        self.dimension = 2 if is_scan(lidar) else 3
+        self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
+        self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
         self.duration_s = whole.duration_s
         self.span = chosen_span(whole, config)
         self.scan_count = count_scans(indexes, self.topic, whole, config)
-        T_base_lidar = find_mounting(indexes, lidar, wheels, self.notes)
+        self.mounting = find_mounting(indexes, lidar, wheels, self.span)
+        self.notes += self._mounting_notes()
+        T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.damage: list[str] = [line for index in indexes for line in index.damage]
@@ -81,6 +94,11 @@ class Log:
             for channel in (wheels, truth)
             if channel is not None
         }
+        if self.mounting.joints:
+            self.pose_decoders |= {
+                topic: transforms_reader(channel) for topic, channel in joint_topics(indexes).items()
+            }
+        self.scans_with_wheels = 0
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -88,6 +106,17 @@ class Log:
     def has_odometry(self) -> bool:
         """Whether scans carry the wheels' pose."""
         return self.odometry_topic != ""
+
+    def idle_keys(self) -> dict[str, str]:
+        """Settings that have no effect on this log, and why."""
+        idle: dict[str, str] = {}
+        if is_scan(self.lidar):
+            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan tells the times of its beams itself")
+        if not any(index.takes_rate for index in self.indexes):
+            idle["log.rate_hz"] = "the log has its own stamps, it is no folder of clouds"
+        if not self.has_odometry:
+            idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
+        return idle
 
     def scans(self) -> Iterator[Scan]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
@@ -98,12 +127,12 @@ class Log:
         self.damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
         poses, tally = (
-            ToldPoses(self.odometry_topic, self.ground_truth_topic),
+            ToldPoses(self.odometry_topic, self.ground_truth_topic, self.mounting),
             Tally(self.topic, self.odometry_topic),
         )
         times = PointTimes(self.config)
         count, index, asked = 0, 0, perf_counter()
-        for message, T_odom_base in self._with_wheels(poses, times):
+        for message, beside in self._with_poses(poses, times):
             count += 1
             if (count - 1) % self.config.every:
                 continue
@@ -113,20 +142,21 @@ class Log:
                 continue
             if complaint:
                 raise InputError(f"{complaint}; {_REMEDY}")
-            scan = self._scan(index, message, T_odom_base, waited_s=perf_counter() - asked)
+            scan = self._scan(index, message, beside, waited_s=perf_counter() - asked)
             tally.take(scan)
             yield scan
             index += 1
             asked = perf_counter()
         self._truth = poses.ground_truth()
+        self.scans_with_wheels = index - tally.without_wheels
         self.damage += [*tally.losses(), *poses.complaints()]
-        self.notes += [*([times.assumed] if self.dimension == 3 else []), *tally.notes()]
+        self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
             self.damage.append(f"{count - tally.bad} scans of {self.topic} were recovered")
 
-    def _scan(self, index: int, message: Decoded, T_odom_base: Pose | None, *, waited_s: float) -> Scan:
+    def _scan(self, index: int, message: Decoded, beside: Beside, *, waited_s: float) -> Scan:
         returns = message.value
         assert isinstance(returns, Returns)
         return Scan(
@@ -136,17 +166,48 @@ class Log:
             points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
             times_s=returns.times_s,
             dropped=returns.dropped,
-            T_odom_base=T_odom_base,
+            T_odom_base=self._wheels(index, beside),
             waited_s=waited_s,
         )
 
+    def _mounting_notes(self) -> list[str]:
+        """What is assumed of the mounting. Raises InputError where a planar lidar moves out of its plane."""
+        mounting = self.mounting
+        if mounting.motion is None:
+            return [mounting.note] if mounting.note else []
+        if self.dimension == 2 and mounting.motion.leaves_plane:
+            raise self._out_of_plane(str(mounting.motion))
+        moves = f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion included"
+        wheels = "; wheels are carried over to it by /tf at the stamp of each scan" if self.has_odometry else ""
+        return [*([mounting.note] if mounting.note else []), moves + wheels]
+
+    def _out_of_plane(self, motion: str) -> InputError:
+        return InputError(
+            f"{self.paths[0]}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
+            "another --topic, a part in which it rests (--start, --end), or join its scans to 3D clouds first "
+            "(laser_assembler)"
+        )
+
+    def _wheels(self, index: int, beside: Beside) -> Pose | None:
+        """T_odom_base of a scan; where the lidar moves on the base, that of a base which is fixed to the lidar."""
+        mounting, T_base_lidar = self.mounting, beside.T_base_lidar
+        if T_base_lidar is None or not is_moved(mounting.T_base_lidar, T_base_lidar):
+            return beside.T_odom_base
+        if self.dimension == 2 and leaves_plane(mounting.T_base_lidar, T_base_lidar):
+            turn_deg = np.degrees(lie.apart(mounting.T_base_lidar, T_base_lidar)[1])
+            raise self._out_of_plane(f"{mounting.lidar} has turned by {turn_deg:.0f} deg in /tf at scan {index}")
+        if beside.T_odom_base is None:
+            return None
+        now = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
+        return beside.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
+
     def assumed_point_times(self) -> str:
-        """What a run assumes about per-point times, by the first scan that has returns; empty for a planar log."""
+        """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
         times = PointTimes(self.config)
-        if self.dimension == 3:
+        if not is_scan(self.lidar):
             returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
             next((each for each in returns if len(each.points)), None)
-        return times.assumed if self.dimension == 3 else ""
+        return "" if is_scan(self.lidar) else times.assumed
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
@@ -158,8 +219,8 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_wheels(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Lidar messages with the wheels' pose at their stamp; they wait a little for the reading behind them."""
+    def _with_poses(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Beside]]:
+        """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         for message in self._messages(decoders, self.damage):
@@ -167,23 +228,36 @@ class Log:
                 waiting.append(message)
             else:
                 poses.take(message)
-            while waiting and self._may_go(waiting, message.log_time_ns, poses.wheels):
-                yield waiting[0], poses.wheels_at(waiting.popleft())
+            while waiting and self._may_go(waiting, message.log_time_ns, poses):
+                yield waiting[0], poses.beside(waiting.popleft())
         while waiting:
-            yield waiting[0], poses.wheels_at(waiting.popleft())
+            yield waiting[0], poses.beside(waiting.popleft())
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
         """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        if self.dimension == 2:
+        if is_scan(self.lidar):
             return LaserScanDecoder(limits, scan_reader(self.lidar))
-        return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
+        if self.plane_height_m is None:
+            return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
+        return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
 
-    def _may_go(self, waiting: deque[Decoded], now_ns: int, wheels: WheelTrack) -> bool:
+    def _plane_height_m(self) -> float | None:
+        """The height of all points of the first clouds, None where it is not one."""
+        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
+        decoder = PointCloudDecoder(limits, PointTimes(self.config), cloud_reader(self.lidar))
+        height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
+        if height_m is not None:
+            self.notes.append(
+                f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
+            )
+        return height_m
+
+    def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: ToldPoses) -> bool:
         first = waiting[0].value
-        if not self.odometry_topic or not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
+        if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
             return True
-        return wheels.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
+        return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
 
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
         ahead = self.config.prefetch_chunks

@@ -25,7 +25,7 @@ Indexer = Callable[[Path, int], FileIndex]
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
 _KNOWN = (
     "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "
-    "of KITTI raw or odometry, or of PCD or PLY files"
+    "of KITTI raw or odometry, or of PCD, PLY, .npy or .bin files"
 )
 
 

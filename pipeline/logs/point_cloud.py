@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,8 @@ from pipeline.logs.point_times import NAMES, PointTimes
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64
 _MOST_FIELDS = 1024
+PLANAR_M = 5e-4  # off the plane, at the most, of a point of a planar cloud: rounding of float32
+_FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # of a cloud, and in all, that tell whether clouds are planar
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 
@@ -137,6 +139,39 @@ class PointCloudDecoder:
         why = "" if count else _why_none(x, y, z)
         kept_points = moved(points[:count], message.T_frame_cloud)
         return Returns(message.stamp_ns, kept_points, times_s, len(cloud) - count, why)
+
+
+class PlanarCloudDecoder(PointCloudDecoder):
+    """Decodes clouds whose points all lie at one height, as of a planar scanner, to points in the plane."""
+
+    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud, height_m: float) -> None:
+        super().__init__(limits, times, read)
+        self.height_m = height_m
+
+    def returns(self, message: PointCloudMessage) -> Returns:
+        """Points (N, 2) that came back. Raises MalformedMessageError where one is not in the plane."""
+        returns = super().returns(message)
+        off_m = np.abs(returns.points[:, 2] - self.height_m).max(initial=0.0)
+        if off_m > PLANAR_M:
+            raise MalformedMessageError(
+                f"a point lies {off_m:.3g} m off the plane z = {self.height_m:.3g} m, in which all points of the "
+                "first clouds lie"
+            )
+        return returns._replace(points=np.ascontiguousarray(returns.points[:, :2]))
+
+
+def plane_height_m(clouds: Iterable[Returns]) -> float | None:
+    """The height of all points of the first clouds, None where it is not one or no cloud has enough to tell."""
+    heights_m = np.empty(0, np.float32)
+    most = 0
+    for cloud in clouds:
+        most = max(most, len(cloud.points))
+        heights_m = np.concatenate([heights_m, cloud.points[:, 2]])
+        if len(heights_m) and np.ptp(heights_m) > 2.0 * PLANAR_M:
+            return None
+        if len(heights_m) > _ENOUGH_POINTS:
+            break
+    return None if most < _FEWEST_POINTS else float(np.median(heights_m))
 
 
 def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:

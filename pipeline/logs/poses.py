@@ -54,25 +54,38 @@ def decode_transforms(data: memoryview, form: type[CdrReader] = CdrReader) -> li
     return transforms
 
 
-def chain(transforms: list[StampedPose], target: str, source: str) -> Pose | None:
+def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose | None:
     """T_target_source (4, 4) through the tree of transforms, None where no path joins the two frames."""
-    target, source = target.lstrip("/"), source.lstrip("/")
-    if target == source:
-        return np.eye(4)
+    reached = _reached(transforms, source).get(target.lstrip("/"))
+    return None if reached is None else reached[1]
+
+
+def frames_between(transforms: Sequence[StampedPose], target: str, source: str) -> list[str]:
+    """The frames that ``chain`` passes from target to source, both included; none where no path joins them."""
+    reached, frames, frame = _reached(transforms, source), [], target.lstrip("/")
+    while frame in reached:
+        frames.append(frame)
+        frame = reached[frame][0]
+    return frames
+
+
+def _reached(transforms: Sequence[StampedPose], source: str) -> dict[str, tuple[str, Pose]]:
+    """Every frame that a path joins to ``source``: the frame before it on that path, and T_frame_source (4, 4)."""
+    source = source.lstrip("/")
     steps: dict[str, list[tuple[str, Pose]]] = {}
     for step in transforms:
         parent, child = step.parent.lstrip("/"), step.child.lstrip("/")
         steps.setdefault(child, []).append((parent, step.T_parent_child))
         steps.setdefault(parent, []).append((child, lie.inverse(step.T_parent_child)))
-    reached = {source: np.eye(4)}
-    queue = deque(reached)
+    reached = {source: ("", np.eye(4))}
+    queue = deque([source])
     while queue:
         frame = queue.popleft()
         for following, T in steps.get(frame, []):
             if following not in reached:
-                reached[following] = T @ reached[frame]
+                reached[following] = frame, T @ reached[frame][1]
                 queue.append(following)
-    return reached.get(target)
+    return reached
 
 
 def _pose(reader: CdrReader, dimension: int) -> Pose:

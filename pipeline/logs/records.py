@@ -124,6 +124,7 @@ class FileIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
+    takes_rate: bool = False
     is_trusted: bool = True
     doubted: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)

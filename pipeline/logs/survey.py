@@ -13,6 +13,7 @@ from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.log import Log
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
+from pipeline.logs.readers import is_scan
 from pipeline.logs.rest import Rest, RestWatch
 from pipeline.logs.scan_facts import ScanFacts, facts_of
 from pipeline.logs.selection import whole_span
@@ -93,7 +94,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
         reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
         raise InputError(f"{log.paths[0]}: no scan of {log.topic} could be read: {reasons}")
     stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
-    assumed = times.assumed if log.dimension == 3 else ""
+    assumed = "" if is_scan(log.lidar) else times.assumed
     return Survey(
         log=log,
         scans=tuple(scans),

@@ -8,6 +8,7 @@ from pipeline.errors import InputError
 from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan
 from pipeline.logs.records import Channel, FileIndex
 
+_MOST_LISTED = 8
 _UNDERSTOOD = ", ".join(LIDAR_TYPES)
 
 
@@ -24,21 +25,22 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     """The lidar's channel: the topic asked for, else the only one that fits. Raises InputError."""
     channels = topics_of(indexes)
     path = indexes[0].path
-    if wanted and wanted not in channels:
-        raise InputError(f"{path}: has no topic {wanted}; choose --topic from: {_listed(channels.values())}")
-    if wanted and not _is_lidar(channels[wanted]):
-        raise InputError(
-            f"{path}: topic {_listed([channels[wanted]])} is of no type that is understood ({_UNDERSTOOD}); "
-            f"choose --topic from: {_listed(channels.values())}"
-        )
-    if wanted:
+    lidars = [channel for channel in channels.values() if is_lidar(channel)]
+    if wanted and wanted in channels and channels[wanted] in lidars:
         return channels[wanted]
-    lidars = [channel for channel in channels.values() if _is_lidar(channel)]
     if not lidars:
+        absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
-            f"{path}: has no lidar topic of a type that is understood ({_UNDERSTOOD}); "
+            f"{path}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
             f"it holds: {_listed(channels.values())}{_damage(indexes)}"
         )
+    if wanted:
+        why = (
+            f"topic {_listed([channels[wanted]])} is no lidar's"
+            if wanted in channels
+            else f"has no topic {wanted}"
+        )
+        raise InputError(f"{path}: {why}; choose --topic from: {_listed(lidars)}")
     if len(lidars) > 1:
         raise InputError(f"{path}: has several lidar topics; choose one with --topic: {_listed(lidars)}")
     return lidars[0]
@@ -81,7 +83,8 @@ def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
     return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
 
 
-def _is_lidar(channel: Channel) -> bool:
+def is_lidar(channel: Channel) -> bool:
+    """Whether its messages are scans or clouds that are understood."""
     return is_scan(channel) or is_cloud(channel)
 
 
@@ -93,7 +96,9 @@ def _damage(indexes: Sequence[FileIndex]) -> str:
 
 def _listed(channels: Iterable[Channel]) -> str:
     names = []
-    for channel in channels:
+    channels = list(channels)
+    for channel in channels[:_MOST_LISTED]:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual})")
+    names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
     return ", ".join(names) or "none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Literal, Self
@@ -47,15 +48,22 @@ class LogWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._stream.close()
-            self._partial.unlink()
-            return
-        self._writer.finish()
-        self._stream.close()
-        self._partial.replace(self.destination)
+        try:
+            if kind is None:
+                self._writer.finish()
+                self._stream.close()
+                self._partial.replace(self.destination)
+        except OSError as failure:
+            error = failure
+            raise
+        finally:
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = str(self.destination)
+            with suppress(OSError):  # what is buffered still, on a full disk
+                self._stream.close()
+            self._partial.unlink(missing_ok=True)
 
     def laser_scan(
         self,

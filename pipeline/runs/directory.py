@@ -62,6 +62,8 @@ class RunDirectory:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(self.destination)
         if self.path != self.destination and not self.is_worth_keeping:
             shutil.rmtree(self.path, ignore_errors=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from pipeline.runs.step_table import STAGES, StepTable
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 
+_FEW_POINTS = 100  # of a scan; lidars, planar ones included, have more
 _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
 
 
@@ -50,6 +51,7 @@ class Metrics(Struct, frozen=True):
 
     Of the closures tried, some were verified by matching; of those the optimised graph accepted some and rejected
     the others. ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
+    ``unreliable`` says why the result as a whole is not to be used, empty where it is.
     """
 
     scans: int
@@ -79,6 +81,7 @@ class Metrics(Struct, frozen=True):
     median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
+    unreliable: str = ""
 
     @property
     def residual(self) -> str:
@@ -139,7 +142,23 @@ def measure(
         median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
+        unreliable=_unreliable(states, [row.points for row in steps.rows]),
     )
+
+
+def _unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
+    """Why a run is not reliable: most of its scans are degenerate or lost; empty where they are not."""
+    degenerate, lost = states[State.DEGENERATE], states[State.LOST]
+    if 2 * (degenerate + lost) <= len(points):
+        return ""
+    line = (
+        f"{degenerate:,} of {len(points):,} scans are degenerate and {lost:,} lost: most poses are predicted, not "
+    )
+    line += "measured, in at least one direction"
+    if np.median(points) < _FEW_POINTS:
+        few = f"scans have {np.median(points):.0f} valid points (median)"
+        return f"{line}; {few}, as a radar's have: choose a lidar with --topic"
+    return f"{line}; scanchain doctor looks for the cause"
 
 
 def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth:
@@ -154,6 +173,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     m = metrics
     dropped = f", {m.dropped_points:,} invalid returns left out" if m.dropped_points else ""
     lines = [
+        *([f"UNRELIABLE     {m.unreliable}"] if m.unreliable else []),
         heading,
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "

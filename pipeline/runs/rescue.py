@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.errors import InputError, ScanchainError
+from pipeline.errors import InputError, ScanchainError, told
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.provenance import Provenance
@@ -27,7 +27,9 @@ def rescued(
     if not len(steps) and not is_bug:
         return error
     directory.worth_keeping()
-    reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.filename is None:
+        error.filename = str(directory.destination)
+    reason = _reason(error)
     what = "traceback.txt and the " if is_bug else ""
     where = f"{what}{len(steps):,} scans until then are in {directory.path}"
     try:
@@ -35,13 +37,20 @@ def rescued(
             error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
         )
     except OSError as failure:
-        where = (
-            f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone ({failure.strerror})"
-        )
+        why = "" if isinstance(error, OSError) else f" ({told(failure) or failure.strerror})"
+        where = f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone{why}"
     if isinstance(error, InputError):
         return InputError(f"{error}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""
     return PartialRunError(f"{kind}{reason}; {where}")
+
+
+def _reason(error: BaseException) -> str:
+    """What ended a run, in words."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    known = told(error) if isinstance(error, OSError) else ""
+    return known or str(error) or type(error).__name__
 
 
 def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:

@@ -10,7 +10,7 @@ from time import perf_counter
 import msgspec
 
 from pipeline import lie
-from pipeline.config import Config
+from pipeline.config import Config, RecordingConfig
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
@@ -32,6 +32,7 @@ from pipeline.slam import SlamResult
 from pipeline.trajectory import read_tum, write_tum
 
 TRUTH_FILE = "ground_truth.tum"
+_RECORDING_KEYS = RecordingConfig.__struct_fields__
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 
@@ -63,7 +64,9 @@ def run(
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
-    settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
+    settings = load_settings(
+        log.dimension, file=job.config_file, overrides=job.overrides, idle=_idle_keys(job, log)
+    )
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
@@ -83,15 +86,24 @@ def run(
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             with directory.results() as folder:
                 truth, note = _judge(job, log, done.result, reference, folder)
-                warnings = (*log.damage, *done.warnings, *note)
+                warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
                 metrics = measure(steps, done.result, done.cloud, done.judged, run_s=run_s, ground_truth=truth)
-                text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
+                text = summary(
+                    metrics, _heading(log, settings.config, stopped), settings.source, (*log.notes, *warnings)
+                )
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
         except (Exception, KeyboardInterrupt) as error:
             raise rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
+
+
+def _idle_keys(job: Job, log: Log) -> dict[str, str]:
+    """Keys without an effect on this job, and why."""
+    recording = {} if job.sinks else {f"recording.{name}": "no recording is made" for name in _RECORDING_KEYS}
+    truth = {} if job.ground_truth is None else {"log.ground_truth_topic": "--gt names a file"}
+    return log.idle_keys() | recording | truth
 
 
 def _check_prior(log: Log, config: Config) -> None:
@@ -120,14 +132,27 @@ def _judge(
         return None, (f"no accuracy against {source}: {error}",)
 
 
-def _heading(log: Log, stopped: str) -> str:
+def _heading(log: Log, config: Config, stopped: str) -> str:
     paths = ", ".join(str(path) for path in log.paths)
     place = lie.lift(log.T_base_lidar)[:3, 3]
-    mounting = (
-        f"lidar at x {place[0]:.2f}, y {place[1]:.2f}, z {place[2]:.2f} m of the base" if place.any() else ""
+    at = f"lidar at x {place[0]:.2f}, y {place[1]:.2f}, z {place[2]:.2f} m of {log.mounting.base_name}"
+    moving = " at the first scan, moving on it" if log.mounting.motion is not None else ""
+    known = "; ".join(
+        part for part in (_wheels(log, config), at + moving if place.any() or moving else "") if part
     )
-    known = ", ".join(part for part in (f"wheels {log.odometry_topic or 'none'}", mounting) if part)
     return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
+
+
+def _wheels(log: Log, config: Config) -> str:
+    """The wheels of a log that was read, and whether they were used."""
+    if not log.has_odometry:
+        return "wheels none"
+    unused = ""
+    if config.odometry.prior == "constant-velocity":
+        unused = ", not used: odometry.prior is constant-velocity"
+    elif not log.scans_with_wheels:
+        unused = ", not used: no reading is near the stamp of a scan"
+    return f"wheels {log.odometry_topic}{unused}"
 
 
 def _complete(

@@ -1,4 +1,4 @@
-"""A folder of PCD, PLY or raw float32 files, one a scan; stamps are in their names, or come at a rate."""
+"""A folder of PCD, PLY, .npy or raw .bin files, one a scan; stamps are in their names, or come at a rate."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.errors import InputError
-from pipeline.logs.formats.cloud_file import SUFFIXES, read_cloud_file
+from pipeline.logs.formats.cloud_file import SUFFIXES, raw_point, read_cloud_file
 from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
 from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import LATEST_NS, pack_cloud
 from pipeline.logs.records import Block, Contents, FileIndex, Message
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
+_FIRST_FILES = 3
 _NS = 1_000_000_000
 
 
@@ -27,6 +30,9 @@ def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
     files = _files(folder)
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
     index = made_index(folder, number)
+    index.takes_rate = True
+    raw = _raw_point(folder, files)
+    index.notes += _found(folder, files, raw)
     channel = made_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
         made_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
@@ -36,13 +42,37 @@ def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
         if wanted is not None and channel.key[1] not in wanted:
             return Contents([], "")
         try:
-            data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file))
+            data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file, raw))
         except (CloudFileError, OSError) as error:
             return Contents([], f"{file}: {error}; it was left out")
         return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
     index.make = make
     return index
+
+
+def _raw_point(folder: Path, files: Sequence[Path]) -> np.dtype[np.void]:
+    """How a point lies in .bin files."""
+    try:
+        return raw_point(files if files[0].suffix.lower() == ".bin" else [])
+    except CloudFileError as error:
+        raise InputError(f"{folder}: {files[0].name} {error}; save clouds as .npy, PCD or PLY") from error
+
+
+def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
+    """What the files hold, by the first that can be read."""
+    for file in files[:_FIRST_FILES]:
+        try:
+            points = read_cloud_file(file, raw)
+        except (CloudFileError, OSError):
+            continue
+        kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
+        names = " ".join(points.dtype.names or ())
+        suffix = file.suffix.lower()
+        guess = " (as their numbers suggest)" if suffix == ".bin" else ""
+        held = f"{names}, {kinds}{guess}; {len(points):,} points in {file.name}"
+        return [f"{folder}: {len(files):,} {suffix} files of {held}"]
+    return []
 
 
 def stamp_of_name(stem: str) -> int | None:
@@ -76,6 +106,6 @@ def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
     if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
         raise InputError(
             f"{folder}: names such as {files[0].name} tell no stamp of their own; say how often the scans come, "
-            "as in --log.rate_hz 10 (scanchain convert: --rate 10)"
+            "as in --log.rate_hz 10"
         )
     return stamps_ns
