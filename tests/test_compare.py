@@ -30,7 +30,7 @@ from pipeline.runs.progress import Unwatched
 from pipeline.runs.provenance import Provenance
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import simulate
-from pipeline.trajectory import read_tum, write_kitti
+from pipeline.trajectory import read_tum, write_kitti, write_tum
 from pipeline.watched import Limits
 
 TESTS = Path(__file__).parent
@@ -347,10 +347,23 @@ def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file(offi
         assert figures.paired_share == 1.0
 
 
+def test_scans_without_truth_are_counted_in_a_note_and_a_column(office, tmp_path):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[6:-9:3], truth.poses[6:-9:3]))
+    settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
+    table = run(office, tmp_path, "mine", ground_truth=tmp_path / "part.tum", settings_file=settings)
+    known = len(truth.stamps_ns[6:-9:3]) * 3 - 2
+    assert table.rows[0].figures.paired_share == pytest.approx(known / 60)
+    missing = (
+        f"of 60 scans {60 - known} without a true pose: 6 before the truth begins, {54 - known} after it ends"
+    )
+    assert any(missing in note for note in table.notes)
+
+
 def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_path):
     truth = read_tum(office.with_suffix(".tum"))
     write_kitti(tmp_path / "short.txt", Trajectory(truth.stamps_ns[:-1], truth.poses[:-1]))
-    with pytest.raises(InputError, match="59 lines, the log 60 scans"):
+    with pytest.raises(InputError, match="59 lines for 60 scans"):
         run(office, tmp_path, "plicp", ground_truth=tmp_path / "short.txt")
     toml(tmp_path / "old.tum", "1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match="same clock"):

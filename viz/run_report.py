@@ -115,7 +115,7 @@ def _against(trajectory: Trajectory, truth: Trajectory | None) -> _Off:
         return _Off(np.eye(4), errors_m)
     pairs = pair(trajectory, truth)
     ate = absolute_error_on_any_course(pairs)
-    errors_m[pairs.indices[:, 0]] = ate.errors_m
+    errors_m[pairs.places] = ate.errors_m
     return _Off(ate.T_reference_estimate, errors_m)
 
 

@@ -44,7 +44,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 @click.option("--every", metavar="N", help="Take every N-th scan.")
 @click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: a TUM file or a topic. [default: /ground_truth]")
+@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Go on from the last checkpoint of a run that was killed or stopped.")
 @click.option(

@@ -22,7 +22,7 @@ from pipeline.compare.summary import summarise
 from pipeline.compare.table import Table, write_table
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
-from pipeline.evaluate import pair, read_reference, read_relations, relation_error
+from pipeline.evaluate import pair, read_relations, read_truth, relation_error
 from pipeline.logs import Log, open_log
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
@@ -120,10 +120,11 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
         relation_error(standing, relations)
     truth, source = log.ground_truth(), log.ground_truth_topic
     if contest.ground_truth is not None:
-        truth, source = read_reference(contest.ground_truth, scans.stamps_ns), str(contest.ground_truth)
+        truth, source = read_truth(contest.ground_truth).at(scans.stamps_ns), str(contest.ground_truth)
     if truth is not None:
         try:
-            pair(standing, truth)
+            missing = pair(standing, truth).missing
+            note = missing and f"{source}: of {len(scans):,} scans {missing}"
         except InputError as error:
             if contest.ground_truth is not None:
                 raise

@@ -12,8 +12,8 @@ from pipeline.evaluate.kitti import (
     kitti_error,
     kitti_error_on_any_course,
 )
-from pipeline.evaluate.pairing import PAIRING_LIMIT_S, Pairs, pair
-from pipeline.evaluate.reference import read_reference
+from pipeline.evaluate.pairing import Pairs, pair
+from pipeline.evaluate.reference import TruthFile, check_overlap, read_truth
 from pipeline.evaluate.relations import (
     RELATION_LIMIT_S,
     RelationError,
@@ -32,7 +32,6 @@ from pipeline.evaluate.statistics import Statistics
 
 __all__ = [
     "KITTI_LENGTHS_M",
-    "PAIRING_LIMIT_S",
     "RELATION_LIMIT_S",
     "SHORT_LENGTHS_M",
     "AbsoluteError",
@@ -45,16 +44,18 @@ __all__ = [
     "RelativeError",
     "Sharpness",
     "Statistics",
+    "TruthFile",
     "absolute_error",
     "absolute_error_on_any_course",
     "align",
+    "check_overlap",
     "disagreement",
     "kitti_error",
     "kitti_error_on_any_course",
     "motion_nees",
     "pair",
-    "read_reference",
     "read_relations",
+    "read_truth",
     "relation_error",
     "relative_error_over_distance",
     "relative_error_over_frames",

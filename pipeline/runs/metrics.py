@@ -23,9 +23,13 @@ _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
 
 
 class Accuracy(Struct, frozen=True):
-    """A trajectory against the ground truth; what the path is too short for is null."""
+    """A trajectory against the ground truth; what the path is too short for is null.
+
+    Of the scans, ``pairs`` have a true pose; ``missing`` says how many have none and why, empty if all have.
+    """
 
     pairs: int
+    missing: str
     ate_rmse_m: float
     ate_mean_m: float
     ate_max_m: float
@@ -173,6 +177,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         kitti = None
     accuracy = Accuracy(
         pairs=len(pairs),
+        missing=pairs.missing,
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
@@ -186,7 +191,10 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 
 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
-    lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
+    missing = f"; {truth.optimised.missing}" if truth.optimised.missing else ""
+    lines = [
+        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} scans{missing}"
+    ]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
         share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
         of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"

@@ -11,8 +11,8 @@ import msgspec
 
 from pipeline import lie
 from pipeline.config import Config
-from pipeline.data import Trajectory
 from pipeline.errors import InputError
+from pipeline.evaluate import TruthFile, check_overlap, read_truth
 from pipeline.logs import Log, open_log
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory
@@ -29,7 +29,7 @@ from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings
 from pipeline.slam import SlamResult
-from pipeline.trajectory import read_tum, write_tum
+from pipeline.trajectory import write_tum
 
 TRUTH_FILE = "ground_truth.tum"
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -59,7 +59,7 @@ def run(
     """
     started = perf_counter()
     job.check_logs()
-    reference = None if job.ground_truth is None else read_tum(job.ground_truth)
+    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
@@ -67,6 +67,7 @@ def run(
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
+    _check_truth(job, log, truth_file)
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
@@ -82,7 +83,8 @@ def run(
             run_s = perf_counter() - started - done.held_s
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             with directory.results() as folder:
-                truth, note = _judge(job, log, done.result, reference, folder)
+                read = truth_file and truth_file.first(len(steps)) if stopped else truth_file
+                truth, note = _judge(log, done.result, read, folder)
                 warnings = (*log.damage, *done.warnings, *note)
                 metrics = measure(steps, done.result, done.cloud, done.judged, run_s=run_s, ground_truth=truth)
                 text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
@@ -103,16 +105,27 @@ def _check_prior(log: Log, config: Config) -> None:
         )
 
 
+def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
+    """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
+    if file is not None:
+        file.check(log.expected_stamps(log.topic), log.scan_count)
+        return
+    topic = next((change.text for change in job.overrides if change.key == "log.ground_truth_topic"), "")
+    if topic and not log.ground_truth_topic:
+        raise InputError(f"{log.paths[0]}: has no topic {topic}; scanchain info lists those with poses")
+    if topic:
+        check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
+
+
 def _judge(
-    job: Job, log: Log, result: SlamResult, reference: Trajectory | None, folder: Path
+    log: Log, result: SlamResult, file: TruthFile | None, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
     """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
-    source = str(job.ground_truth) if reference is not None else log.config.ground_truth_topic
-    if reference is None:
-        reference = log.ground_truth()
-    if reference is None:
-        return None, ()
+    source = log.config.ground_truth_topic if file is None else str(file.path)
     try:
+        reference = log.ground_truth() if file is None else file.at(result.trajectory.stamps_ns)
+        if reference is None:
+            return None, ()
         truth = judge(result, reference, source)
         write_tum(folder / TRUTH_FILE, reference)
         return truth, ()
