@@ -22,6 +22,7 @@ COVARIANCE = "world/lidar/covariance"
 ODOMETRY = "world/odometry"
 TRAJECTORY = "world/trajectory"
 OPTIMISED = "world/optimised"
+GROUND_TRUTH = "world/ground_truth"
 OPTIMISED_LIDAR = "world/optimised/lidar"
 KEYFRAMES = "world/graph/keyframes"
 ODOMETRY_EDGES = "world/graph/odometry"
@@ -58,6 +59,7 @@ _LEGEND = f"""
 | orange line | the way by odometry alone: smooth, drifts |
 | blue line | the way as known at the time: each piece placed by the closures known then |
 | cyan line | the way after the last optimisation, over all scans |
+| white line | the ground truth, moved onto the way after the last optimisation as for the ATE |
 | violet dots, grey edges | keyframes and the odometry between them |
 | green edges | loop closures that were accepted; amber where the back end lowered their weight below ½ |
 | red edges | loop closures that were rejected |

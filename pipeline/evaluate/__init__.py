@@ -1,6 +1,11 @@
 """How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
 
-from pipeline.evaluate.absolute import AbsoluteError, absolute_error, absolute_error_on_any_course
+from pipeline.evaluate.absolute import (
+    AbsoluteError,
+    absolute_error,
+    absolute_error_on_any_course,
+    on_the_estimate,
+)
 from pipeline.evaluate.alignment import Alignment, align
 from pipeline.evaluate.consistency import motion_nees
 from pipeline.evaluate.disagreement import disagreement
@@ -12,7 +17,7 @@ from pipeline.evaluate.kitti import (
     kitti_error,
     kitti_error_on_any_course,
 )
-from pipeline.evaluate.pairing import Pairs, pair
+from pipeline.evaluate.pairing import Pairs, during, pair
 from pipeline.evaluate.reference import TruthFile, check_overlap, read_truth
 from pipeline.evaluate.relations import (
     RELATION_LIMIT_S,
@@ -50,9 +55,11 @@ __all__ = [
     "align",
     "check_overlap",
     "disagreement",
+    "during",
     "kitti_error",
     "kitti_error_on_any_course",
     "motion_nees",
+    "on_the_estimate",
     "pair",
     "read_relations",
     "read_truth",

@@ -125,6 +125,15 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     )
 
 
+def during(reference: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
+    """The reference from its last pose not after the first of these stamps to its first not before the last."""
+    there, first_ns, last_ns = reference.stamps_ns, stamps_ns.min(), stamps_ns.max()
+    begin_ns = np.max(there, where=there <= first_ns, initial=there.min())
+    end_ns = np.min(there, where=there >= last_ns, initial=there.max())
+    chosen = (there >= begin_ns) & (there <= end_ns)
+    return Trajectory(there[chosen], reference.poses[chosen])
+
+
 def nearest(
     wanted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -20,6 +20,7 @@ from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 
 _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth
 
 
 class Accuracy(Struct, frozen=True):
@@ -48,11 +49,24 @@ class GroundTruth(Struct, frozen=True):
     optimised: Accuracy
     odometry: Accuracy
 
+    @property
+    def complaint(self) -> str:
+        """That the trajectory is far off, in words; empty where it is not."""
+        error, share = self.optimised, self.optimised.ate_share_of_path
+        if share is None or share <= _FAR_OFF_SHARE or error.ate_rmse_m <= _FAR_OFF_M:
+            return ""
+        return (
+            f"far from the ground truth: ATE {error.ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
+            f"{self.path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, "
+            "or the truth is of another clock or frame"
+        )
+
 
 class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
     Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
+    ``warnings`` : what was lost, left out or is wrong, a line each
     """
 
     scans: int
@@ -80,6 +94,7 @@ class Metrics(Struct, frozen=True):
     median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
+    warnings: tuple[str, ...]
 
     @property
     def residual(self) -> str:
@@ -99,6 +114,7 @@ def measure(
     *,
     run_s: float,
     ground_truth: GroundTruth | None,
+    warnings: Sequence[str] = (),
 ) -> Metrics:
     """The numbers of a finished run."""
     matches = [row.match for row in steps.rows]
@@ -133,6 +149,7 @@ def measure(
         median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
+        warnings=tuple(warnings),
     )
 
 
@@ -165,6 +182,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     ]
     if m.ground_truth is not None:
         lines += _accuracy_lines(m.ground_truth)
+    lines += [f"warning        {warning}" for warning in m.warnings]
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
 
 

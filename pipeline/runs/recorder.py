@@ -55,6 +55,10 @@ class Recorder(Protocol):
         """Record the final graph and what became of every closure."""
         ...
 
+    def log_ground_truth(self, poses: Matrix) -> None:
+        """Record true poses (N, 4, 4), moved onto the optimised way."""
+        ...
+
     def log_map(self, points: NDArray[np.floating]) -> None:
         """Record the finished map (N, d)."""
         ...

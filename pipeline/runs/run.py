@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config
+from pipeline.data import Trajectory
 from pipeline.errors import InputError
-from pipeline.evaluate import TruthFile, check_overlap, read_truth
+from pipeline.evaluate import TruthFile, check_overlap, during, read_truth
 from pipeline.logs import Log, open_log
 from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
-from pipeline.runs.processing import process
+from pipeline.runs.processing import TruePoses, process
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder
@@ -31,7 +35,6 @@ from pipeline.settings import dump, load_settings
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_tum
 
-TRUTH_FILE = "ground_truth.tum"
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 
@@ -79,15 +82,20 @@ def run(
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
-            done = process(job, log, settings.config, directory, record, progress, steps, left)
+            true_poses = partial(_true_poses, log, truth_file, progress)
+            done = process(job, log, settings.config, directory, record, progress, steps, left, true_poses)
             run_s = perf_counter() - started - done.held_s
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             with directory.results() as folder:
-                read = truth_file and truth_file.first(len(steps)) if stopped else truth_file
-                truth, note = _judge(log, done.result, read, folder)
+                truth, note = _judge(
+                    true_poses, str(job.ground_truth or log.ground_truth_topic), done.result, folder
+                )
                 warnings = (*log.damage, *done.warnings, *note)
-                metrics = measure(steps, done.result, done.cloud, done.judged, run_s=run_s, ground_truth=truth)
-                text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
+                metrics = measure(
+                    steps, done.result, done.cloud, done.judged,
+                    run_s=run_s, ground_truth=truth, warnings=warnings,
+                )  # fmt: skip
+                text = summary(metrics, _heading(log, stopped), settings.source, log.notes)
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
@@ -117,20 +125,28 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
         check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
 
 
+def _true_poses(
+    log: Log, file: TruthFile | None, progress: Progress, stamps_ns: NDArray[np.int64]
+) -> Trajectory | None:
+    """Of the file named, else the log's own; a KITTI file's for the scans (N,) that were read before a stop."""
+    if file is None:
+        return log.ground_truth()
+    return (file.first(len(stamps_ns)) if progress.stopped else file).at(stamps_ns)
+
+
 def _judge(
-    log: Log, result: SlamResult, file: TruthFile | None, folder: Path
+    true_poses: TruePoses, source: str, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
-    """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
-    source = log.config.ground_truth_topic if file is None else str(file.path)
+    """Accuracy where there is a truth; a warning where it does not fit, or the trajectory is far from it."""
     try:
-        reference = log.ground_truth() if file is None else file.at(result.trajectory.stamps_ns)
+        reference = true_poses(result.trajectory.stamps_ns)
         if reference is None:
             return None, ()
         truth = judge(result, reference, source)
-        write_tum(folder / TRUTH_FILE, reference)
-        return truth, ()
+        write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
+    return truth, (truth.complaint,) if truth.complaint else ()
 
 
 def _heading(log: Log, stopped: str) -> str:
