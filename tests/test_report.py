@@ -31,7 +31,7 @@ from viz.trajectory_section import Told, trajectory_section
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent
-SIZES = [(1200, False), (1200, True), (500, False), (500, True)]
+SIZES = [(1200, False), (1200, True), (390, False), (390, True)]
 
 
 def renamed(source, destination, old, new):

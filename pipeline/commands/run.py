@@ -98,7 +98,7 @@ def run(
         logs=logs,
         out=out,
         config_file=config,
-        overrides=(*_shortcuts(shortcuts), *truth_topic, *overrides(ctx)),
+        overrides=(*shortcut_overrides(shortcuts), *truth_topic, *overrides(ctx)),
         sinks=_sinks(rerun),
         ground_truth=truth_file,
         force=force,
@@ -121,7 +121,7 @@ def run(
 _KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}
 
 
-def _shortcuts(flags: dict[str, str | bool | None]) -> list[Override]:
+def shortcut_overrides(flags: dict[str, str | bool | None]) -> list[Override]:
     """The short flags as the keys they stand for; a ``--section.key`` flag beats them."""
     keys = _KEYS | {"matcher": "matching.matcher"}
     result = [

@@ -150,8 +150,8 @@ function show(canvas) {
   reset();
 }
 
-function colors(points, [bottom, top], flat) {  // by height from dark to bright, as the picture of the map
-  const anchors = [[90, 70, 160], [60, 110, 175], [40, 155, 150], [110, 200, 100], [250, 230, 70]];
+function colors(points, [bottom, top], flat) {  // by height from dark to bright, pale beside the lines
+  const anchors = [[62, 66, 100], [72, 96, 118], [104, 132, 126], [168, 164, 122], [240, 214, 140]];
   return Uint32Array.from({length: points.length / 3}, (_, i) => {
     const t = 4 * Math.min(0.9999, Math.max(0, (points[3 * i + 2] - bottom) / Math.max(top - bottom, 1e-6)));
     const k = Math.floor(t), mix = n => Math.round(anchors[k][n] + (t - k) * (anchors[k + 1][n] - anchors[k][n]));
