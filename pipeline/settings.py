@@ -33,6 +33,11 @@ class Override:
     flag: str
 
 
+def named(overrides: Sequence[Override], key: str) -> str:
+    """What flags set a key to, the last of several; empty where none does."""
+    return next((change.text for change in reversed(overrides) if change.key == key), "")
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """A configuration and where it came from, in words."""

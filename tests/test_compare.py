@@ -374,6 +374,15 @@ def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_a_topic_of_true_poses_that_is_named_must_be_there(tmp_path):
+    named = Override("log.ground_truth_topic", "/ground_truth", "--gt")
+    with pytest.raises(InputError, match="no poses on /ground_truth"):
+        run(
+            shared_data("3d/kitti_0005_first60.mcap"), tmp_path, "plicp",
+            overrides=(named, Override("log.end_s", "0.5", "")),
+        )  # fmt: skip
+
+
 def test_without_truth_there_is_sharpness_and_disagreement_and_it_is_said_that_they_are_none(tmp_path):
     log = shared_data("3d/kitti_0005_first60.mcap")
     table = run(log, tmp_path, "plicp", "svd", "mine", overrides=(Override("log.end_s", "1.6", ""),),

@@ -27,7 +27,7 @@ from pipeline.logs import Log, open_log
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
-from pipeline.settings import Override, load_settings
+from pipeline.settings import Override, load_settings, named
 from pipeline.source import Source
 
 
@@ -119,14 +119,17 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
         relations = read_relations(contest.relations)
         relation_error(standing, relations)
     truth, source = log.ground_truth(), log.ground_truth_topic
+    topic = named(contest.overrides, "log.ground_truth_topic")
     if contest.ground_truth is not None:
         truth, source = read_truth(contest.ground_truth).at(scans.stamps_ns), str(contest.ground_truth)
+    elif topic and truth is None:
+        raise InputError(f"{log.paths[0]}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
             missing = pair(standing, truth).missing
             note = missing and f"{source}: of {len(scans):,} scans {missing}"
         except InputError as error:
-            if contest.ground_truth is not None:
+            if contest.ground_truth is not None or topic:
                 raise
             truth, note = None, f"no accuracy against {source}: {error}"
     sources = [source] if truth is not None else []

@@ -31,7 +31,7 @@ from pipeline.runs.rescue import rescued
 from pipeline.runs.resuming import find_left
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
-from pipeline.settings import dump, load_settings
+from pipeline.settings import dump, load_settings, named
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_tum
 
@@ -118,7 +118,7 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
     if file is not None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return
-    topic = next((change.text for change in job.overrides if change.key == "log.ground_truth_topic"), "")
+    topic = named(job.overrides, "log.ground_truth_topic")
     if topic and not log.ground_truth_topic:
         raise InputError(f"{log.paths[0]}: has no topic {topic}; scanchain info lists those with poses")
     if topic:
