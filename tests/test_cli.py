@@ -453,7 +453,7 @@ def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, o
     says(output, f"45 scans; {found['missing']}")
     assert found["ate_rmse_m"] < 0.02
     _, output, _ = call("evaluate", out / "trajectory.tum", tmp_path / "late.tum")
-    says(output, found["missing"], "interpolated (linear, SLERP; gaps up to 0.5 s)")
+    says(output, found["missing"], "interpolated (position linear, rotation by SLERP, gaps up to 0.6 s)")
 
 
 def interpolated_at(truth, stamps_ns):

@@ -39,7 +39,7 @@ _PATH = click.Path(path_type=Path)
     "--max-gap",
     type=float,
     metavar="SECONDS",
-    help="Between true poses to interpolate. [default: five times their usual interval, at most 0.5]",
+    help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
 )
 @click.option(
     "--rpe",

@@ -12,7 +12,7 @@ from pipeline import lie
 from pipeline.data import Matrix, Trajectory
 from pipeline.errors import InputError
 
-WIDEST_GAP_S = 0.5  # largest default; at 1 m/s² a straight line between the ends is then up to 3 cm off
+_WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
 _INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
 _ROUNDING_S, _ROUNDING_SHARE = (
     5e-4,
@@ -64,11 +64,12 @@ class Pairs:
     @property
     def description(self) -> str:
         """What was paired and how, in words."""
+        exact = len(self) - self.interpolated
         return (
-            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), the "
-            f"{self.reference_count:,} of the reference taken at their stamps, {self.interpolated:,} of them "
-            f"interpolated (linear, SLERP; gaps up to {self.gap_s:.3g} s)"
-            + (f"; {self.missing}" if self.missing else "")
+            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with the "
+            f"reference (of {self.reference_count:,} poses) at its stamp: {exact:,} as they are, "
+            f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to {self.gap_s:.3g} s), "
+            "none extrapolated" + (f"; {self.missing}" if self.missing else "")
         )
 
     def _reasons(self) -> Iterator[str]:
@@ -87,7 +88,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within the rounding of a
     stamp written in milliseconds. Neither trajectory's stamps need increase.
 
-    gap_s : None for five median intervals of the reference, at most half a second
+    gap_s : None for five median intervals of the reference, at most 0.6 s
     """
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not len(trajectory):
@@ -95,7 +96,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     order = np.argsort(reference.stamps_ns, kind="stable")
     stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
     interval_ns = _median_interval_ns(stamps_ns)
-    gap_ns = min(_INTERVALS * interval_ns, WIDEST_GAP_S * 1e9) if gap_s is None else gap_s * 1e9
+    gap_ns = min(_INTERVALS * interval_ns, _WIDEST_GAP_S * 1e9) if gap_s is None else gap_s * 1e9
     index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
     after = np.searchsorted(stamps_ns, wanted_ns, side="right")
     early, late = after == 0, after == len(stamps_ns)
