@@ -14,10 +14,9 @@ from pipeline.errors import InputError
 
 _WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
 _INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
-_ROUNDING_S, _ROUNDING_SHARE = (
-    5e-4,
-    0.1,
-)  # what rounding a stamp may do: half a millisecond, a tenth of an interval
+_SAME_S = 1e-6  # what a stamp that was a floating-point number of seconds is off
+_ROUNDED_S = 5e-4  # what one written in milliseconds is off
+_ROUNDING_SHARE = 0.1  # of the reference's median interval, that either is at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +65,10 @@ class Pairs:
         """What was paired and how, in words."""
         exact = len(self) - self.interpolated
         return (
-            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with the "
-            f"reference (of {self.reference_count:,} poses) at its stamp: {exact:,} as they are, "
-            f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to {self.gap_s:.3g} s), "
-            "none extrapolated" + (f"; {self.missing}" if self.missing else "")
+            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
+            f"the reference (of {self.reference_count:,} poses) at its stamp: {exact:,} as they are, "
+            f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to "
+            f"{self.gap_s:.3g} s), none extrapolated" + (f"; {self.missing}" if self.missing else "")
         )
 
     def _reasons(self) -> Iterator[str]:
@@ -84,9 +83,9 @@ class Pairs:
 def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Pairs:
     """The reference at the stamps of the estimate: positions linear, rotations by SLERP between its neighbors.
 
-    A reference pose of the same stamp is taken as it is. Nothing is extrapolated: outside the reference, and where
-    its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within the rounding of a
-    stamp written in milliseconds. Neither trajectory's stamps need increase.
+    A reference pose of the same stamp, to a microsecond, is taken as it is. Nothing is extrapolated: outside the
+    reference, and where its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within
+    the rounding of a stamp written in milliseconds. Neither trajectory's stamps need increase.
 
     gap_s : None for five median intervals of the reference, at most 0.6 s
     """
@@ -102,8 +101,9 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     early, late = after == 0, after == len(stamps_ns)
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
     interval = stamps_ns[after] - stamps_ns[before]
-    between = ~early & ~late & (difference_ns > 0) & (interval <= gap_ns)
-    known = between | (difference_ns <= min(_ROUNDING_S * 1e9, _ROUNDING_SHARE * interval_ns))
+    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * interval_ns) for each in (_SAME_S, _ROUNDED_S))
+    between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
+    known = between | (difference_ns <= rounded_ns)
     poses = reference.poses[index]
     share = (wanted_ns - stamps_ns[before])[between] / interval[between]
     poses[between] = _interpolated(
