@@ -18,6 +18,7 @@ from pipeline.evaluate import (
     kitti_error_on_any_course,
     pair,
     read_relations,
+    read_truth,
     relation_error,
     relative_error_over_distance,
     relative_error_over_frames,
@@ -27,7 +28,7 @@ from pipeline.evaluate.pairing import nearest
 from pipeline.logs import open_log
 from pipeline.odometry import Odometry
 from pipeline.settings import Override, load_settings
-from pipeline.trajectory import parse_stamp_ns, read_tum
+from pipeline.trajectory import parse_stamp_ns, read_tum, write_kitti
 
 
 def drive(count=300, seed=1, step_m=1.0):
@@ -330,6 +331,19 @@ def test_truth_too_sparse_to_interpolate_says_so_and_how_to_allow_it():
     with pytest.raises(InputError, match=r"more than 0\.6 s apart.*--max-gap"):
         pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse)
     assert len(pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse, gap_s=2.0)) == 80
+
+
+def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp_path):
+    truth = drive(30)
+    write_kitti(tmp_path / "poses.txt", truth)
+    file = read_truth(tmp_path / "poses.txt")
+    file.check(truth.stamps_ns, 30)
+    np.testing.assert_allclose(file.at(truth.stamps_ns).poses, truth.poses, atol=1e-7)
+    stopped = file.first(12).at(truth.stamps_ns[:12])
+    np.testing.assert_array_equal(stopped.stamps_ns, truth.stamps_ns[:12])
+    for refused in (lambda: file.check(truth.stamps_ns, 29), lambda: file.at(truth.stamps_ns[:12])):
+        with pytest.raises(InputError, match="one line a scan"):
+            refused()
 
 
 def test_poses_without_time_pair_line_by_line():

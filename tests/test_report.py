@@ -171,6 +171,58 @@ def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one
     assert answer.stdout.count("<button") == 4
 
 
+_HANDLED = """
+<script>
+(async () => {
+  const canvas = document.querySelector("canvas.scene");
+  const [plus, minus, above, reset] = document.querySelectorAll("button");
+  const frame = () => new Promise(done => setTimeout(done, 50));
+  const look = async () => { await frame(); return canvas.toDataURL(); };
+  const point = (type, x, y, shiftKey) => canvas.dispatchEvent(
+    new PointerEvent(type, {pointerId: 1, clientX: x, clientY: y, buttons: 1, shiftKey}));
+  const drag = shift => {
+    point("pointerdown", 300, 300, shift); point("pointermove", 360, 330, shift); point("pointerup");
+  };
+  const wheel = () => canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -50, cancelable: true}));
+  canvas.setPointerCapture = () => {};  // there is no such finger
+  const seen = {first: await look()};
+  wheel(); seen.scrolled = await look();
+  drag(false); seen.turned = await look();
+  wheel(); seen.zoomed = await look();
+  drag(true); seen.moved = await look();
+  reset.click(); seen.reset = await look();
+  plus.click(); seen.larger = await look();
+  minus.click(); above.click(); seen.above = await look();
+  const names = Object.keys(seen), images = Object.values(seen);
+  const same = Object.fromEntries(names.map((name, i) => [name, names[images.indexOf(images[i])]]));
+  document.title = "PROBE" + JSON.stringify(same);
+})();
+</script></body>"""
+
+
+def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_clicked(tmp_path):
+    points = np.random.default_rng(2).uniform([-20.0, -10.0, 0.0], [20.0, 10.0, 6.0], (5000, 3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    lines = [
+        PathLine(np.linspace(low, high, 50), "red", 1.0),
+        PathLine(np.linspace(high, low, 9), "", 1.0, is_dashed=True),
+    ]
+    scene = map_scene(points, lines, low, high, grain_m=0.2, is_flat=False)
+    section = Section("Map", drawings=(Drawing("Map", "", scene, is_wide=True),))
+    write_page(tmp_path / "a.html", Page("a", "b", (), (), (), (section,), script=SCRIPT))
+    text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "a.html").read_text())
+    frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window
+    (tmp_path / "b.html").write_text(text.replace("<body>", f"<body>{frames}").replace("</body>", _HANDLED))
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+        "--window-size=1000,900", "--virtual-time-budget=5000", "--dump-dom", f"file://{tmp_path / 'b.html'}",
+    ]  # fmt: skip
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    same = json.loads(html.unescape(re.search("<title>PROBE(.*?)</title>", answer.stdout)[1]))
+    assert same == {name: name for name in same} | {"scrolled": "first", "reset": "first"}
+    assert len(same) == 8
+
+
 def test_the_map_in_a_page_stays_small_and_lies_where_the_points_are():
     random = np.random.default_rng(3)
     points = random.normal(0.0, [80.0, 50.0, 4.0], (900_000, 3)).astype(np.float32)
