@@ -178,7 +178,7 @@ def test_one_that_failed_is_best_at_nothing():
         Row(name, name, status, "", "", {}, Figures(peak_mib=mib, ate_m=mib), [])
         for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
     ]
-    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", rows, [], [], made, {})
+    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", "", rows, [], [], made, {})
     assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
 
 
@@ -355,9 +355,9 @@ def test_scans_without_truth_are_counted_in_a_note_and_a_column(office, tmp_path
     known = len(truth.stamps_ns[6:-9:3]) * 3 - 2
     assert table.rows[0].figures.paired_share == pytest.approx(known / 60)
     missing = (
-        f"of 60 scans {60 - known} without a true pose: 6 before the truth begins, {54 - known} after it ends"
+        f"Of 60 scans {60 - known} without a true pose: 6 before the truth begins, {54 - known} after it ends"
     )
-    assert any(missing in note for note in table.notes)
+    assert missing in table.against and missing in text(table)
 
 
 def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_path):

@@ -127,11 +127,11 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
     if truth is not None:
         try:
             missing = pair(standing, truth).missing
-            note = missing and f"{source}: of {len(scans):,} scans {missing}"
+            note = missing and f"Of {len(scans):,} scans {missing}"
         except InputError as error:
             if contest.ground_truth is not None or topic:
                 raise
-            truth, note = None, f"no accuracy against {source}: {error}"
+            truth, note = None, f"No accuracy against {source}: {error}"
     sources = [source] if truth is not None else []
     sources += [str(contest.relations)] if relations is not None else []
     return Reference(truth, relations, " and ".join(sources), note)

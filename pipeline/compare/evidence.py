@@ -28,7 +28,7 @@ METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tu
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What errors are against: poses, relations, both or nothing; ``source`` says where they come from."""
+    """What errors are against: poses, relations, both or nothing; ``note`` says what is missing."""
 
     truth: Trajectory | None
     relations: Relations | None
