@@ -456,6 +456,17 @@ def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, o
     says(output, found["missing"], "interpolated (position linear, rotation by SLERP, gaps up to 0.6 s)")
 
 
+def test_a_truth_of_few_scans_is_a_warning_that_says_why(call, tmp_path, office):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[10:30], truth.poses[10:30]))
+    words = ["run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "part.tum"]
+    code, output, errors = call(*words)
+    few = "accuracy is that of 20 of 60 scans alone: 40 without a true pose: 10 before the truth begins, 30 after"
+    assert code == 0 and errors.startswith(f"warning: {few}")
+    says(output, f"warning        {few}")
+    assert metrics(tmp_path / "a")["warnings"] == [errors.removeprefix("warning: ").strip()]
+
+
 def interpolated_at(truth, stamps_ns):
     """Planar truth at other stamps, by hand."""
     yaw = np.unwrap(np.arctan2(truth.poses[:, 1, 0], truth.poses[:, 0, 0]))

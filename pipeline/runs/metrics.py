@@ -58,7 +58,7 @@ class GroundTruth(Struct, frozen=True):
         return (
             f"far from the ground truth: ATE {error.ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
             f"{self.path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, "
-            "or the truth is of another clock or frame"
+            "or the truth keeps another clock or follows another body"
         )
 
 

@@ -137,7 +137,7 @@ def _true_poses(
 def _judge(
     true_poses: TruePoses, source: str, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
-    """Accuracy where there is a truth; a warning where it does not fit, or the trajectory is far from it."""
+    """Accuracy where there is a truth; warnings where it does not fit, is of few scans, or far off."""
     try:
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is None:
@@ -146,7 +146,9 @@ def _judge(
         write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
-    return truth, (truth.complaint,) if truth.complaint else ()
+    scans, known = len(result.trajectory), truth.optimised.pairs
+    few = f"accuracy is that of {known:,} of {scans:,} scans alone: {truth.optimised.missing}"
+    return truth, tuple(line for line in (truth.complaint, few if 2 * known < scans else "") if line)
 
 
 def _heading(log: Log, stopped: str) -> str:
