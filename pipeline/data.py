@@ -13,7 +13,6 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import checks
 from pipeline.errors import InputError
 from pipeline.point_store import StoredPoints
 
@@ -61,6 +60,8 @@ class Scan:
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that what was checked stays so."""
+        from pipeline import checks  # compiled: whoever reads --help makes no scan
+
         for name, wanted in _WHOLE:
             if type(value := getattr(self, name)) is not int:
                 object.__setattr__(self, name, checks.integer(value, name, wanted))

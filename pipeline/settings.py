@@ -10,10 +10,9 @@ from pathlib import Path
 import msgspec
 import tomli_w
 
-from pipeline import checks
 from pipeline.config import Config
 from pipeline.config_keys import Value, config_keys, find_key
-from pipeline.errors import InputError
+from pipeline.errors import InputError, shown
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
@@ -41,6 +40,11 @@ class Override:
     key: str
     text: str
     flag: str
+
+
+def named(overrides: Sequence[Override], key: str) -> str:
+    """What flags set a key to, the last of several; empty where none does."""
+    return next((change.text for change in reversed(overrides) if change.key == key), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +78,8 @@ def load_settings(
     layer: dict[str, Value] = {}
     source = "defaults"
     if dimension is not None:
-        dimension = checks.dimension(dimension)
+        if not (isinstance(dimension, int) and dimension in PRESETS):
+            raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
         layer = read_layer(preset_path(PRESETS[dimension]))
         source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
     source += "" if file is None else f", {file}"

@@ -9,6 +9,7 @@ import subprocess
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_NARROWEST = 500  # pixels of Chromium's window
 _PROBE = """
 <script>
 const texts = [...document.querySelectorAll("figure svg")].map(svg => {
@@ -26,10 +27,13 @@ const texts = [...document.querySelectorAll("figure svg")].map(svg => {
 });
 const outside = [...document.querySelectorAll("main *")].filter(e => !e.closest(".scroll, svg") &&
   e.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map(e => e.tagName);
-document.title = "PROBE" + JSON.stringify({
+window.parent.document.title = "PROBE" + JSON.stringify({
   svgs: texts, outside, scripts: document.scripts.length, wide: document.documentElement.scrollWidth,
   width: document.documentElement.clientWidth, paper: getComputedStyle(document.body).backgroundColor,
   tables: document.querySelectorAll("table").length, rows: document.querySelectorAll("table tbody tr").length,
+  names: Math.max(0, ...[...document.querySelectorAll("tbody th")].map(e => e.getBoundingClientRect().width)),
+  reasons: Math.max(0, ...[...document.querySelectorAll("td.wide span")].map(
+    e => e.getBoundingClientRect().right)),
   text: document.body.innerText, bold: document.querySelectorAll("td.best").length });
 </script>
 """
@@ -46,7 +50,11 @@ def find_browser():
 def look(page, folder, *, width, dark=False):
     """What a page, opened from disk, is like at this width: a dict of the probe above."""
     probed = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text(encoding="utf-8"))
-    (folder / "page.html").write_text(probed.replace("</body>", f"{_PROBE}</body>"), encoding="utf-8")
+    probed = probed.replace("</body>", f"{_PROBE}</body>")
+    if width < _NARROWEST:  # a window cannot be that narrow, a frame can
+        frame = f'<iframe srcdoc="{html.escape(probed)}" style="width: {width}px; height: 1900px; border: 0">'
+        probed = f"<!doctype html><title></title><body>{frame}</iframe></body>"
+    (folder / "page.html").write_text(probed, encoding="utf-8")
     scheme = 0 if dark else 1
     command = [
         find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}",

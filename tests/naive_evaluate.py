@@ -4,11 +4,28 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 
 def nearest(wanted, stamps):
     """First index of the nearest stamp; of two equally far ones the earlier in time."""
     return [min(range(len(stamps)), key=lambda i: (abs(stamps[i] - w), stamps[i], i)) for w in wanted]
+
+
+def interpolated(stamp, stamps, poses, gap):
+    """The pose at a stamp, or None where there is none: exact, or between its neighbors by quaternions."""
+    if stamp in stamps:
+        return poses[list(stamps).index(stamp)]
+    earlier, later = [s for s in stamps if s < stamp], [s for s in stamps if s > stamp]
+    if not earlier or not later or min(later) - max(earlier) > gap:
+        return None
+    a, b = list(stamps).index(max(earlier)), list(stamps).index(min(later))
+    share = float(stamp - stamps[a]) / float(stamps[b] - stamps[a])
+    pose = np.eye(4)
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix([poses[a][:3, :3], poses[b][:3, :3]]))
+    pose[:3, :3] = turns(share).as_matrix()
+    pose[:3, 3] = (1.0 - share) * poses[a][:3, 3] + share * poses[b][:3, 3]
+    return pose
 
 
 def travelled(poses):

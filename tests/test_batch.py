@@ -2,14 +2,17 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from urllib.parse import unquote
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from browser import look
 from scenes import ROOT
 from web_server import serving
 
@@ -231,6 +234,60 @@ def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_
     assert page.count("<svg") == 3 + 2  # errors, speeds and memory; two ways
     written = [file.read_bytes() for file in out.rglob("*") if file.is_file()]
     assert not any(b"secret" in content for content in written)
+
+
+@pytest.fixture
+def two_lidars(tmp_path):
+    """Two logs of a long name with two lidars each; the first sees one wall alone, along which all is open."""
+    logs = [tmp_path / f"2026-11-22_warehouse_north_aisle_{name}_second_attempt.mcap" for name in ("wall", "room")]
+    angles = np.radians(np.arange(-90.0, 90.5, 0.5))
+    wall = 3.0 / np.maximum(np.cos(angles), 1e-3)
+    room = np.minimum(wall, 4.0 / np.maximum(np.abs(np.sin(angles)), 1e-3))
+    for log, ranges in zip(logs, (wall, room), strict=True):
+        with LogWriter(log) as writer:
+            for stamp_ns in range(0, 2_000_000_000, 100_000_000):
+                for topic in ("/front", "/rear"):
+                    writer.laser_scan(
+                        topic, stamp_ns, "lidar", angles[0], np.radians(0.5), 0.0, ranges,
+                        range_min_m=0.1, range_max_m=20.0,
+                    )  # fmt: skip
+    return logs
+
+
+def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars, tmp_path):
+    words = ["batch", *map(str, two_lidars), "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    assert all("choose one with --topic" in row["reason"] for row in table(tmp_path / "out").values())
+    assert main([*words, "--topic", "/rear", "--every", "2", "--no-loops"]) == 0
+    rows = table(tmp_path / "out")
+    assert [row["scans"] for row in rows.values()] == [10, 10]
+    for row in rows.values():
+        config = (tmp_path / "out" / row["run"] / "config.toml").read_text()
+        assert 'topic = "/rear"' in config and "every = 2" in config and "enabled = false" in config
+    assert main([*words, "--gt", "truth.tum"]) == 2
+
+
+def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
+    out = tmp_path / "out"
+    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
+    logs = [*map(str, two_lidars), str(tmp_path / "bad.mcap")]
+    assert main(["batch", *logs, "--out", str(out), "--topic", "/front"]) == 1
+    rows = table(out)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
+    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
+    assert blind[0] == ("", "20") and blind[1] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
+    assert fine[1] == fine[2] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    links = re.findall(r'<a href="([^"]+)">', page)
+    assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
+    assert links[0].endswith("/report.html") and links[2].startswith("rows/")
+    seen = look(out / "report.html", tmp_path, width=390)
+    assert (
+        0.0 < seen["reasons"] <= 390
+        and seen["names"] < 0.45 * 390
+        and seen["wide"] <= seen["width"]
+        and seen["outside"] == []
+    )
 
 
 def test_of_remote_logs_a_pattern_names_those_that_match(monkeypatch):

@@ -28,12 +28,15 @@ from naive_logs import (
 )
 from scenes import ROOT, configured
 
+from pipeline import lie
 from pipeline.__main__ import scanchain
 from pipeline.commands.override_command import OnceCommand
+from pipeline.data import Trajectory
 from pipeline.graph.g2o import read_g2o
 from pipeline.logs.write import LogWriter
 from pipeline.settings import flatten
 from pipeline.simulate import simulate
+from pipeline.trajectory import read_tum, write_kitti, write_tum
 
 
 @pytest.fixture(scope="module")
@@ -357,7 +360,7 @@ def test_a_file_named_twice_is_refused(refused, tmp_path, office):
             ["mulran.mcap", "ask for a sequence", "scanchain convert"],
         ),
         (["info", "absent.mcap"], ["absent.mcap", "check the path"]),
-        (["evaluate", "absent.tum"], ["GT.tum", "--relations"]),
+        (["evaluate", "absent.tum"], ["give GT", "--relations"]),
         (["evaluate", "absent.tum", "absent.tum"], ["absent.tum", "check the path"]),
         (["config", "show", "--loops.enable", "off"], ["--loops.enable", "loops.enabled"]),
         (["config", "dump", "--lidar", "4d"], ["--lidar", "'4d'", "config dump --help"]),
@@ -370,9 +373,9 @@ def test_the_other_commands_refuse_in_one_line_too(refused, monkeypatch, tmp_pat
 
 
 @pytest.mark.parametrize("limit", ["nan", "-1", "inf"])
-def test_a_time_difference_that_is_none_is_refused(refused, office, limit):
+def test_a_gap_that_is_no_time_is_refused(refused, office, limit):
     truth = office.with_suffix(".tum")
-    says(refused("evaluate", truth, truth, "--max-difference", limit), f"--max-difference is {limit}", "0 up")
+    says(refused("evaluate", truth, truth, "--max-gap", limit), f"--max-gap is {limit}", "0 up")
 
 
 def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, office):
@@ -588,13 +591,83 @@ def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_p
     }
 
 
-def test_a_truth_of_another_time_is_a_warning_and_the_run_stands(call, tmp_path, office):
+def test_a_truth_of_another_time_is_refused_before_the_work_with_both_spans(refused, tmp_path, office):
     (tmp_path / "old.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
-    code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "old.tum")
+    words = ["run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt"]
+    first, last = read_tum(office.with_suffix(".tum")).stamps_ns[[0, -1]] / 1e9
+    says(refused(*words, tmp_path / "old.tum"), "old.tum", "1.000 to 2.000 s", f"{first:.3f} to {last:.3f} s")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_topic_of_true_poses_that_keeps_another_clock_is_refused_before_the_work(refused, tmp_path):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for k in range(20):
+            at_ns = 10**18 + k * 10**8
+            log.laser_scan(
+                "/scan", at_ns, "lidar", -1.5, 0.1, 0.0, np.full(31, 3.0), range_min_m=0.1, range_max_m=9.0
+            )
+            log.odometry("/mocap", 5 * 10**9 + k * 10**8, "world", "lidar", np.eye(3), log_time_ns=at_ns)
+    words = ["run", tmp_path / "a.mcap", "--out", tmp_path / "a", "--rerun", "off", "--gt"]
+    says(refused(*words, "/mocap"), "/mocap", "5.000 to 6.900 s", "1000000000.000 to 1000000001.900 s")
+    says(refused(*words, "/ground_truth"), "/ground_truth", "scanchain info")
+
+
+def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_path, office):
+    ends = read_tum(office.with_suffix(".tum")).stamps_ns[[0, -1]] / 1e9 + np.array([-1.0, 1.0])
+    (tmp_path / "ends.tum").write_text("".join(f"{stamp:.9f} {stamp} 0 0 0 0 0 1\n" for stamp in ends))
+    code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "ends.tum")
     assert code == 0 and errors.count("\n") == 1
-    assert errors.startswith(f"warning: no accuracy against {tmp_path / 'old.tum'}: ")
-    says((tmp_path / "a" / "summary.txt").read_text(), "no accuracy against")
+    assert errors.startswith(f"warning: no accuracy against {tmp_path / 'ends.tum'}: ")
+    says((tmp_path / "a" / "summary.txt").read_text(), "no accuracy against", "--max-gap")
     assert metrics(tmp_path / "a")["ground_truth"] is None
+
+
+def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, office):
+    """Every third true pose, 30 ms later, and none of the last second: within 10 ms of a scan there is none."""
+    truth = read_tum(office.with_suffix(".tum"))
+    fast = Trajectory(*interpolated_at(truth, truth.stamps_ns[:-1:3] + 30_000_000))
+    write_tum(tmp_path / "late.tum", Trajectory(fast.stamps_ns[:-4], fast.poses[:-4]))
+    out = tmp_path / "a"
+    _, output, errors = call("run", office, "--out", out, "--rerun", "off", "--gt", tmp_path / "late.tum")
+    found = metrics(out)["ground_truth"]["optimised"]
+    assert errors == "" and found["pairs"] == 45
+    assert found["missing"] == "15 without a true pose: 1 before the truth begins, 14 after it ends"
+    says(output, f"45 scans; {found['missing']}")
+    assert found["ate_rmse_m"] < 0.02
+    _, output, _ = call("evaluate", out / "trajectory.tum", tmp_path / "late.tum")
+    says(output, found["missing"], "interpolated (position linear, rotation by SLERP, gaps up to 0.6 s)")
+
+
+def test_a_truth_of_few_scans_is_a_warning_that_says_why(call, tmp_path, office):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[10:30], truth.poses[10:30]))
+    words = ["run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "part.tum"]
+    code, output, errors = call(*words)
+    few = "accuracy is that of 20 of 60 scans alone: 40 without a true pose: 10 before the truth begins, 30 after"
+    assert code == 0 and errors.startswith(f"warning: {few}")
+    says(output, f"warning        {few}")
+    assert metrics(tmp_path / "a")["warnings"] == [errors.removeprefix("warning: ").strip()]
+
+
+def interpolated_at(truth, stamps_ns):
+    """Planar truth at other stamps, by hand."""
+    yaw = np.unwrap(np.arctan2(truth.poses[:, 1, 0], truth.poses[:, 0, 0]))
+    columns = [np.interp(stamps_ns, truth.stamps_ns, v) for v in (truth.poses[:, 0, 3], truth.poses[:, 1, 3], yaw)]
+    return stamps_ns, lie.lift(np.array([lie.pose_2d(*row) for row in zip(*columns, strict=True)]))
+
+
+def test_run_and_evaluate_take_kitti_poses_a_row_a_scan_as_compare_does(call, refused, tmp_path, office):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_kitti(tmp_path / "poses.txt", truth)
+    words = ["run", office, "--rerun", "off", "--gt", tmp_path / "poses.txt", "--out"]
+    assert call(*words, tmp_path / "a")[0] == 0
+    call("run", office, "--rerun", "off", "--out", tmp_path / "b")
+    found, same = (metrics(tmp_path / name)["ground_truth"]["optimised"] for name in "ab")
+    assert found["pairs"] == 60 and found["ate_rmse_m"] == pytest.approx(same["ate_rmse_m"], abs=1e-7)
+    says(refused(*words, tmp_path / "c", "--end", "3"), "60 lines for 30 scans")
+    assert not (tmp_path / "c").exists()
+    tree = json.loads(call("evaluate", tmp_path / "a" / "trajectory.tum", tmp_path / "poses.txt", "--json")[1])
+    assert tree["ate"]["translation_m"]["rmse"] == pytest.approx(found["ate_rmse_m"], abs=1e-6)
 
 
 def test_a_log_in_two_files_gives_what_the_one_file_gives(call, tmp_path, office):

@@ -30,7 +30,7 @@ from pipeline.runs.progress import Unwatched
 from pipeline.runs.provenance import Provenance
 from pipeline.settings import Override, load_settings
 from pipeline.simulate import simulate
-from pipeline.trajectory import read_tum, write_kitti
+from pipeline.trajectory import read_tum, write_kitti, write_tum
 from pipeline.watched import Limits
 
 TESTS = Path(__file__).parent
@@ -178,7 +178,7 @@ def test_one_that_failed_is_best_at_nothing():
         Row(name, name, status, "", "", {}, Figures(peak_mib=mib, ate_m=mib), [])
         for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
     ]
-    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", rows, [], [], made, {})
+    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", "", rows, [], [], made, {})
     assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
 
 
@@ -188,7 +188,7 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
     def fake(method, scans, folder, limits):
         ran.append(folder.name)
         report = EndReport(Status.OK, "", has_compiled=len(ran) == 1)
-        return Outcome(report, blank, Trajectory(blank, blank), blank + len(ran), blank, folder)
+        return Outcome(report, blank, Trajectory(blank, np.zeros((2, 3, 3))), blank + len(ran), blank, folder)
 
     monkeypatch.setattr("pipeline.compare.race._run", fake)
     methods = resolve(("plicp",), 2, file=None)
@@ -347,10 +347,23 @@ def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file(offi
         assert figures.paired_share == 1.0
 
 
+def test_scans_without_truth_are_counted_in_a_note_and_a_column(office, tmp_path):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[6:-9:3], truth.poses[6:-9:3]))
+    settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
+    table = run(office, tmp_path, "mine", ground_truth=tmp_path / "part.tum", settings_file=settings)
+    known = len(truth.stamps_ns[6:-9:3]) * 3 - 2
+    assert table.rows[0].figures.paired_share == pytest.approx(known / 60)
+    missing = (
+        f"Of 60 scans {60 - known} without a true pose: 6 before the truth begins, {54 - known} after it ends"
+    )
+    assert missing in table.against and missing in text(table)
+
+
 def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_path):
     truth = read_tum(office.with_suffix(".tum"))
     write_kitti(tmp_path / "short.txt", Trajectory(truth.stamps_ns[:-1], truth.poses[:-1]))
-    with pytest.raises(InputError, match="59 lines, the log 60 scans"):
+    with pytest.raises(InputError, match="59 lines for 60 scans"):
         run(office, tmp_path, "plicp", ground_truth=tmp_path / "short.txt")
     toml(tmp_path / "old.tum", "1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match="same clock"):
@@ -359,6 +372,15 @@ def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_p
     with pytest.raises(InputError, match="belong to this log"):
         run(office, tmp_path, "plicp", relations=tmp_path / "a.relations")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_topic_of_true_poses_that_is_named_must_be_there(tmp_path):
+    named = Override("log.ground_truth_topic", "/ground_truth", "--gt")
+    with pytest.raises(InputError, match="no poses on /ground_truth"):
+        run(
+            shared_data("3d/kitti_0005_first60.mcap"), tmp_path, "plicp",
+            overrides=(named, Override("log.end_s", "0.5", "")),
+        )  # fmt: skip
 
 
 def test_without_truth_there_is_sharpness_and_disagreement_and_it_is_said_that_they_are_none(tmp_path):

@@ -414,6 +414,18 @@ def optimised_strips(path):
             yield np.array(batch.column("LineStrips3D:strips").to_pylist()[0][0])
 
 
+def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(drive, tmp_path, monkeypatch):
+    found = drive.tum()[:, 1:4]
+    chunks = RrdReader(str(drive.folder / "recording.rrd")).stream()
+    (drawn,) = (chunk for chunk in chunks if str(chunk.entity_path) == "/world/ground_truth")
+    (line,) = drawn.to_record_batch().column("LineStrips3D:strips").to_pylist()[0]
+    np.testing.assert_allclose(np.array(line), found, atol=0.1)
+    shown = {}
+    monkeypatch.setattr("viz.run_picture.draw_map", lambda path, **what: shown.update(what))
+    succeed("view", drive.folder, "--png", tmp_path / "a.png")
+    np.testing.assert_allclose(shown["ground_truth"][:, :3, 3], found, atol=0.1)
+
+
 def test_a_3d_scan_takes_at_most_150_kilobytes_of_recording(town):
     assert (town.folder / "recording.rrd").stat().st_size / town.metrics["scans"] < 150_000
 

@@ -18,14 +18,17 @@ from pipeline.evaluate import (
     kitti_error_on_any_course,
     pair,
     read_relations,
+    read_truth,
     relation_error,
     relative_error_over_distance,
     relative_error_over_frames,
     relative_error_over_time,
 )
 from pipeline.evaluate.pairing import nearest
+from pipeline.logs import open_log
 from pipeline.odometry import Odometry
-from pipeline.trajectory import parse_stamp_ns, read_tum
+from pipeline.settings import Override, load_settings
+from pipeline.trajectory import parse_stamp_ns, read_tum, write_kitti
 
 
 def drive(count=300, seed=1, step_m=1.0):
@@ -256,23 +259,97 @@ def test_nearest_equals_naive_with_repeated_and_unsorted_stamps():
     np.testing.assert_array_equal(difference, np.abs(stamps[index] - wanted))
 
 
-def test_pairing_reports_the_share_and_uses_a_pose_once():
-    truth = drive(100)
-    late = truth.stamps_ns[::10] + np.where(np.arange(10) < 7, 3_000_000, 40_000_000)
-    pairs = pair(Trajectory(late, truth.poses[::10]), truth, limit_s=0.01)
-    assert len(pairs) == 7
-    assert pairs.share == pytest.approx(0.7)
-    assert "70.0 %" in absolute_error(pairs).definition
-    doubled = Trajectory(np.repeat(truth.stamps_ns[:5], 2), np.repeat(truth.poses[:5], 2, axis=0))
-    assert pair(doubled, truth).indices.tolist() == [[0, 0], [2, 1], [4, 2], [6, 3], [8, 4]]
+def at_rate(trajectory, every, late_ns=0):
+    """Every n-th pose, with stamps that much later."""
+    return Trajectory(trajectory.stamps_ns[::every] + late_ns, trajectory.poses[::every])
 
 
-def test_pairing_keeps_the_order_of_the_estimate():
+def test_truth_at_another_rate_is_interpolated_as_naive_does():
+    truth = drive(200)
+    random = np.random.default_rng(4)
+    keep = np.sort(random.choice(200, 140, replace=False))
+    sparse = Trajectory(truth.stamps_ns[keep], truth.poses[keep])
+    stamps_ns = random.integers(truth.stamps_ns[0] - 10**9, truth.stamps_ns[-1] + 10**9, 100)
+    stamps_ns[::7] = sparse.stamps_ns[random.integers(0, 140, len(stamps_ns[::7]))]
+    pairs = pair(Trajectory(stamps_ns, truth.poses[:100]), sparse, gap_s=0.25)
+    expected = [naive.interpolated(t, sparse.stamps_ns, sparse.poses, 0.25e9) for t in stamps_ns.tolist()]
+    assert pairs.places.tolist() == [k for k, pose in enumerate(expected) if pose is not None]
+    known = np.array([pose for pose in expected if pose is not None])
+    np.testing.assert_allclose(pairs.reference, known, atol=1e-9)
+    assert pairs.early + pairs.late + pairs.in_gap == 100 - len(pairs)
+    assert min(pairs.early, pairs.late, pairs.in_gap, pairs.interpolated) > 0
+
+
+@pytest.mark.parametrize(("rate_hz", "late_ns"), [(115.0, 0), (10.0, 37_000_000), (2.5, 11_000_000)])
+def test_scans_between_true_poses_are_judged_as_if_the_truth_had_their_stamps(rate_hz, late_ns):
+    """An arc of 20 m at constant speed, scans at 10 Hz; one of 61 scans had a true pose within 10 ms."""
+
+    def poses(stamps_ns):
+        a = 0.05 * (stamps_ns - 10**18) * 1e-9
+        return np.array([lie.pose_2d(20.0 * np.sin(t), 20.0 * (1.0 - np.cos(t)), t) for t in a])
+
+    scans_ns = 10**18 + np.arange(10, 71, dtype=np.int64) * 10**8
+    truth_ns = 10**18 + np.round(np.arange(0.0, 9.0, 1.0 / rate_hz) * 1e9).astype(np.int64) + late_ns
+    pairs = pair(Trajectory(scans_ns, poses(scans_ns)), Trajectory(truth_ns, poses(truth_ns)))
+    error = absolute_error(pairs)
+    assert len(pairs) == 61 and pairs.missing == "" and "61 of 61" in error.definition
+    assert error.translation_m.maximum < 1e-3 and error.rotation_rad.maximum < 1e-6
+
+
+def test_a_true_pose_of_the_same_stamp_is_taken_to_the_last_bit_in_any_order():
     truth = drive(50)
-    order = np.random.default_rng(0).permutation(50)[:20]
-    pairs = pair(Trajectory(truth.stamps_ns[order], truth.poses[order]), truth)
-    np.testing.assert_array_equal(pairs.indices[:, 1], order)
+    order = np.random.default_rng(0).permutation(50)
+    some = order[:20]
+    shuffled = Trajectory(truth.stamps_ns[order], truth.poses[order])
+    pairs = pair(Trajectory(truth.stamps_ns[some], truth.poses[some]), shuffled)
     np.testing.assert_array_equal(pairs.estimate, pairs.reference)
+    assert pairs.places.tolist() == list(range(20)) and pairs.interpolated == 0
+    doubled = Trajectory(np.repeat(truth.stamps_ns[:5], 2), np.repeat(truth.poses[:5], 2, axis=0))
+    np.testing.assert_array_equal(pair(doubled, truth).reference, doubled.poses)
+
+
+def test_scans_without_truth_are_counted_with_the_reason():
+    truth = drive(100)
+    holed = Trajectory(np.delete(truth.stamps_ns, range(40, 48)), np.delete(truth.poses, range(40, 48), axis=0))
+    longer = Trajectory(truth.stamps_ns + 3_000_000 - 500_000_000, truth.poses)
+    pairs = pair(longer, holed)
+    assert (pairs.early, pairs.late, pairs.in_gap) == (5, 0, 9)
+    assert pairs.missing == ("14 without a true pose: 5 before the truth begins, 9 in gaps of it wider than 0.5 s")
+    assert pairs.share == pytest.approx(0.86)
+    assert pairs.missing in absolute_error(pairs).definition and "86.0 %" in absolute_error(pairs).definition
+    assert len(pair(longer, holed, gap_s=1.0)) == 95
+
+
+def test_a_stamp_rounded_to_milliseconds_is_that_of_the_truth_at_its_ends_too():
+    truth = drive(30)
+    rounded = Trajectory(truth.stamps_ns + np.where(np.arange(30) < 15, 400_000, -400_000), truth.poses)
+    assert len(pair(rounded, truth)) == len(pair(truth, rounded)) == 30
+
+
+def test_truth_too_sparse_to_interpolate_says_so_and_how_to_allow_it():
+    sparse = at_rate(drive(100), 20)
+    with pytest.raises(InputError, match=r"more than 0\.6 s apart.*--max-gap"):
+        pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse)
+    assert len(pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse, gap_s=2.0)) == 80
+
+
+def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp_path):
+    truth = drive(30)
+    write_kitti(tmp_path / "poses.txt", truth)
+    file = read_truth(tmp_path / "poses.txt")
+    file.check(truth.stamps_ns, 30)
+    np.testing.assert_allclose(file.at(truth.stamps_ns).poses, truth.poses, atol=1e-7)
+    stopped = file.first(12).at(truth.stamps_ns[:12])
+    np.testing.assert_array_equal(stopped.stamps_ns, truth.stamps_ns[:12])
+    for refused in (lambda: file.check(truth.stamps_ns, 29), lambda: file.at(truth.stamps_ns[:12])):
+        with pytest.raises(InputError, match="one line a scan"):
+            refused()
+
+
+def test_poses_without_time_pair_line_by_line():
+    lines = Trajectory(np.arange(120, dtype=np.int64), drive(120).poses)
+    pairs = pair(lines, Trajectory(lines.stamps_ns[:100], lines.poses[:100]))
+    assert (len(pairs), pairs.late, pairs.interpolated) == (100, 20, 0)
 
 
 def test_trajectories_of_other_times_are_refused_with_both_spans():
@@ -348,3 +425,13 @@ def test_real_ground_truth_evaluates_to_zero_against_itself():
     error = absolute_error(pair(truth, truth))
     assert error.translation_m.rmse < 1e-9
     assert 60.0 < error.path_length_m < 70.0
+
+
+def test_scans_in_the_dropouts_of_a_real_motion_capture_are_named():
+    """Poses every 10 ms with six dropouts of half a second."""
+    config = load_settings(overrides=[Override("log.ground_truth_topic", "/vrpn_client_node/jackal/pose", "--gt")])
+    log = open_log(shared_data("2d/mocap_room_1.bag"), config.config.log)
+    stamps_ns = np.array([scan.stamp_ns for scan in log.scans()])
+    pairs = pair(Trajectory(stamps_ns, np.tile(np.eye(3), (len(stamps_ns), 1, 1))), log.ground_truth())
+    assert (len(pairs), pairs.interpolated) == (380, 380)
+    assert pairs.missing == "34 without a true pose: 34 in gaps of it wider than 0.05 s"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.batch.table import totals
-from pipeline.batch.task import Row, State
+from pipeline.batch.task import Row, State, said_file
 from pipeline.runs.metrics import Metrics
 from pipeline.source import source_of, without_keys
 from pipeline.trajectory import read_tum
@@ -21,16 +22,18 @@ from viz.sheet import Sheet
 
 _MOST_WAYS = 60
 _MAX_POINTS = 1500  # of a line
+_MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
     Head("log"),
     Head("scans"),
-    Head("lost"),
+    Head("degen.", "", "degenerate scans: a direction of motion that nothing determines"),
+    Head("lost", "", "scans that could not be matched"),
     Head("way", "m"),
     Head("loops", "", "loop closures accepted"),
-    Head("inliers", "%", "median over the scans"),
-    Head("residual", "mm", "median over the scans"),
     Head("ATE", "m", "rmse against the ground truth in the log, after optimisation"),
     Head("KITTI", "%", "translational error of the KITTI metric"),
+    Head("inliers", "%", "median over the scans"),
+    Head("residual", "mm", "median over the scans"),
     Head("speed", "× real time"),
     Head("time", "s", "of the whole process"),
     Head("memory", "MiB", "most that the process had"),
@@ -49,37 +52,48 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
         + tuple(unreliable),
         notes=(),
-        sections=(_logs(rows), *_spread(done), *_ways(directory, done)),
+        sections=(_logs(directory, rows), *_spread(done), *_ways(directory, done)),
         folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),
     )
     write_page(directory / REPORT_FILE, page)
 
 
-def _logs(rows: Sequence[Row]) -> Section:
+def _logs(directory: Path, rows: Sequence[Row]) -> Section:
     legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
-    return Section("Logs", grid=Grid(_HEADS, tuple(map(_row, rows)), legend))
+    text = "A name leads to the report of its run, or to what was printed where there is none."
+    return Section("Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row) for row in rows), legend))
 
 
-def _row(row: Row) -> report.Row:
+def _row(directory: Path, row: Row) -> report.Row:
     """The figures of a log, or why it has none."""
-    m = row.metrics
+    m, link = row.metrics, _link(directory, row)
     if m is None:
-        return report.Row(_name(row), (Cell(f"{row.state}: {row.reason}", is_wide=True),))
+        return report.Row(_name(row), (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
     truth = None if m.ground_truth is None else m.ground_truth.optimised
-    figures = (
-        f"{m.scans:,}",
-        f"{m.lost:,}",
-        f"{m.travelled_m:,.1f}",
-        f"{m.closures_accepted:,}",
-        f"{100.0 * m.median_inlier_share:.0f}",
-        _figure(m.median_residual_m, 1e3, 1),
-        _figure(None if truth is None else truth.ate_rmse_m, 1.0, 4),
-        _figure(None if truth is None else truth.kitti_translation_share, 100.0, 3),
-        f"{m.times_real_time:.1f}",
-        f"{row.duration_s:.1f}",
-        f"{row.peak_mib:,.0f}",
+    is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
+    cells = (
+        Cell(f"{m.scans:,}"),
+        Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
+        Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
+        Cell(f"{m.travelled_m:,.1f}"),
+        Cell(f"{m.closures_accepted:,}"),
+        Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
+        Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
+        Cell(f"{100.0 * m.median_inlier_share:.0f}"),
+        Cell(_figure(m.median_residual_m, 1e3, 1)),
+        Cell(f"{m.times_real_time:.1f}"),
+        Cell(f"{row.duration_s:.1f}"),
+        Cell(f"{row.peak_mib:,.0f}"),
     )
-    return report.Row(_name(row), tuple(map(Cell, figures)))
+    return report.Row(_name(row), cells, link=link)
+
+
+def _link(directory: Path, row: Row) -> str:
+    """The run's report, else what the last try printed, from this page; empty where there is neither."""
+    for path in (Path(row.run) / REPORT_FILE if row.run else None, said_file(Path(), row.key)):
+        if path is not None and (directory / path).is_file():
+            return quote(path.as_posix())
+    return ""
 
 
 def _figure(value: float | None, scale: float, digits: int) -> str:

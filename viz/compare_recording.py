@@ -47,7 +47,7 @@ def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray)
     if truth_file.exists():
         way = shapes.positions(read_tum(truth_file).poses)
         line = rr.LineStrips3D([way], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
-        messages.append(Message("world/ground_truth", line))
+        messages.append(Message(entities.GROUND_TRUTH, line))
     for course in courses:
         messages += _of(course, method_folder(directory, course.name) / MAP_FILE, stamps_ns)
     return messages

@@ -123,7 +123,7 @@ def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: F
         yield from relation_section(drawn)
         yield from time_section(drawn)
         yield from knowledge_section(drawn, is_planar=is_planar)
-        yield from _map_section(directory, drawn, figures.frame(framing, truth), table.dimension)
+        yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
     for course in courses:
         yield from loop_section(
             course, method_folder(directory, course.name) / CLOSURES_FILE, f"Loop closures of {course.name}"
@@ -140,14 +140,19 @@ def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
 
 
 def _map_section(
-    directory: Path, courses: Sequence[Course], way: tuple[Floats, Floats], dimension: int
+    directory: Path,
+    courses: Sequence[Course],
+    framing: Sequence[Course],
+    way: tuple[Floats, Floats],
+    dimension: int,
 ) -> Iterator[Section]:
-    """Maps, all within the same corners."""
+    """Maps, all within the same corners; those of ``framing`` must be seen whole."""
     files = [(course, method_folder(directory, course.name) / MAP_FILE) for course in courses]
     maps = [(course, read_ply(file)) for course, file in files if file.exists()]
     if not maps:
         return
-    corners = surroundings(*way, [points for _, points in maps], dimension)
+    whole = {course.name for course in framing}
+    corners = surroundings(*way, [points for course, points in maps if course.name in whole])
     drawings = tuple(
         Drawing(course.name, "", map_picture(f"map {course.name}", points, *corners), chip(course))
         for course, points in maps

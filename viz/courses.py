@@ -51,6 +51,16 @@ class Course:
         return {"color": self.colour, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
 
 
+@dataclass(frozen=True, slots=True)
+class PathLine:
+    """A line through positions (N, 3), broken where they are NaN; drawn as the page's text without a color."""
+
+    positions: Floats
+    color: str
+    width: float
+    is_dashed: bool = False
+
+
 def colour_of(place: int) -> str:
     """Of the method at this place of the table."""
     return _COLOURS[place % len(_COLOURS)]

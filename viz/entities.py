@@ -22,6 +22,7 @@ COVARIANCE = "world/lidar/covariance"
 ODOMETRY = "world/odometry"
 TRAJECTORY = "world/trajectory"
 OPTIMISED = "world/optimised"
+GROUND_TRUTH = "world/ground_truth"
 OPTIMISED_LIDAR = "world/optimised/lidar"
 KEYFRAMES = "world/graph/keyframes"
 ODOMETRY_EDGES = "world/graph/odometry"
@@ -58,6 +59,7 @@ _LEGEND = f"""
 - **orange line**: trajectory by odometry alone; smooth, drifts
 - **blue line**: trajectory as known at the time, every scan placed by the closures known then
 - **cyan line**: trajectory after the last optimization, over all scans
+- **white line**: ground truth, aligned to the optimized trajectory as for the ATE
 - **violet dots, gray edges**: keyframes and the odometry between them
 - **green edges**: accepted loop closures; amber where the back end lowered their weight below ½
 - **red edges**: loop closures that the matcher or, later, the back end rejected

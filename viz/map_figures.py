@@ -9,7 +9,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.data import Points
-from viz.courses import Course, Floats
+from viz.courses import Course, Floats, PathLine
 from viz.sheet import INK, Sheet
 
 _ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
@@ -17,36 +17,56 @@ _POINTS = "#808893"
 _MAX_POINTS = 120_000
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
-AROUND_M = {2: 5.0, 3: 20.0}  # of map that is shown around a way, at most
-_SHOWN_SHARES, _MARGIN_M = (0.2, 99.8), 1.0  # per cent of the points
+_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; how many times its size a point may lie outside of these
 
 
-def surroundings(low: Floats, high: Floats, clouds: Sequence[Points], dimension: int) -> tuple[Floats, Floats]:
-    """Corners of a map: those of a way and some of what is around it, as far as there are points."""
-    ends = np.array([np.percentile(points, _SHOWN_SHARES, axis=0) for points in clouds if len(points)])
-    if not len(ends):
-        return low, high
-    around_m = AROUND_M[dimension]
-    lowest, highest = ends[:, 0].min(axis=0) - _MARGIN_M, ends[:, 1].max(axis=0) + _MARGIN_M
-    return (
-        np.minimum(low, np.maximum(low - around_m, lowest)),
-        np.maximum(high, np.minimum(high + around_m, highest)),
-    )
+def surroundings(low: Floats, high: Floats, clouds: Sequence[Points]) -> tuple[Floats, Floats]:
+    """Corners (3,) that hold a trajectory, from ``low`` to ``high``, and the extents of its maps."""
+    boxes = np.array([(low, high), *(extent(points) for points in clouds if len(points))])
+    return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+
+
+def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Corners (d,) of a map (M, d), but for outliers: points that lie far beyond 99 % of all, along any axis."""
+    low, high = np.percentile(points, _BULK, axis=0)
+    size = high - low
+    size[:2] = size[:2].max()
+    inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
+    return inside.min(axis=0).astype(np.float64), inside.max(axis=0).astype(np.float64)
 
 
 def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the colour is the height, where there is any."""
-    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
-    inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
-    shown = shown[inside]
     with Sheet.of_plan(name, low, high) as sheet:
-        if len(shown):
-            corners = (low[0], high[0], low[1], high[1])
-            sheet.axes.imshow(_image(shown, low, high), extent=corners, origin="lower", interpolation="none")
+        _draw_points(sheet, points, low, high, by_height=True)
         return sheet.svg()
 
 
-def _image(points: Floats, low: Floats, high: Floats) -> NDArray[np.uint8]:
+def path_over_map(
+    name: str, points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats
+) -> Markup:
+    """Lines over the map (grey), seen from above, within corners; circle and square begin and end the path."""
+    with Sheet.of_plan(name, low, high) as sheet:
+        _draw_points(sheet, points, low, high, by_height=False)
+        for line in lines:
+            style = (0, (1, 1.5)) if line.is_dashed else "-"
+            x, y = line.positions[:, :2].T
+            sheet.axes.plot(x, y, color=line.color or INK, linewidth=line.width, linestyle=style)
+        for place, marker in ((0, "o"), (-1, "s")):
+            sheet.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
+        return sheet.svg()
+
+
+def _draw_points(sheet: Sheet, points: Points, low: Floats, high: Floats, *, by_height: bool) -> None:
+    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
+    if inside.any():
+        image = _image(shown[inside], low, high, by_height=by_height)
+        corners = (low[0], high[0], low[1], high[1])
+        sheet.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
+
+
+def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
     """(H, W, 4), clear where nothing is, the fuller the more points there are, coloured as the highest of them."""
     from matplotlib import colormaps
     from matplotlib.colors import to_rgba
@@ -57,7 +77,7 @@ def _image(points: Floats, low: Floats, high: Floats) -> NDArray[np.uint8]:
     points = points[np.argsort(points[:, 2])]
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     colours = np.array([to_rgba(_POINTS)])
-    if np.ptp(points[:, 2]):
+    if by_height and np.ptp(points[:, 2]):
         bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
         colours = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
     image = np.zeros((rows, columns, 4))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
+from viz.map_figures import extent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 _WIDTH_INCHES = 8.0
 _MAX_POINTS = 400_000
-_OUTLIERS = 0.5  # percent of the points at each end that the frame may leave out
 _ODOMETRY, _OPTIMISED, _GROUND_TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
 _POINTS = "#8a8f98"
 _FREE, _OCCUPIED = 35, 65  # percent; what is below is drawn white, above dark
@@ -59,8 +59,8 @@ def draw_map(
     if points is not None and len(points):
         _draw_points(axes, points)
     _draw_way(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
-    _draw_way(axes, ground_truth, "ground truth", _GROUND_TRUTH, (0, (4, 2)), 1.4)
-    _draw_way(axes, optimised, "optimised", _OPTIMISED, "-", 1.4)
+    _draw_way(axes, optimised, "optimised", _OPTIMISED, "-", 1.8)
+    _draw_way(axes, ground_truth, "ground truth", _GROUND_TRUTH, (0, (4, 3)), 0.9)
     _mark_ends(axes, optimised)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -76,11 +76,11 @@ def _frame(
     """Corners of what must be seen: every way, the map but for outliers, and a margin."""
     corners: list[NDArray[np.floating]] = [way[:, :2, -1] for way in ways]
     if points is not None and len(points):
-        corners.append(np.percentile(points[:, :2], (_OUTLIERS, 100.0 - _OUTLIERS), axis=0))
+        corners.append(np.array(extent(points[:, :2])))
     elif grid is not None:
         rows, columns = np.nonzero(grid.cells >= _OCCUPIED)
         if len(rows):
-            seen = np.percentile(np.stack([columns, rows], axis=-1), (_OUTLIERS, 100.0 - _OUTLIERS), axis=0)
+            seen = np.array(extent(np.stack([columns, rows], axis=-1).astype(np.float64)))
             corners.append(np.array(grid.origin_m) + grid.resolution_m * seen)
     known = np.concatenate(corners) if corners else np.zeros((1, 2))
     low, high = known.min(axis=0), known.max(axis=0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -25,20 +27,25 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell; ``is_wide`` stretches it to the end of its row."""
+    """A table's cell; ``is_wide`` stretches it to the end of its row, ``is_bad`` marks what needs a look."""
 
     text: str
     is_best: bool = False
     is_wide: bool = False
+    is_bad: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A table's row: what it is about, with its line in the drawings if it has one, and its cells."""
+    """A table's row: what it is about, with its line in the drawings if it has one, and its cells.
+
+    ``link`` : a page or file beside this one that tells more
+    """
 
     name: str
     cells: tuple[Cell, ...]
     chip: Chip | None = None
+    link: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +69,16 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with what it shows; ``svg`` comes from a ``Sheet``, all else is escaped."""
+    """A picture with what it shows; ``svg`` comes from a ``Sheet`` or is a scene, all else is escaped.
+
+    ``is_wide`` : over the whole width of the page
+    """
 
     title: str
     caption: str
     svg: Markup
     chip: Chip | None = None
+    is_wide: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +104,10 @@ class Fold:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not."""
+    """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not.
+
+    ``script`` : the only one that the page may run
+    """
 
     title: str
     subtitle: str
@@ -102,10 +116,11 @@ class Page:
     notes: tuple[str, ...]
     sections: tuple[Section, ...]
     folds: tuple[Fold, ...] = ()
+    script: str = ""
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Write a page; every text in it is escaped, and it may load and run nothing."""
+    """Write a page; every text in it is escaped, and it may load nothing and run nothing but its own script."""
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -113,4 +128,8 @@ def write_page(path: Path, page: Page) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    write_whole(path, environment.get_template("report.html").render(page=page).encode())
+    digest = b64encode(sha256(page.script.encode()).digest()).decode("ascii")
+    may_run = f"script-src 'sha256-{digest}'" if page.script else ""
+    script = Markup(page.script)
+    text = environment.get_template("report.html").render(page=page, may_run=may_run, script=script)
+    write_whole(path, text.encode())

@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.errors import InputError
+from pipeline.evaluate import on_the_estimate
 from pipeline.maps import read_map, read_ply
+from pipeline.runs.directory import TRUTH_FILE
 from pipeline.trajectory import read_tum
 from viz.plots import GridPicture, draw_map
 
 
 def draw_run(directory: Path, picture: Path) -> None:
-    """Draw trajectory, odometry and map of a run to a PNG: the occupancy grid of a 2D run, the cloud of a 3D one.
+    """Draw trajectories, ground truth and map of a run to a PNG: the occupancy grid in 2D, the cloud in 3D.
 
     Raises InputError where the directory is no run's, or the picture does not end in .png or cannot be written.
     """
@@ -23,12 +25,15 @@ def draw_run(directory: Path, picture: Path) -> None:
     is_planar = not points[:, 2].any()
     cells, resolution_m, origin_m = read_map(directory)
     optimised, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
+    truth_file = directory / TRUTH_FILE
+    truth = on_the_estimate(optimised, read_tum(truth_file)) if truth_file.exists() else None
     try:
         draw_map(
             picture,
             title=directory.resolve().name,
             optimised=optimised.poses,
             odometry=odometry.poses,
+            ground_truth=None if truth is None else truth.poses,
             points=None if is_planar else points,
             grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
         )

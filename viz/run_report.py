@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -17,20 +17,19 @@ from pipeline.evaluate import absolute_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
 from pipeline.maps import read_ply
 from pipeline.runs.consistency import nees_of_steps
-from pipeline.runs.directory import RUN_FILE
+from pipeline.runs.directory import RUN_FILE, TRUTH_FILE
 from pipeline.runs.metrics import Metrics
 from pipeline.runs.provenance import Provenance
-from pipeline.runs.run import TRUTH_FILE
 from pipeline.runs.step_table import STAGES
 from pipeline.settings import read_layer
 from pipeline.trajectory import read_tum
-from viz import course_figures as figures
 from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats, colour_of
-from viz.map_figures import map_picture, surroundings
+from viz.map_viewer import SCRIPT
 from viz.provenance_folds import provenance_folds
-from viz.report import REPORT_FILE, Drawing, Fold, Page, Section, write_page
+from viz.report import REPORT_FILE, Fold, Page, Section, write_page
 from viz.run_tables import accuracy_section, stages_section
+from viz.trajectory_section import Told, trajectory_section
 
 
 def write_run_report(directory: Path) -> None:
@@ -42,13 +41,14 @@ def write_run_report(directory: Path) -> None:
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
-        warnings=tuple(line for line in (metrics.unreliable, made.stopped) if line),
+        warnings=tuple(line for line in (metrics.unreliable, made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         folds=(
             *provenance_folds(made, {}),
             Fold("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
         ),
+        script=SCRIPT,
     )
     write_page(directory / REPORT_FILE, page)
 
@@ -61,46 +61,61 @@ def _summary_lines(directory: Path) -> list[str]:
 
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
+    """The result first, what it took last."""
+    yield "trajectory", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
+    yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
-    yield "way", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
     yield "pose graph", m.fit
     yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
-    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
     yield (
         "matching",
         f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
     )
+    yield "map", f"{m.map_points:,} points"
     yield "configuration", made.configuration
+    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
     yield "machine", f"{made.platform}, {made.cores} cores"
 
 
+def _accuracy(m: Metrics) -> str:
+    if m.ground_truth is None:
+        return "unknown: no ground truth"
+    error = m.ground_truth.optimised
+    share = "" if error.ate_share_of_path is None else f", {100.0 * error.ate_share_of_path:.3f} % of the path"
+    return f"ATE {error.ate_rmse_m:.4f} m{share}"
+
+
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
+    """Accuracy, trajectory and map, closures, errors, certainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
-    truth_file = directory / TRUTH_FILE
+    truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
     optimised, before = _against(trajectory, truth), _against(odometry, truth)
+    T_world_truth = lie.inverse(optimised.T_truth_way)
     courses = [
-        _course("optimised", 0, trajectory, optimised, steps, truth),
-        _course("odometry", 3, odometry, before, None, truth),
+        _course("optimised", 0, trajectory, lie.identity(3), optimised, steps, truth),
+        _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, truth),
     ]
     if metrics.ground_truth is not None:
         yield accuracy_section(metrics.ground_truth)
-    yield stages_section(metrics)
     is_planar = metrics.dimension == 2
-    way = None if truth is None else truth.poses[:, :3, 3]
-    text = "Each moved onto the truth as for the ATE." if truth is not None else ""
-    section = way_section(courses, courses, way, is_planar=is_planar, text=text)
-    drawings = (*section.drawings, _map(directory, courses[0], optimised.T_truth_way, metrics.dimension))
-    yield replace(section, title="Trajectory and map", drawings=drawings)
+    way = None if truth is None else (T_world_truth @ truth.poses)[:, :3, 3]
+    loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
+    grain_m = float(str(config["maps.voxel_size_m"]))
+    yield trajectory_section(courses[0], Told.read(steps, loops_file), way, points, grain_m)
+    if config["loops.enabled"]:
+        yield from loop_section(courses[0], loops_file, "Loop closures")
+    text = (
+        "Odometry and truth are moved onto the optimised trajectory as for the ATE." if truth is not None else ""
+    )
+    yield way_section(courses, courses, way, is_planar=is_planar, text=text)
     if metrics.ground_truth is not None:
         yield from error_section(courses, metrics.ground_truth.source)
-    yield from time_section(courses[:1])
-    config = read_layer(directory / "config.toml")
     yield from knowledge_section(courses[:1], is_planar=is_planar)
-    if config["loops.enabled"]:
-        yield from loop_section(courses[0], directory / "loops.parquet", "Loop closures")
+    yield stages_section(metrics)
+    yield from time_section(courses[:1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,16 +132,17 @@ def _against(trajectory: Trajectory, truth: Trajectory | None) -> _Off:
         return _Off(np.eye(4), errors_m)
     pairs = pair(trajectory, truth)
     ate = absolute_error_on_any_course(pairs)
-    errors_m[pairs.indices[:, 0]] = ate.errors_m
+    errors_m[pairs.places] = ate.errors_m
     return _Off(ate.T_reference_estimate, errors_m)
 
 
 def _course(
-    name: str, place: int, trajectory: Trajectory, off: _Off, steps: pa.Table | None, truth: Trajectory | None
-) -> Course:
-    """One of the two ways; what is known of the scans belongs to the first."""
+    name: str, place: int, trajectory: Trajectory, T_world_way: Pose, off: _Off, steps: pa.Table | None,
+    truth: Trajectory | None,
+) -> Course:  # fmt: skip
+    """One of the two ways in the frame of the map; what is known of the scans belongs to the first."""
     unknown = np.full(len(trajectory), np.nan)
-    poses = off.T_truth_way @ trajectory.poses
+    poses = T_world_way @ trajectory.poses
     return Course(
         name=name,
         colour=colour_of(place),
@@ -157,11 +173,3 @@ def _seconds(steps: pa.Table) -> Floats:
 
 def _nees(steps: pa.Table, truth: Trajectory) -> Floats:
     return nees_of_steps(steps, _trajectory(steps, "odom_"), truth)
-
-
-def _map(directory: Path, course: Course, T: Pose, dimension: int) -> Drawing:
-    """The points of the map around the way."""
-    points = lie.transform(T, read_ply(directory / "map.ply"))
-    corners = surroundings(*figures.frame([course], None), [points], dimension)
-    colours = "; dark is low, bright is high" if dimension == 3 else ""
-    return Drawing("Map", f"map.ply, seen from above{colours}.", map_picture("map", points, *corners))

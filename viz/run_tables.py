@@ -14,14 +14,20 @@ from viz.report import Cell, Grid, Head, Row, Section
 def accuracy_section(truth: GroundTruth) -> Section:
     """How far off both ways were."""
     rows = tuple(
-        Row(name, tuple(Cell(text) for text in _figures(accuracy)))
-        for name, accuracy in (("optimised", truth.optimised), ("odometry", truth.odometry))
+        Row(
+            name, tuple(Cell(text, is_bad=bool(complaint) and k == 0) for k, text in enumerate(_figures(accuracy)))
+        )
+        for name, accuracy, complaint in (
+            ("optimised", truth.optimised, truth.complaint),
+            ("odometry", truth.odometry, ""),
+        )
     )
     heads = (
         Head("way"), Head("ATE", "m", "rmse"), Head("ATE mean", "m"), Head("ATE max", "m"), Head("ATE/path", "%"),
         Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
     )  # fmt: skip
-    text = f"Against {truth.source}, {truth.path_length_m:.1f} m."
+    missing = f", {truth.optimised.missing}" if truth.optimised.missing else ""
+    text = f"Against {truth.source}, {truth.path_length_m:.1f} m: {truth.optimised.pairs:,} scans{missing}."
     return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimised.definition,)))
 
 

@@ -69,11 +69,13 @@ def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
 
 
 def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
-    scans, lost = sum(each.scans for each in results), sum(each.lost for each in results)
+    scans, degenerate, lost = (
+        sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
+    )
     way_km = 1e-3 * sum(each.travelled_m for each in results)
     hours = sum(each.log_span_s for each in results) / 3600.0
     speed = np.array([each.times_real_time for each in results])
-    yield "scans", f"{scans:,}, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h"
+    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h"
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimised.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:

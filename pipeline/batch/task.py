@@ -74,7 +74,7 @@ class Task(Struct, frozen=True):
     @property
     def said_file(self) -> Path:
         """All that the last try said."""
-        return self.row_file.with_suffix(".txt")
+        return said_file(Path(self.out), self.key)
 
 
 class Row(Struct, frozen=True):
@@ -97,6 +97,11 @@ class Row(Struct, frozen=True):
         new = path.with_suffix(".new")
         new.write_bytes(msgspec.json.encode(self))
         new.replace(path)
+
+
+def said_file(out: Path, key: str) -> Path:
+    """Where a batch keeps all that the last try of a log said."""
+    return out / "rows" / f"{key}.txt"
 
 
 def finished_row(task: Task) -> Row | None:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.ground_truth import ground_truth
 from pipeline.commands.limit_options import limit_options
 from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.commands.run import aliases
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
 from pipeline.source import Source
@@ -30,6 +32,15 @@ _DAY_S = 86_400.0
     "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="A list of logs, one a line."
 )
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic of every log; found where only one fits.")
+@click.option(
+    "--start", metavar="SECONDS", help="Leave out what comes before, counted from a log's first message."
+)
+@click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
+@click.option("--every", metavar="N", help="Take every N-th scan.")
+@click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
+@click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
+@click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Logs at a time. [default: one a core]")
 @click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
 @limit_options("a log", time_default="a day", memory_default="its share of three quarters of what is free")
@@ -54,6 +65,8 @@ def batch(
     memory_mib: float | None,
     retries: int,
     rerun: str,
+    gt: str | None,
+    **shortcuts: str | bool | None,
 ) -> None:
     """Run many logs, each in a process of its own.
 
@@ -61,13 +74,14 @@ def batch(
     process, hangs or takes all memory is a row that says so; the others finish, and the exit code is 1. Called
     again, only what has no result is run: a result belongs to the log's contents (of a remote log: its address,
     size and version) and the configuration in effect. DIR gets a run directory a log, batch.parquet with a row a
-    log, report.html and summary.txt.
+    log, report.html and summary.txt. Logs whose topics differ go into calls of their own, each with its --topic.
 
     \b
     Examples:
       scanchain batch *.mcap --out runs/all
       scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
       scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
+      scanchain batch *.bag --out runs/front --topic /lidar_front/points --end 60
       scanchain batch --manifest logs.txt --out /shared/all --ray auto
       scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
@@ -78,7 +92,12 @@ def batch(
 
     if ray is not None and workers is not None:
         raise InputError("--workers is for this machine alone; on a cluster every core takes a log")
-    changes = overrides(ctx)
+    truth_file, truth_topic = ground_truth(gt)
+    if truth_file is not None:
+        raise InputError(
+            f"--gt {gt}: a batch has no file of true poses for all its logs; name a topic, or use run"
+        )
+    changes = tuple(overrides(ctx, [*aliases(shortcuts), *truth_topic]))
     job = Batch(
         logs=collect(logs, manifests),
         out=out.resolve(),

@@ -27,7 +27,7 @@ _PATH = click.Path(path_type=Path)
 
 @click.command(cls=OnceCommand)
 @click.argument("estimate", metavar="EST.tum", type=_PATH)
-@click.argument("reference", metavar="[GT.tum]", required=False, type=_PATH)
+@click.argument("reference", metavar="[GT]", required=False, type=_PATH)
 @click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
 @click.option(
     "--align",
@@ -36,7 +36,12 @@ _PATH = click.Path(path_type=Path)
     show_default=True,
     help="How the frames are brought together for the ATE.",
 )
-@click.option("--max-difference", type=float, metavar="SECONDS", help="Between stamps that pair. [default: 0.01]")
+@click.option(
+    "--max-gap",
+    type=float,
+    metavar="SECONDS",
+    help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
+)
 @click.option(
     "--rpe",
     default="1pose,1s,10m,100m",
@@ -51,14 +56,15 @@ def evaluate(
     reference: Path | None,
     relations: Path | None,
     align: str,
-    max_difference: float | None,
+    max_gap: float | None,
     rpe: str,
     kitti: bool,
     as_json: bool,
 ) -> None:
     """Print ATE, RPE, the KITTI metric and the error over relations, each with its definition.
 
-    Give the ground truth, or --relations, or both.
+    Give the ground truth, or --relations, or both. GT is a TUM file, interpolated at the stamps of EST (positions
+    linear, rotations by SLERP, nothing extrapolated), or a KITTI file with one row a pose of EST.
 
     \b
     Examples:
@@ -66,19 +72,18 @@ def evaluate(
       scanchain evaluate runs/intel/trajectory.tum --relations intel.relations
       scanchain evaluate runs/log/trajectory.tum truth.tum --align first --rpe 5s,50m --json
     """
-    from pipeline.evaluate import PAIRING_LIMIT_S, read_relations, relation_error
+    from pipeline.evaluate import read_relations, read_truth, relation_error
     from pipeline.trajectory import read_kitti, read_tum
 
     if reference is None and relations is None:
-        raise InputError("nothing to compare with; give GT.tum or --relations FILE")
-    read = read_kitti if kitti else read_tum
-    trajectory = read(estimate)
+        raise InputError("nothing to compare with; give GT (a TUM or KITTI file) or --relations FILE")
+    trajectory = read_kitti(estimate) if kitti else read_tum(estimate)
     results = Results({}, {})
     if reference is not None:
-        limit_s = PAIRING_LIMIT_S if max_difference is None else max_difference
-        if not 0.0 <= limit_s < inf:
-            raise InputError(f"--max-difference is {limit_s:g} s; choose a number from 0 up")
-        results = _against(trajectory, read(reference), align, limit_s, _stretches(rpe))
+        if max_gap is not None and not 0.0 <= max_gap < inf:
+            raise InputError(f"--max-gap is {max_gap:g} s; choose a number from 0 up")
+        truth = read_kitti(reference) if kitti else read_truth(reference).at(trajectory.stamps_ns)
+        results = _against(trajectory, truth, align, max_gap, _stretches(rpe))
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     click.echo(_json(results) if as_json else _text(results))
@@ -128,12 +133,12 @@ def _stretches(text: str) -> list[Stretch]:
 
 
 def _against(
-    trajectory: Trajectory, reference: Trajectory, align: str, limit_s: float, stretches: list[Stretch]
+    trajectory: Trajectory, reference: Trajectory, align: str, gap_s: float | None, stretches: list[Stretch]
 ) -> Results:
     """Every metric that the trajectories allow."""
     from pipeline.evaluate import Alignment, absolute_error, kitti_error_on_any_course, pair
 
-    pairs = pair(trajectory, reference, limit_s=limit_s)
+    pairs = pair(trajectory, reference, gap_s=gap_s)
     metrics: dict[str, Callable[[], Result]] = {
         **{stretch.name: partial(stretch.error, pairs) for stretch in stretches},
         "kitti": partial(kitti_error_on_any_course, pairs),

@@ -44,7 +44,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 @click.option("--every", metavar="N", help="Take every N-th scan.")
 @click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: a TUM file or a topic. [default: /ground_truth]")
+@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Go on from the last checkpoint of a run that was killed or stopped.")
 @click.option(
@@ -98,7 +98,7 @@ def run(
         logs=logs,
         out=out,
         config_file=config,
-        overrides=overrides(ctx, [*_aliases(shortcuts), *truth_topic]),
+        overrides=overrides(ctx, [*aliases(shortcuts), *truth_topic]),
         sinks=_sinks(rerun),
         ground_truth=truth_file,
         force=force,
@@ -126,7 +126,7 @@ def run(
 _KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}
 
 
-def _aliases(options: dict[str, str | bool | None]) -> list[Override]:
+def aliases(options: dict[str, str | bool | None]) -> list[Override]:
     """The keys that the short options stand for."""
     keys = _KEYS | {"matcher": "matching.matcher"}
     result = [each for name, key in keys.items() for each in alias(key, options.get(name), f"--{name}")]

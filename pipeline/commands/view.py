@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option(
-    "--png", metavar="FILE", type=click.Path(path_type=Path), help="Draw trajectory and map to a picture."
+    "--png",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Draw trajectory, ground truth and map to a picture.",
 )
 @click.pass_context
 def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> None:

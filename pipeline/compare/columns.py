@@ -114,7 +114,7 @@ COLUMNS = (
         1,
         "",
         "accuracy",
-        "share of the shorter trajectory's poses that were paired",
+        "share of the scans that have a true pose, interpolated or not",
     ),
     Column(
         "relations_m", "relations", "m", 1.0, 4, "low", "summary", "mean absolute error over relations set by hand"

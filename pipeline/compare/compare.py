@@ -22,12 +22,12 @@ from pipeline.compare.summary import summarise
 from pipeline.compare.table import Table, write_table
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
-from pipeline.evaluate import pair, read_reference, read_relations, relation_error
+from pipeline.evaluate import pair, read_relations, read_truth, relation_error
 from pipeline.logs import Log, open_log
 from pipeline.runs.directory import RUN_FILE, RunDirectory
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
-from pipeline.settings import Override, load_settings
+from pipeline.settings import Override, load_settings, named
 from pipeline.source import Source
 
 
@@ -121,15 +121,19 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
         relations = read_relations(contest.relations)
         relation_error(standing, relations)
     truth, source = log.ground_truth(), log.ground_truth_topic
+    topic = named(contest.overrides, "log.ground_truth_topic")
     if contest.ground_truth is not None:
-        truth, source = read_reference(contest.ground_truth, scans.stamps_ns), str(contest.ground_truth)
+        truth, source = read_truth(contest.ground_truth).at(scans.stamps_ns), str(contest.ground_truth)
+    elif topic and truth is None:
+        raise InputError(f"{log.paths[0]}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
-            pair(standing, truth)
+            missing = pair(standing, truth).missing
+            note = missing and f"Of {len(scans):,} scans {missing}"
         except InputError as error:
-            if contest.ground_truth is not None:
+            if contest.ground_truth is not None or topic:
                 raise
-            truth, note = None, f"no accuracy against {source}: {error}"
+            truth, note = None, f"No accuracy against {source}: {error}"
     sources = [source] if truth is not None else []
     sources += [str(contest.relations)] if relations is not None else []
     return Reference(truth, relations, " and ".join(sources), note)

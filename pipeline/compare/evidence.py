@@ -17,7 +17,7 @@ from pipeline.compare.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
 from pipeline.compare.scan_store import StoredScans
 from pipeline.compare.scan_table import RunOfMethod, write_relations, write_scans
 from pipeline.data import Points, Trajectory
-from pipeline.evaluate import Relations
+from pipeline.evaluate import Relations, during
 from pipeline.maps import write_ply
 from pipeline.trajectory import write_tum
 
@@ -28,7 +28,7 @@ METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tu
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What errors are against: poses, relations, both or nothing; ``source`` says where they come from."""
+    """What errors are against: poses, relations, both or nothing; ``note`` says what is missing."""
 
     truth: Trajectory | None
     relations: Relations | None
@@ -53,7 +53,7 @@ def write_evidence(folder: Path, evidence: Evidence) -> None:
     write_scans(folder / SCANS_FILE, list(_runs(evidence)), evidence.scans.stamps_ns)
     write_relations(folder / RELATIONS_FILE, evidence.judged)
     if evidence.reference.truth is not None:
-        write_tum(folder / TRUTH_FILE, evidence.reference.truth)
+        write_tum(folder / TRUTH_FILE, during(evidence.reference.truth, evidence.scans.stamps_ns))
     settings = {method.name: {"method": method.base} | method.settings for method in evidence.methods}
     (folder / SETTINGS_FILE).write_text(tomli_w.dumps(settings), encoding="utf-8")
     for method in evidence.methods:

@@ -108,7 +108,7 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
     over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
     nees = _nees(outcome, truth)
-    place = pairs.indices[:, 0]
+    place = pairs.places
     errors_m, errors_rad = judged.errors_m.copy(), judged.errors_rad.copy()
     errors_m[place], errors_rad[place] = ate.errors_m, ate.errors_rad
     figures = msgspec.structs.replace(

@@ -37,11 +37,11 @@ def summarise(evidence: Evidence, log: Log, limits: Limits, provenance: Provenan
         points_per_scan=float(scans.points.mean()),
         repeats=max(len(runs) for runs in evidence.outcomes.values()),
         truth=evidence.reference.source,
+        truth_note=evidence.reference.note,
         rows=rows,
         disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
         notes=[
             f"every run may take {limits.time_s:,.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
-            *([evidence.reference.note] if evidence.reference.note else []),
             *log.notes,
             *log.damage,
         ],

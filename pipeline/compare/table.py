@@ -45,6 +45,7 @@ class Table(Struct, frozen=True):
     ----------
     log, topic : what was read, for headings
     truth : what errors are against; empty where there is no ground truth
+    truth_note : how many scans have no true pose, or why a truth could not be used; else empty
     disagreement_m : row by row the median distance between two methods' motions; None where one has failed
     notes : what was chosen or assumed, a line each
     baselines : versions of the packages that were compared
@@ -57,6 +58,7 @@ class Table(Struct, frozen=True):
     points_per_scan: float
     repeats: int
     truth: str
+    truth_note: str
     rows: list[Row]
     disagreement_m: list[list[float | None]]
     notes: list[str]
@@ -66,9 +68,12 @@ class Table(Struct, frozen=True):
     @property
     def against(self) -> str:
         """What errors are against, in a sentence."""
+        note = f" {self.truth_note}." if self.truth_note else ""
         if self.truth:
-            return f"Errors are against {self.truth}."
-        return "There is no ground truth: surfaces and to others tell who is sharp or alone, not who is right."
+            return f"Errors are against {self.truth}.{note}"
+        return (
+            f"There is no ground truth: surfaces and to others tell who is sharp or alone, not who is right.{note}"
+        )
 
     @property
     def figures(self) -> list[Figures]:

@@ -1,6 +1,11 @@
 """How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
 
-from pipeline.evaluate.absolute import AbsoluteError, absolute_error, absolute_error_on_any_course
+from pipeline.evaluate.absolute import (
+    AbsoluteError,
+    absolute_error,
+    absolute_error_on_any_course,
+    on_the_estimate,
+)
 from pipeline.evaluate.alignment import Alignment, align
 from pipeline.evaluate.consistency import motion_nees
 from pipeline.evaluate.disagreement import disagreement
@@ -12,8 +17,8 @@ from pipeline.evaluate.kitti import (
     kitti_error,
     kitti_error_on_any_course,
 )
-from pipeline.evaluate.pairing import PAIRING_LIMIT_S, Pairs, pair
-from pipeline.evaluate.reference import read_reference
+from pipeline.evaluate.pairing import Pairs, during, pair
+from pipeline.evaluate.reference import TruthFile, check_overlap, read_truth
 from pipeline.evaluate.relations import (
     RELATION_LIMIT_S,
     RelationError,
@@ -32,7 +37,6 @@ from pipeline.evaluate.statistics import Statistics
 
 __all__ = [
     "KITTI_LENGTHS_M",
-    "PAIRING_LIMIT_S",
     "RELATION_LIMIT_S",
     "SHORT_LENGTHS_M",
     "AbsoluteError",
@@ -45,16 +49,20 @@ __all__ = [
     "RelativeError",
     "Sharpness",
     "Statistics",
+    "TruthFile",
     "absolute_error",
     "absolute_error_on_any_course",
     "align",
+    "check_overlap",
     "disagreement",
+    "during",
     "kitti_error",
     "kitti_error_on_any_course",
     "motion_nees",
+    "on_the_estimate",
     "pair",
-    "read_reference",
     "read_relations",
+    "read_truth",
     "relation_error",
     "relative_error_over_distance",
     "relative_error_over_frames",

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.data import Matrix, Pose
+from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate.alignment import Alignment, align
-from pipeline.evaluate.pairing import Pairs
+from pipeline.evaluate.pairing import Pairs, during, pair
 from pipeline.evaluate.statistics import Statistics
 
 
@@ -86,6 +86,16 @@ def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
         return absolute_error(pairs)
     except InputError:
         return absolute_error(pairs, Alignment.FIRST)
+
+
+def on_the_estimate(estimate: Trajectory, reference: Trajectory) -> Trajectory:
+    """The reference during the estimate, moved onto it by the alignment of the ATE.
+
+    Raises InputError where they have no pairs.
+    """
+    T_reference_estimate = absolute_error_on_any_course(pair(estimate, reference)).T_reference_estimate
+    near = during(reference, estimate.stamps_ns)
+    return Trajectory(near.stamps_ns, lie.inverse(T_reference_estimate) @ lie.lift(near.poses))
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:

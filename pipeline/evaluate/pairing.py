@@ -1,7 +1,8 @@
-"""Poses of two trajectories that belong to the same instant."""
+"""An estimated trajectory and the truth at the same stamps, interpolated where it has others."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,80 +12,127 @@ from pipeline import lie
 from pipeline.data import Matrix, Trajectory
 from pipeline.errors import InputError
 
-PAIRING_LIMIT_S = 0.01
+_WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
+_INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
+_SAME_S = 1e-6  # what a stamp that was a floating-point number of seconds is off
+_ROUNDED_S = 5e-4  # what one written in milliseconds is off
+_ROUNDING_SHARE = 0.1  # of the reference's median interval, that either is at most
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Estimate and reference, pose by pose, in the order of the estimate.
+    """Estimate and reference, pose by pose, in the order and at the stamps of the estimate.
 
     Attributes
     ----------
     stamps_ns : (N,) int64, the estimate's
     estimate, reference : (N, 4, 4) poses; SE(2) lifted into the plane z = 0
-    indices : (N, 2) int64, their places in the estimate and in the reference
+    places : (N,) int64, of the poses among those of the estimate
     estimate_count, reference_count : poses there were
-    limit_s : largest difference of stamps allowed
+    interpolated : how many of the N reference poses lie between two of the reference's own
+    early, late, in_gap : estimated poses without a reference pose: before its begin, after its end, in gaps of it
+    gap_s : widest gap that was interpolated over
     """
 
     stamps_ns: NDArray[np.int64]
     estimate: Matrix
     reference: Matrix
-    indices: NDArray[np.int64]
+    places: NDArray[np.int64]
     estimate_count: int
     reference_count: int
-    limit_s: float
+    interpolated: int
+    early: int
+    late: int
+    in_gap: int
+    gap_s: float
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     @property
     def share(self) -> float:
-        """Share of the poses of the shorter trajectory that found a partner."""
-        return len(self) / min(self.estimate_count, self.reference_count)
+        """Share of the estimated poses that have a reference pose."""
+        return len(self) / self.estimate_count
+
+    @property
+    def missing(self) -> str:
+        """How many estimated poses have no reference pose and why; empty where all have one."""
+        reasons = ", ".join(self._reasons())
+        return f"{self.estimate_count - len(self):,} without a true pose: {reasons}" if reasons else ""
 
     @property
     def description(self) -> str:
-        """What was paired, in words."""
+        """What was paired and how, in words."""
+        exact = len(self) - self.interpolated
         return (
-            f"{len(self)} pairs by nearest stamp within {self.limit_s:g} s "
-            f"({100.0 * self.share:.1f} % of the shorter trajectory; "
-            f"{self.estimate_count} estimated, {self.reference_count} reference poses)"
+            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
+            f"the reference (of {self.reference_count:,} poses) at its stamp: {exact:,} as they are, "
+            f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to "
+            f"{self.gap_s:.3g} s), none extrapolated" + (f"; {self.missing}" if self.missing else "")
         )
 
+    def _reasons(self) -> Iterator[str]:
+        if self.early:
+            yield f"{self.early:,} before the truth begins"
+        if self.late:
+            yield f"{self.late:,} after it ends"
+        if self.in_gap:
+            yield f"{self.in_gap:,} in gaps of it wider than {self.gap_s:.3g} s"
 
-def pair(estimate: Trajectory, reference: Trajectory, *, limit_s: float = PAIRING_LIMIT_S) -> Pairs:
-    """Pair each pose of the shorter trajectory with the nearest in time of the longer one, within the limit.
 
-    A pose stands in one pair only, that with the nearest partner. Stamps need not increase: a log's own order is
-    kept and only the search is done on sorted stamps.
+def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Pairs:
+    """The reference at the stamps of the estimate: positions linear, rotations by SLERP between its neighbors.
+
+    A reference pose of the same stamp, to a microsecond, is taken as it is. Nothing is extrapolated: outside the
+    reference, and where its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within
+    the rounding of a stamp written in milliseconds. Neither trajectory's stamps need increase.
+
+    gap_s : None for five median intervals of the reference, at most 0.6 s
     """
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not len(trajectory):
             raise InputError(f"the {name} has no pose; nothing to compare")
-    few, many = (estimate, reference) if len(estimate) <= len(reference) else (reference, estimate)
-    partner, difference_ns = nearest(few.stamps_ns, many.stamps_ns)
-    numbers = np.arange(len(few))
-    close = difference_ns <= round(limit_s * 1e9)
-    best = np.lexsort((numbers, difference_ns, partner))
-    first = np.append(True, np.diff(partner[best]) != 0)
-    keep = np.zeros(len(few), np.bool_)
-    keep[best[first]] = True
-    keep &= close
-    chosen = np.stack([numbers[keep], partner[keep]], axis=1)
-    indices = chosen if few is estimate else chosen[:, ::-1]
-    indices = indices[np.argsort(indices[:, 0], kind="stable")]
-    if not len(indices):
-        raise InputError(_no_pairs(estimate, reference, limit_s))
+    order = np.argsort(reference.stamps_ns, kind="stable")
+    stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
+    interval_ns = _median_interval_ns(stamps_ns)
+    gap_ns = min(_INTERVALS * interval_ns, _WIDEST_GAP_S * 1e9) if gap_s is None else gap_s * 1e9
+    index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
+    after = np.searchsorted(stamps_ns, wanted_ns, side="right")
+    early, late = after == 0, after == len(stamps_ns)
+    before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
+    interval = stamps_ns[after] - stamps_ns[before]
+    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * interval_ns) for each in (_SAME_S, _ROUNDED_S))
+    between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
+    known = between | (difference_ns <= rounded_ns)
+    poses = reference.poses[index]
+    share = (wanted_ns - stamps_ns[before])[between] / interval[between]
+    poses[between] = _interpolated(
+        reference.poses[order[before[between]]], reference.poses[order[after[between]]], share
+    )
+    if not known.any():
+        raise InputError(_no_pairs(estimate, reference, gap_ns * 1e-9))
     return Pairs(
-        stamps_ns=estimate.stamps_ns[indices[:, 0]],
-        estimate=lie.lift(estimate.poses[indices[:, 0]]),
-        reference=lie.lift(reference.poses[indices[:, 1]]),
-        indices=indices,
+        stamps_ns=wanted_ns[known],
+        estimate=lie.lift(estimate.poses[known]),
+        reference=lie.lift(poses[known]),
+        places=np.flatnonzero(known),
         estimate_count=len(estimate),
         reference_count=len(reference),
-        limit_s=limit_s,
+        interpolated=int(between.sum()),
+        early=int((early & ~known).sum()),
+        late=int((late & ~known).sum()),
+        in_gap=int((~early & ~late & ~known).sum()),
+        gap_s=gap_ns * 1e-9,
     )
+
+
+def during(reference: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
+    """The reference from its last pose not after the first of these stamps to its first not before the last."""
+    there, first_ns, last_ns = reference.stamps_ns, stamps_ns.min(), stamps_ns.max()
+    begin_ns = np.max(there, where=there <= first_ns, initial=there.min())
+    end_ns = np.min(there, where=there >= last_ns, initial=there.max())
+    chosen = (there >= begin_ns) & (there <= end_ns)
+    return Trajectory(there[chosen], reference.poses[chosen])
 
 
 def nearest(
@@ -105,12 +153,31 @@ def nearest(
     return order[chosen], np.minimum(to_lower, to_upper)
 
 
-def _no_pairs(estimate: Trajectory, reference: Trajectory, limit_s: float) -> str:
-    spans = [
-        f"{trajectory.stamps_ns.min() / 1e9:.3f} to {trajectory.stamps_ns.max() / 1e9:.3f} s"
-        for trajectory in (estimate, reference)
-    ]
-    return (
-        f"no pose of the estimate ({spans[0]}) lies within {limit_s:g} s of one of the reference ({spans[1]}); "
-        "check that both keep the same clock, or allow a larger difference"
-    )
+def span(stamps_ns: NDArray[np.int64]) -> str:
+    """From the earliest stamp to the latest, in words."""
+    return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
+
+
+def _median_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
+    """Between successive different stamps; 0 where all are equal."""
+    intervals = np.diff(ordered_ns)
+    intervals = intervals[intervals > 0]
+    return float(np.median(intervals)) if len(intervals) else 0.0
+
+
+def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matrix:
+    """Poses (K, d+1, d+1) so far from a to b: position linear, rotation by SLERP."""
+    d = T_a.shape[-1] - 1
+    R_a, R_b = T_a.copy(), T_b.copy()
+    R_a[:, :d, d] = R_b[:, :d, d] = 0.0
+    result = lie.exp(share[:, None] * lie.log(R_b @ lie.inverse(R_a))) @ R_a
+    result[:, :d, d] = T_a[:, :d, d] + share[:, None] * (T_b[:, :d, d] - T_a[:, :d, d])
+    return result
+
+
+def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
+    here, there = estimate.stamps_ns, reference.stamps_ns
+    spans = f"the estimate ({span(here)}) has no pose with a true one beside it in the reference ({span(there)})"
+    if here.max() < there.min() or there.max() < here.min():
+        return f"{spans}; check that both keep the same clock"
+    return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; evaluate --max-gap allows more"

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import LogConfig
@@ -26,6 +27,7 @@ from pipeline.logs.mounting import (
 from pipeline.logs.opening import index_files
 from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from pipeline.logs.point_times import PointTimes
+from pipeline.logs.poses import StampedPose
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
@@ -208,6 +210,19 @@ class Log:
             returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
             next((each for each in returns if len(each.points)), None)
         return "" if is_scan(self.lidar) else times.assumed
+
+    def expected_stamps(self, topic: str) -> NDArray[np.int64]:
+        """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
+
+        ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
+        """
+        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config)).decode
+        for message in decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
+            if isinstance(message.value, Returns | StampedPose):
+                last_ns = min(self.span.end_ns, whole_span(self.indexes).end_ns)
+                first_ns = message.value.stamp_ns
+                return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
+        raise InputError(f"{self.paths[0]}: no message of {topic} in the part that is read could be understood")
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""

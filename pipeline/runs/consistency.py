@@ -28,7 +28,7 @@ def nees_of_steps(steps: pa.Table, odometry: Trajectory, truth: Trajectory) -> N
     covariances = np.array([row or unknown for row in steps["covariance"].to_pylist()]).reshape(-1, k, k)
     covariances[[state != "ok" for state in steps["state"].to_pylist()]] = np.nan
     pairs = pair(odometry, truth)
-    place = pairs.indices[:, 0]
+    place = pairs.places
     estimate, reference = pairs.estimate, pairs.reference
     if k == 3:
         estimate, reference = lie.flatten(estimate), lie.flatten(reference)

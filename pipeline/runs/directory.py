@@ -16,6 +16,7 @@ import psutil
 from pipeline.errors import InputError
 
 RUN_FILE = "run.json"
+TRUTH_FILE = "ground_truth.tum"  # true poses during the run, as they were given
 CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
 RECORDING_FILE = "recording.rrd"
 POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory

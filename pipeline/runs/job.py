@@ -22,7 +22,7 @@ class Job:
     out : the run directory
     config_file : on top of the preset; overrides : on top of both
     sinks : where the recording goes
-    ground_truth : a TUM file; None where the log's own is good
+    ground_truth : a TUM or KITTI file; None where the log's own is good
     force : whether a run directory of that name is replaced
     resume : whether to go on from the last checkpoint of a run that was killed, where there is one
     checkpoint_s : seconds between two checkpoints, or more where they are large

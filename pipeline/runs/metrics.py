@@ -21,12 +21,17 @@ from pipeline.slam import SlamResult
 
 _FEW_POINTS = 100  # of a scan; lidars, planar ones included, have more
 _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth
 
 
 class Accuracy(Struct, frozen=True):
-    """A trajectory against the ground truth; what the path is too short for is null."""
+    """A trajectory against the ground truth; what the path is too short for is null.
+
+    Of the scans, ``pairs`` have a true pose; ``missing`` says how many have none and why, empty if all have.
+    """
 
     pairs: int
+    missing: str
     ate_rmse_m: float
     ate_mean_m: float
     ate_max_m: float
@@ -45,6 +50,18 @@ class GroundTruth(Struct, frozen=True):
     optimised: Accuracy
     odometry: Accuracy
 
+    @property
+    def complaint(self) -> str:
+        """That the trajectory is far off, in words; empty where it is not."""
+        error, share = self.optimised, self.optimised.ate_share_of_path
+        if share is None or share <= _FAR_OFF_SHARE or error.ate_rmse_m <= _FAR_OFF_M:
+            return ""
+        return (
+            f"far from the ground truth: ATE {error.ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
+            f"{self.path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, "
+            "or the truth keeps another clock or follows another body"
+        )
+
 
 class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
@@ -52,6 +69,7 @@ class Metrics(Struct, frozen=True):
     Of the closures tried, some were verified by matching; of those the optimised graph accepted some and rejected
     the others. ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``unreliable`` says why the result as a whole is not to be used, empty where it is.
+    ``warnings`` : what was lost, left out or is wrong, a line each
     """
 
     scans: int
@@ -81,6 +99,7 @@ class Metrics(Struct, frozen=True):
     median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
+    warnings: tuple[str, ...]
     unreliable: str = ""
 
     @property
@@ -106,6 +125,7 @@ def measure(
     *,
     run_s: float,
     ground_truth: GroundTruth | None,
+    warnings: Sequence[str] = (),
 ) -> Metrics:
     """The numbers of a finished run."""
     matches = [row.match for row in steps.rows]
@@ -143,6 +163,7 @@ def measure(
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
         unreliable=_unreliable(states, [row.points for row in steps.rows]),
+        warnings=tuple(warnings),
     )
 
 
@@ -192,6 +213,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     ]
     if m.ground_truth is not None:
         lines += _accuracy_lines(m.ground_truth)
+    lines += [f"warning        {warning}" for warning in m.warnings]
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
 
 
@@ -204,6 +226,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         kitti = None
     accuracy = Accuracy(
         pairs=len(pairs),
+        missing=pairs.missing,
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
@@ -217,7 +240,10 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 
 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
-    lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
+    missing = f"; {truth.optimised.missing}" if truth.optimised.missing else ""
+    lines = [
+        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} scans{missing}"
+    ]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
         share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
         of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.config import Config
-from pipeline.data import Scan
+from pipeline.data import Scan, Trajectory
+from pipeline.errors import InputError
+from pipeline.evaluate import on_the_estimate
 from pipeline.logs import Log
 from pipeline.runs.checkpoint import Checkpoints
 from pipeline.runs.closure_table import write_closures
@@ -23,6 +29,8 @@ from pipeline.runs.resuming import Left, after, go_on_recording, set_aside
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import JudgedClosure, final_verdicts
 from pipeline.slam import Slam, SlamResult
+
+TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +53,7 @@ def process(
     progress: Progress,
     steps: StepTable,
     left: Left | None,
+    true_poses: TruePoses,
 ) -> Processed:
     """Place every scan, from the first on or from where the run left off, and write the results."""
     slam, scans, checkpoints = _begin(job, log, config, directory.path, left)
@@ -76,6 +85,7 @@ def process(
             cloud = write_results(folder, result, judged, config, recording)
             write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
             steps.write(folder / "steps.parquet", result.trajectory)
+            _show_truth(true_poses, result, recording)
             if config.outputs.mcap:
                 write_results_mcap(folder, log, steps, result)
         slam.points.close()
@@ -96,6 +106,14 @@ def _begin(
     set_aside(folder, checkpoint)
     checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
     return checkpoint.slam, scans, checkpoints
+
+
+def _show_truth(true_poses: TruePoses, result: SlamResult, recording: Recorder) -> None:
+    """Ground truth into the recording, moved onto the trajectory; one that does not fit is warned of elsewhere."""
+    with suppress(InputError):
+        reference = true_poses(result.trajectory.stamps_ns)
+        if reference is not None:
+            recording.log_ground_truth(on_the_estimate(result.trajectory, reference).poses)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

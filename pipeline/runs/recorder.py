@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from pipeline.config import RecordingConfig
 from pipeline.data import Closure, GraphState, Matrix, Step
-from pipeline.runs.step_table import StepRow
-from pipeline.runs.verdicts import JudgedClosure
 
 if TYPE_CHECKING:
     from pipeline.batch.task import Row
     from pipeline.graph.optimisation import GraphChange
     from pipeline.landmarks.study import Study
+    from pipeline.runs.step_table import StepRow
+    from pipeline.runs.verdicts import JudgedClosure
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 
@@ -68,6 +68,10 @@ class Recorder(Protocol):
 
     def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure."""
+        ...
+
+    def log_ground_truth(self, poses: Matrix) -> None:
+        """Record true poses (N, 4, 4), moved onto the optimised way."""
         ...
 
     def log_map(self, points: NDArray[np.floating]) -> None:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import lie
 from pipeline.config import Config, RecordingConfig
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
+from pipeline.evaluate import TruthFile, check_overlap, during, read_truth
 from pipeline.logs import Log, open_log
 from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
-from pipeline.runs.processing import process
+from pipeline.runs.processing import TruePoses, process
 from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder
@@ -27,11 +31,10 @@ from pipeline.runs.rescue import rescued
 from pipeline.runs.resuming import find_left
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
-from pipeline.settings import dump, load_settings
+from pipeline.settings import dump, load_settings, named
 from pipeline.slam import SlamResult
-from pipeline.trajectory import read_tum, write_tum
+from pipeline.trajectory import write_tum
 
-TRUTH_FILE = "ground_truth.tum"
 _RECORDING_KEYS = RecordingConfig.__struct_fields__
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
@@ -60,7 +63,7 @@ def run(
     """
     started = perf_counter()
     job.check_logs()
-    reference = None if job.ground_truth is None else read_tum(job.ground_truth)
+    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
@@ -70,6 +73,7 @@ def run(
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
+    _check_truth(job, log, truth_file)
     progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
@@ -81,16 +85,20 @@ def run(
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
-            done = process(job, log, settings.config, directory, record, progress, steps, left)
+            true_poses = partial(_true_poses, log, truth_file, progress)
+            done = process(job, log, settings.config, directory, record, progress, steps, left, true_poses)
             run_s = perf_counter() - started - done.held_s
             stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
             with directory.results() as folder:
-                truth, note = _judge(job, log, done.result, reference, folder)
-                warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
-                metrics = measure(steps, done.result, done.cloud, done.judged, run_s=run_s, ground_truth=truth)
-                text = summary(
-                    metrics, _heading(log, settings.config, stopped), settings.source, (*log.notes, *warnings)
+                truth, note = _judge(
+                    true_poses, str(job.ground_truth or log.ground_truth_topic), done.result, folder
                 )
+                warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
+                metrics = measure(
+                    steps, done.result, done.cloud, done.judged,
+                    run_s=run_s, ground_truth=truth, warnings=warnings,
+                )  # fmt: skip
+                text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
@@ -115,21 +123,42 @@ def _check_prior(log: Log, config: Config) -> None:
         )
 
 
+def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
+    """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
+    if file is not None:
+        file.check(log.expected_stamps(log.topic), log.scan_count)
+        return
+    topic = named(job.overrides, "log.ground_truth_topic")
+    if topic and not log.ground_truth_topic:
+        raise InputError(f"{log.paths[0]}: has no topic {topic}; scanchain info lists those with poses")
+    if topic:
+        check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
+
+
+def _true_poses(
+    log: Log, file: TruthFile | None, progress: Progress, stamps_ns: NDArray[np.int64]
+) -> Trajectory | None:
+    """Of the file named, else the log's own; a KITTI file's for the scans (N,) that were read before a stop."""
+    if file is None:
+        return log.ground_truth()
+    return (file.first(len(stamps_ns)) if progress.stopped else file).at(stamps_ns)
+
+
 def _judge(
-    job: Job, log: Log, result: SlamResult, reference: Trajectory | None, folder: Path
+    true_poses: TruePoses, source: str, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
-    """Accuracy against the file named, else against the log's own truth; a warning where they do not fit."""
-    source = str(job.ground_truth) if reference is not None else log.config.ground_truth_topic
-    if reference is None:
-        reference = log.ground_truth()
-    if reference is None:
-        return None, ()
+    """Accuracy where there is a truth; warnings where it does not fit, is of few scans, or far off."""
     try:
+        reference = true_poses(result.trajectory.stamps_ns)
+        if reference is None:
+            return None, ()
         truth = judge(result, reference, source)
-        write_tum(folder / TRUTH_FILE, reference)
-        return truth, ()
+        write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
+    scans, known = len(result.trajectory), truth.optimised.pairs
+    few = f"accuracy is that of {known:,} of {scans:,} scans alone: {truth.optimised.missing}"
+    return truth, tuple(line for line in (truth.complaint, few if 2 * known < scans else "") if line)
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:
