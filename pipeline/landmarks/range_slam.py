@@ -15,7 +15,7 @@ from pipeline.landmarks.dead_reckoning import OdometryNoise
 from pipeline.landmarks.mrclam import RangeLog
 from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_fit import LogModel, fit_log
-from pipeline.landmarks.solvers import create_solver
+from pipeline.landmarks.solvers import ESTIMATOR, create_solver
 from pipeline.landmarks.student import StudentLoss
 
 
@@ -60,7 +60,7 @@ class RangeSolution:
     guess: State
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = "schur") -> RangeSolution:
+def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None for an estimate of it

@@ -16,16 +16,18 @@ from pipeline.landmarks.dead_reckoning import OWN, OWN_UNITS
 from pipeline.landmarks.mrclam import RangeLog, read_mrclam
 from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_slam import RangeSolution, solve_range_log
-from pipeline.landmarks.study import Estimate, Fact, Options, Study
+from pipeline.landmarks.solvers import methods_for
+from pipeline.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
 
 _DOUBTED = 0.25  # of the weight of an observation as expected
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
 
 
 def study_log(folder: Path, options: Options) -> Study:
-    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture and with every method.
+    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
 
-    The linear solvers are compared on the first step from where the estimate began, with the noise that it found.
+    The linear solvers that are asked for run on the first step from where the estimate began, with the noise that
+    it found; ``ESTIMATOR`` makes the estimate.
     """
     log = read_mrclam(folder, options.robot)
     solve_range_log(log, options.noise)  # compiles, which is no part of the time
@@ -34,10 +36,11 @@ def study_log(folder: Path, options: Options) -> Study:
     at = solution.problem.linearise(solution.guess)
     system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
     build_s = perf_counter() - begin
+    names, left_out = methods_for(options.methods, system.pattern.shape[1])
     truth = truth_at(log, solution.nodes_s, solution.landmarks)
     return Study(
         name=log.name,
-        facts=_facts(log, solution, is_stated=options.noise is not None),
+        facts=(*_facts(log, solution, is_stated=options.noise is not None), *left_out_fact(left_out)),
         before=_estimate(solution.reckoned, solution.nodes_s, truth),
         after=_estimate(solution.state, solution.nodes_s, truth),
         converged=solution.converged,
@@ -50,7 +53,7 @@ def study_log(folder: Path, options: Options) -> Study:
         columns=system.pattern.shape[1],
         entries=len(system.values),
         build_s=build_s,
-        methods=compare_linear(system, options.methods, options.repeats),
+        methods=compare_linear(system, names, options.repeats),
         trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.state.poses)),
     )
 
