@@ -101,7 +101,7 @@ def test_jitter_is_measured_against_the_period(tmp_path):
 def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
     finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
     assert finding["stamp order"].severity == "warning"
-    assert finding["stamp order"].found == "2 header stamps step back, 1 repeat the one before"
+    assert finding["stamp order"].found == "2 steps back in the header stamps, 1 repeated"
 
 
 def test_stamps_that_were_never_set_are_a_problem(tmp_path):
@@ -113,7 +113,7 @@ def test_stamps_that_were_never_set_are_a_problem(tmp_path):
 def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
     found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
     assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
-    assert "40 of 40 scans have none" in found["wheels"].found
+    assert "40 of 40 scans without one" in found["wheels"].found
     assert "constant-velocity" in found["wheels"].remedy
 
 
@@ -144,16 +144,20 @@ def test_nan_and_zero_shares_are_measured(tmp_path):
 
     finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
     assert finding.found == "30 % NaN or infinite, 50 % zero, 20 valid a scan (median)"
-    assert finding.severity == "warning" and "40 scans have fewer than 50 returns" in finding.effect
+    assert finding.severity == "warning" and "40 scans with fewer than 50 returns" in finding.effect
 
 
 def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
     said = drive()
     said[5].data = said[5].data[:50]
     said[9] = scan_said(said[9].log_ns, laser_scan(said[9].log_ns, np.full(100, np.nan)))
-    finding = diagnose(saved(tmp_path, said))["damage"]
-    assert finding.severity == "problem" and finding.remedy == "--log.bad_scans skip"
-    assert "1 malformed scans" in finding.found and "1 scans without a valid point" in finding.found
+    path = saved(tmp_path, said)
+    finding = diagnose(path, max_bad_scans_percent=2.0)["damage"]
+    assert finding.severity == "problem" and finding.remedy == "--log.max_bad_scans_percent 5"
+    assert "1 malformed scan (" in finding.found and "1 scan without a valid point" in finding.found
+    for percent in (5.0, LogConfig().max_bad_scans_percent):
+        finding = diagnose(path, max_bad_scans_percent=percent)["damage"]
+        assert finding.severity == "warning" and "left out" in finding.effect
 
 
 def test_a_log_that_was_cut_off_is_told(tmp_path):
@@ -279,7 +283,7 @@ def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
 
 def test_the_intel_log_is_known_for_its_stamps():
     found = diagnose(shared_data("2d/intel.mcap"))
-    assert found["stamp order"].found == "631 header stamps step back, 0 repeat the one before"
+    assert found["stamp order"].found == "631 steps back in the header stamps, 0 repeated"
     assert "81.83 m" in found["no return"].found and found["no return"].severity == "ok"
     assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found
 

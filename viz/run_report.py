@@ -24,6 +24,7 @@ from pipeline.runs.run import TRUTH_FILE
 from pipeline.runs.step_table import STAGES
 from pipeline.settings import read_layer
 from pipeline.trajectory import read_tum
+from pipeline.words import counted
 from viz import course_figures as figures
 from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats, colour_of
@@ -62,7 +63,7 @@ def _summary_lines(directory: Path) -> list[str]:
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
-    yield "way", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
+    yield "way", f"{m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
     yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
     yield (

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.words import counted
+
 if TYPE_CHECKING:
     from pipeline.graph.certificate import Certificate
     from pipeline.graph.g2o import G2oFile
@@ -28,10 +30,10 @@ class Answer:
         guess = done.initialisation
         if guess == "given":
             guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
-        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
+        size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
         lines = [
             f"graph          {self.change.name}: {size}",
-            *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
             f"first guess    {guess}",
             f"chi2           {done.chi2_before:.6g} before, {done.chi2_after:.8g} after",
             f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from pipeline.errors import InputError
+from pipeline.words import counted
 
 
 @click.command()
@@ -73,4 +74,7 @@ def simulate(
             force=force,
             progress=terminal.count,
         )
-    click.echo(f"{destination}: {len(truth)} scans; ground truth in it and in {destination.with_suffix('.tum')}")
+    click.echo(
+        f"{destination}: {counted(len(truth), 'scan')}; ground truth in it and in "
+        f"{destination.with_suffix('.tum')}"
+    )

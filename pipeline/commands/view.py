@@ -31,6 +31,8 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
       scanchain view runs/log --web
       scanchain view runs/log --png log.png
     """
+    from pipeline.commands.terminal import Terminal
+
     viewing: Viewing = ctx.obj
     if png is not None:
         viewing.draw(directory, png)
@@ -41,4 +43,5 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
         raise InputError(f"{path}: no such file; scanchain run writes it unless --rerun leaves out save")
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
-    viewing.show(path, web)
+    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
+        viewing.show(path, click.echo, web)

@@ -22,6 +22,7 @@ from pipeline.landmarks.relative_position import linear_system, state_of
 from pipeline.landmarks.solvers import create_solver, methods_for
 from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
 from pipeline.landmarks.system import LinearSystem
+from pipeline.words import counted
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 
@@ -75,7 +76,10 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
         Fact("guess", options.guess),
-        Fact("iteration", f"{options.optimiser} {ended} after {minimum.iterations} steps: {minimum.reason}"),
+        Fact(
+            "iteration",
+            f"{options.optimiser} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
+        ),
         chi2_fact(minimum.cost, len(system.b), system.pattern.shape[1]),
         *left_out_fact(left_out),
     )

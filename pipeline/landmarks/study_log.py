@@ -18,6 +18,7 @@ from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_slam import RangeSolution, solve_range_log
 from pipeline.landmarks.solvers import methods_for
 from pipeline.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
+from pipeline.words import counted
 
 _DOUBTED = 0.25  # of the weight of an observation as expected
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
@@ -79,7 +80,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     )
     own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
-    after = f"{ended} after {solution.iterations} steps: {solution.reason}"
+    after = f"{ended} after {counted(solution.iterations, 'step')}: {solution.reason}"
     doubted = int(np.count_nonzero(solution.weights < _DOUBTED * solution.loss.share))
     return (
         Fact("observations", seen),
@@ -91,7 +92,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
             f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(solution.motion_chi2)}",
         ),
         Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
-        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g} of what others do"),
+        Fact("doubted", f"{counted(doubted, 'observation')} with less than {_DOUBTED:g} of the weight of others"),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
@@ -12,6 +13,8 @@ from pipeline.config import PreprocessConfig
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.rest import LEAST_S, Rest
 from pipeline.logs.survey import Survey
+from pipeline.logs.tally import most_bad_scans
+from pipeline.words import counted
 
 _MANY_LOST = 0.5
 _STUCK_SHARE = 0.01  # of beams, all at the farthest range
@@ -38,13 +41,16 @@ def _damage(seen: Survey) -> Finding:
     bad = len(seen.malformed) + empty
     lines = list(seen.damage)
     if seen.malformed:
-        lines.append(f"{len(seen.malformed)} malformed scans (the first: {seen.malformed[0]})")
+        lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
     if empty:
-        lines.append(f"{empty} scans without a valid point")
+        lines.append(f"{counted(empty, 'scan')} without a valid point")
     if not lines:
         return Finding("damage", Severity.OK, "every scan is readable and has points")
-    if bad:
-        return Finding("damage", Severity.PROBLEM, "; ".join(lines), "a run stops there", "--log.bad_scans skip")
+    messages = len(seen.scans) + len(seen.malformed)
+    if bad > most_bad_scans(messages, seen.log.config):
+        effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}"
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
     effect = "what was damaged is left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
 
@@ -56,7 +62,7 @@ def _returns(seen: Survey) -> Finding:
     found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, {median:,} valid a scan (median)"
     few = int(np.count_nonzero(np.array(kept) < _FEW_POINTS))
     if few:
-        effect = f"{few} scans have fewer than {_FEW_POINTS} returns: their matches are weak or lost"
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
         return Finding("returns", Severity.WARNING, found, effect, "--start or --end, where they are at an end")
     if undefined + zero > _MANY_LOST:
         return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
@@ -104,7 +110,7 @@ def _rings(seen: Survey) -> Finding:
     if not any(rings):
         return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
     most, least = max(rings), min(rings)
-    found = f"{most} rings" if most == least else f"{least} to {most} rings"
+    found = counted(most, "ring") if most == least else f"{least} to {most} rings"
     if least < most:
         return Finding("rings", Severity.NOTE, found, "scans without some of their rings are sparser, no more")
     return Finding("rings", Severity.OK, found)

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.survey import Survey
+from pipeline.words import counted
 
 _GAP_PERIODS = 2.5
 _JITTER = 0.1  # of the period
@@ -34,7 +35,7 @@ def check_time(seen: Survey) -> Iterator[Finding]:
 
 def _rate(seen: Survey) -> Finding:
     rate_hz = 1.0 / seen.period_s if seen.period_s else 0.0
-    found = f"{len(seen.scans):,} scans, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
+    found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
     if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not seen.wheels:
         effect = "the motion between two scans is long and predicted without wheels; fast turns may get lost"
         return Finding("rate", Severity.NOTE, found, effect, "--matching.wide_max_distance_m, larger")
@@ -82,7 +83,7 @@ def _order(seen: Survey) -> Finding:
     backwards, repeated = int(np.count_nonzero(steps_ns < 0)), int(np.count_nonzero(steps_ns == 0))
     if not backwards and not repeated:
         return Finding("stamp order", Severity.OK, "header stamps rise from scan to scan")
-    found = f"{backwards} header stamps step back, {repeated} repeat the one before"
+    found = f"{counted(backwards, 'step')} back in the header stamps, {repeated:,} repeated"
     effect = "scans are taken in the order of log time; poses in the results hold at stamps that are not in order"
     severity = Severity.PROBLEM if repeated == len(steps_ns) else Severity.WARNING
     remedy = "record with stamps: the driver left them out" if severity == Severity.PROBLEM else ""
@@ -119,8 +120,9 @@ def _wheels(seen: Survey) -> Finding:
     after = np.searchsorted(stamps_ns, seen.stamps_ns)
     before_ns = np.abs(seen.stamps_ns - stamps_ns[np.maximum(after - 1, 0)])
     after_ns = np.abs(stamps_ns[np.minimum(after, len(stamps_ns) - 1)] - seen.stamps_ns)
+    scans = counted(len(seen.scans), "scan")
     missed = int(np.count_nonzero(np.minimum(before_ns, after_ns) > _NEAR_NS))
-    found = f"{topic}: {len(stamps_ns):,} readings, {missed} of {len(seen.scans):,} scans have none within 0.5 s"
+    found = f"{topic}: {counted(len(stamps_ns), 'reading')}, {missed} of {scans} without one within 0.5 s"
     if not missed:
         return Finding("wheels", Severity.OK, found)
     effect = "the motion of those scans is predicted from the scans alone"

@@ -7,18 +7,23 @@ from dataclasses import dataclass
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
+from pipeline.logs.counting import times_of
 from pipeline.logs.log import Log
 from pipeline.logs.opening import index_files
 from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
 from pipeline.logs.sizes import size_of
+from pipeline.logs.topics import topics_of
 from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic: its message type, how it is encoded, how many messages there are and how often they come."""
+    """A topic: its message type, how it is encoded, how many messages there are, and their mean rate.
+
+    The rate is that between the first and the last of them, 0 where there is one alone.
+    """
 
     topic: str
     type_name: str
@@ -84,11 +89,10 @@ def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, 
 
 def _topics(indexes: Sequence[FileIndex], duration_s: float) -> tuple[TopicInfo, ...]:
     """Every topic, its messages added up over the files."""
-    topics: dict[str, TopicInfo] = {}
-    for index in indexes:
-        for number, channel in index.channels.items():
-            known = topics.get(channel.topic)
-            messages = index.counts.get(number, 0) + (known.messages if known else 0)
-            rate_hz = messages / duration_s if duration_s > 0.0 else 0.0
-            topics[channel.topic] = TopicInfo(channel.topic, kind(channel), channel.encoding, messages, rate_hz)
-    return tuple(topics[topic] for topic in sorted(topics))
+    result = []
+    for topic, channel in topics_of(indexes).items():
+        messages, first_ns, last_ns = times_of(indexes, topic)
+        span_s = (last_ns - first_ns) * 1e-9 or duration_s
+        rate_hz = (messages - 1) / span_s if span_s > 0.0 and messages > 1 else 0.0
+        result.append(TopicInfo(topic, kind(channel), channel.encoding, messages, rate_hz))
+    return tuple(result)

@@ -18,8 +18,7 @@ from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
-
-_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+from pipeline.words import counted
 
 
 class Accuracy(Struct, frozen=True):
@@ -142,18 +141,19 @@ def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
     """The numbers as a person reads them."""
     m = metrics
-    dropped = f", {m.dropped_points:,} invalid returns left out" if m.dropped_points else ""
+    dropped = f", {counted(m.dropped_points, 'invalid return')} left out" if m.dropped_points else ""
     lines = [
         heading,
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
         f"{m.lost:,} lost{dropped}",
-        f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
-        f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
-        f"accepted; chi2 {m.chi2:.4g}",
-        f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
+        f"way            {m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}; "
+        f"{counted(m.closures_tried, 'loop closure')} tried, {m.closures_verified:,} verified, "
+        f"{m.closures_accepted:,} accepted; chi2 {m.chi2:.4g}",
+        f"map            {counted(m.map_points, 'point')}; "
+        f"{m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
-        f"residual {m.residual}, {m.median_iterations:.0f} iterations (medians)",
+        f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
@@ -176,7 +176,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
-        ate_share_of_path=ate.share_of_path if ate.path_length_m >= _SHORTEST_PATH_M else None,
+        ate_share_of_path=ate.share_of_path,
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
@@ -186,7 +186,9 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 
 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
-    lines = [f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} poses"]
+    lines = [
+        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {counted(truth.optimised.pairs, 'pose')}"
+    ]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
         share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
         of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"

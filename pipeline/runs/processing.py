@@ -69,9 +69,9 @@ def process(
                 checkpoints.write(slam)
         if progress.stopped:
             checkpoints.write(slam)
-        progress.say("optimising and writing")
-        result = slam.finish()
+        result = slam.finish(progress.say)
         judged = final_verdicts(result.closures, result.state)
+        progress.say("drawing and writing the map")
         with directory.results() as folder:
             cloud = write_results(folder, result, judged, config, recording)
             write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
@@ -80,6 +80,7 @@ def process(
                 write_results_mcap(folder, log, steps, result)
         slam.points.close()
         held_s = _hold(recording, progress)
+        progress.say("writing the rest of the recording")
     return Processed(result, cloud, judged, (*notes, *recording.warnings), held_s)
 
 

@@ -12,6 +12,7 @@ from pipeline.runs.checkpoint import Checkpoint, read_checkpoint
 from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, left_behind
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.step_table import StepRow, StepTable
+from pipeline.words import counted
 
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -32,7 +33,7 @@ def find_left(out: Path, configuration: str) -> Left | None:
 
     configuration : that of now, as TOML. Raises InputError where that run's, or its version, was another.
     """
-    folder = left_behind(out, CHECKPOINT_FILE)
+    folder = left_behind(out)
     if folder is None:
         return None
     if (folder / "config.toml").read_text(encoding="utf-8") != configuration:
@@ -65,7 +66,9 @@ def set_aside(folder: Path, scans: int) -> tuple[str, ...]:
     if recording.is_file():
         number = len(list(folder.glob("recording.part_*.rrd")))
         before = recording.rename(folder / f"recording.part_{number}.rrd").name
-    return (f"went on after {scans:,} scans" + (f"; the recording up to there is {before}" if before else ""),)
+    return (
+        f"went on after {counted(scans, 'scan')}" + (f"; the recording up to there is {before}" if before else ""),
+    )
 
 
 def _facts(scan: Scan) -> tuple[int, int, int, int]:

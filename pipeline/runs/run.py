@@ -15,7 +15,7 @@ from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.logs import Log, open_log
 from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, RunDirectory, resumable
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
@@ -30,6 +30,7 @@ from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings
 from pipeline.slam import SlamResult
 from pipeline.trajectory import read_tum, write_tum
+from pipeline.words import counted
 
 TRUTH_FILE = "ground_truth.tum"
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -67,12 +68,16 @@ def run(
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
-    progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
+    progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
+    if not job.resume and (idle := resumable(job.out)) is not None:
+        progress.tell(
+            f"{idle.name} is of a run that was stopped; --resume would go on with it, this one begins anew"
+        )
     if left is not None:
         started -= left.checkpoint.run_s
-        progress.tell(f"going on after {len(steps):,} scans of {left.folder.name}")
+        progress.tell(f"going on after {counted(len(steps), 'scan')} of {left.folder.name}")
     rehearsal = ("pipeline.runs.rehearsal", str(log.dimension))
     with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress, rehearsal):
         provenance.write(directory.path / RUN_FILE)
@@ -80,7 +85,7 @@ def run(
         try:
             done = process(job, log, settings.config, directory, record, progress, steps, left)
             run_s = perf_counter() - started - done.held_s
-            stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
+            stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
             with directory.results() as folder:
                 truth, note = _judge(job, log, done.result, reference, folder)
                 warnings = (*log.damage, *done.warnings, *note)
@@ -88,6 +93,7 @@ def run(
                 text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
+            progress.say("drawing the report")
             warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
         except (Exception, KeyboardInterrupt) as error:
             raise rescued(error, directory, steps, provenance) from error
