@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.config import Config
 from pipeline.data import (
     Closure,
@@ -96,16 +96,14 @@ class Slam:
         """Place one scan that ``front_end`` located."""
         tracked = located.tracked
         scan = tracked.scan
-        started = perf_counter()
+        started = working_s()
         keyframe = self._keyframe(located)
         closures: tuple[Closure, ...] = ()
         state = None
         if keyframe >= 0 and self.config.loops.enabled:
             closures = self._close_loops()
             state = self._optimise_when_due()
-        timing = Timing(
-            scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, perf_counter() - started
-        )
+        timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
             scan=scan,
             points=tracked.matched,

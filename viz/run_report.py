@@ -65,7 +65,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "way", f"{m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
-    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
+    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield (
         "matching",
         f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",

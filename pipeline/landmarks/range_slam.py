@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.clock import working_s
 from pipeline.data import Matrix
 from pipeline.landmarks.assembly import landmark_columns, pose_columns
 from pipeline.landmarks.bearing_range import BearingRangeProblem
@@ -70,7 +70,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
     a while, by what the residuals show (``Likeness``): each sighting counts as a share of an independent one.
     Raises InputError where the observations are too few for that.
     """
-    begin = perf_counter()
+    begin = working_s()
     model = LogModel(log)
     fit = fit_log(model, noise, create_solver(method))
     layout, minimum, found = fit.problem.pattern.layout, fit.minimum, fit.consistency
@@ -92,7 +92,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
         iterations=fit.iterations,
         converged=minimum.converged,
         reason=minimum.reason,
-        time_s=perf_counter() - begin,
+        time_s=working_s() - begin,
         problem=fit.problem,
         guess=fit.guess,
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.landmarks import guess as guesses
 from pipeline.landmarks.accuracy import of_positions
 from pipeline.landmarks.assembly import landmark_columns, pose_columns
@@ -45,9 +45,9 @@ class _Solved:
 
 
 def _linear(data: LandmarkData, options: Options) -> _Solved:
-    begin = perf_counter()
+    begin = working_s()
     system = linear_system(data)
-    build_s = perf_counter() - begin
+    build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     methods = compare_linear(system, names, options.repeats)
     chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
@@ -65,9 +65,9 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     guess = _guess(problem, options.guess)
     names, left_out = methods_for(options.methods, problem.pattern.shape[1])
     minimum = minimise(problem, guess, create_solver(names[0]), optimiser=options.optimiser)
-    begin = perf_counter()
+    begin = working_s()
     system = problem.system(problem.linearise(minimum.state), minimum.weights)
-    build_s = perf_counter() - begin
+    build_s = working_s() - begin
     if options.optimiser == "gradient-descent":  # solves no linear system: compare them on the one at its end
         methods = compare_linear(system, names, options.repeats)
     else:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from time import perf_counter
 
 import numpy as np
 
+from pipeline.clock import working_s
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
@@ -102,7 +102,7 @@ class Log:
             Tally(self.topic, self.odometry_topic),
         )
         times = PointTimes(self.config)
-        count, index, asked = 0, 0, perf_counter()
+        count, index, asked = 0, 0, working_s()
         for message, T_odom_base in self._with_wheels(poses, times):
             count += 1
             if (count - 1) % self.config.every:
@@ -112,11 +112,11 @@ class Log:
                 tally.skip(complaint)
                 self._check_bad(tally.bad, complaint)
                 continue
-            scan = self._scan(index, message, T_odom_base, waited_s=perf_counter() - asked)
+            scan = self._scan(index, message, T_odom_base, waited_s=working_s() - asked)
             tally.take(scan)
             yield scan
             index += 1
-            asked = perf_counter()
+            asked = working_s()
         self._truth = poses.ground_truth()
         self.damage += [*tally.losses(), *poses.complaints()]
         self.notes += [*([times.assumed] if self.dimension == 3 else []), *tally.notes()]

@@ -10,6 +10,7 @@ from time import perf_counter
 
 import pipeline
 from pipeline import config, data
+from pipeline.clock import working_s
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.kernels.voxels import Voxels
@@ -50,7 +51,7 @@ def _version() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The chain after ``scans`` scans, which took ``run_s`` seconds."""
+    """The chain after ``scans`` scans, which took ``run_s`` seconds of work."""
 
     scans: int
     run_s: float
@@ -83,7 +84,7 @@ class Checkpoints:
         """run_s : that earlier processes took up to the checkpoint gone on from."""
         self.path = folder / CHECKPOINT_FILE
         self.every_s = every_s
-        self.began_s = perf_counter() - run_s
+        self.began_s = working_s() - run_s
         self.next_s = perf_counter() + every_s
 
     def are_due(self) -> bool:
@@ -93,7 +94,7 @@ class Checkpoints:
     def write(self, slam: Slam) -> None:
         """Write one. Raises OSError on a full disk; the last one stays."""
         started = perf_counter()
-        write_snapshot(self.path, Checkpoint(len(slam.stamps_ns), started - self.began_s, slam), _CLASSES)
+        write_snapshot(self.path, Checkpoint(len(slam.stamps_ns), working_s() - self.began_s, slam), _CLASSES)
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 

@@ -20,6 +20,8 @@ from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
 from pipeline.words import counted
 
+_NOTICEABLE_S = 0.5  # of compiling; less is not told
+
 
 class Accuracy(Struct, frozen=True):
     """A trajectory against the ground truth; what the path is too short for is null."""
@@ -47,6 +49,7 @@ class GroundTruth(Struct, frozen=True):
 class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
+    No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
     Of the closures tried, some were verified by matching, and of those the optimised graph accepted some.
     """
 
@@ -75,11 +78,19 @@ class Metrics(Struct, frozen=True):
     median_residual_m: float | None
     median_iterations: float
     ground_truth: GroundTruth | None
+    compile_s: float = 0.0
 
     @property
     def residual(self) -> str:
         """Of matching, in words."""
         return "–" if self.median_residual_m is None else f"{1e3 * self.median_residual_m:.1f} mm"
+
+    @property
+    def compiling(self) -> str:
+        """How long kernels were compiled besides, in words; empty where they came from the cache."""
+        if self.compile_s < _NOTICEABLE_S:
+            return ""
+        return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
 
     def write(self, path: Path) -> None:
         """Write as JSON; what is not finite becomes null."""
@@ -93,6 +104,7 @@ def measure(
     judged: Sequence[JudgedClosure],
     *,
     run_s: float,
+    compile_s: float,
     ground_truth: GroundTruth | None,
 ) -> Metrics:
     """The numbers of a finished run."""
@@ -128,6 +140,7 @@ def measure(
         median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
+        compile_s=compile_s,
     )
 
 
@@ -154,7 +167,8 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"{m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
-        f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
+        f"time           {m.run_s:.1f} s{m.compiling}, "
+        f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
         "  95 % below   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),

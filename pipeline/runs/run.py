@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 
 import msgspec
 
 from pipeline import lie
+from pipeline.clock import compiled_s, working_s
 from pipeline.config import Config
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
@@ -58,7 +58,7 @@ def run(
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
-    started = perf_counter()
+    started, compiled_before_s = working_s(), compiled_s()
     job.check_logs()
     reference = None if job.ground_truth is None else read_tum(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
@@ -84,17 +84,26 @@ def run(
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
             done = process(job, log, settings.config, directory, record, progress, steps, left)
-            run_s = perf_counter() - started - done.held_s
+            run_s = working_s() - started - done.held_s
+            compile_s = compiled_s() - compiled_before_s
             stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
             with directory.results() as folder:
                 truth, note = _judge(job, log, done.result, reference, folder)
                 warnings = (*log.damage, *done.warnings, *note)
-                metrics = measure(steps, done.result, done.cloud, done.judged, run_s=run_s, ground_truth=truth)
+                metrics = measure(
+                    steps,
+                    done.result,
+                    done.cloud,
+                    done.judged,
+                    run_s=run_s,
+                    compile_s=compile_s,
+                    ground_truth=truth,
+                )
                 text = summary(metrics, _heading(log, stopped), settings.source, (*log.notes, *warnings))
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             progress.say("drawing the report")
-            warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
+            warnings += _complete(directory, provenance, hashing, stopped, run_s + compile_s, report)
         except (Exception, KeyboardInterrupt) as error:
             raise rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
