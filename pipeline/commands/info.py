@@ -58,6 +58,7 @@ def _text(log: LogInfo) -> str:
             f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
             *([f"times     {log.point_times.removeprefix('point times: ')}"] if log.point_times else []),
         ]
+    lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log.sensors]
     lines += [f"note      {note}" for note in log.notes]
     lines += [f"damage    {line}" for line in log.damage]
     return "\n".join([*lines, *([f"problem   {log.problem}"] if log.problem else [])])

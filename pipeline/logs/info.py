@@ -14,7 +14,7 @@ from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
 from pipeline.logs.sizes import size_of
-from pipeline.logs.topics import topics_of
+from pipeline.logs.topics import OtherSensor, other_sensors, topics_of
 from pipeline.source import Source
 
 
@@ -36,6 +36,7 @@ class TopicInfo:
 class LogInfo:
     """A log: its files and topics, what a run would take of it, and what is wrong with it.
 
+    ``sensors`` are those beside lidar and wheels.
     ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
     nanoseconds; ``T_base_lidar`` row by row.
     """
@@ -49,6 +50,7 @@ class LogInfo:
     dimension: int
     scans: int
     odometry: str
+    sensors: tuple[OtherSensor, ...]
     point_times: str
     T_base_lidar: tuple[tuple[float, ...], ...]
     notes: tuple[str, ...]
@@ -62,6 +64,7 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
     indexes = index_files(sources, config.rate_hz)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
+    wheels, truth = ("", "") if log is None else (log.odometry_topic, log.ground_truth_topic)
     return LogInfo(
         files=tuple(str(source) for source in sources),
         size_bytes=sum(size_of(source) for source in sources),
@@ -71,7 +74,8 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         lidar="" if log is None else log.topic,
         dimension=0 if log is None else log.dimension,
         scans=0 if log is None else log.scan_count,
-        odometry="" if log is None else log.odometry_topic,
+        odometry=wheels,
+        sensors=tuple(other_sensors(indexes, wheels=wheels, truth=truth)),
         point_times="" if log is None else log.assumed_point_times(),
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         notes=() if log is None else tuple(log.notes),
