@@ -55,7 +55,9 @@ def _rate(seen: Survey, matching: MatchingConfig) -> Finding:
 def _gaps(seen: Survey) -> Finding:
     steps_s = np.diff(seen.log_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
-    missing = int((_periods(seen)[0] - 1).sum())
+    periods, off_s = _periods(seen)
+    is_even = len(off_s) > 0 and float(np.std(off_s)) < _JITTER * seen.period_s
+    missing = int((periods - 1).sum()) if is_even else 0  # of scans that come as they please none is missing
     absent = f"; {counted(missing, 'scan')} missing in all" if missing else ""
     if not len(gaps):
         found = f"none longer than {_GAP_PERIODS:g} periods{absent}"
