@@ -37,7 +37,7 @@ def complete(index: FileIndex) -> None:
 def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
     """How many messages a topic has, and the log times of the first and the last of them; 0, 0 where unknown.
 
-    Exact where a local file has a message index, else as exactly as its chunks say.
+    Exact where a file has a message index, else as exactly as its chunks say.
     """
     messages, ends_ns = 0, []
     for index in indexes:
@@ -51,7 +51,7 @@ def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
 
 def _ends(index: FileIndex, block: Block, channel: int) -> list[int]:
     """Log times of the first and last message of a channel in a block that holds some."""
-    if index.remote is not None or not any(e.channel == channel and e.offset >= 0 for e in block.entries):
+    if not any(e.channel == channel and e.offset >= 0 for e in block.entries):
         return [block.start_ns, block.end_ns]
     times_ns = log_times(index, block, channel)
     return [int(times_ns.min()), int(times_ns.max())] if len(times_ns) else [block.start_ns, block.end_ns]
