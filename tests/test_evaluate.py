@@ -348,3 +348,12 @@ def test_real_ground_truth_evaluates_to_zero_against_itself():
     error = absolute_error(pair(truth, truth))
     assert error.translation_m.rmse < 1e-9
     assert 60.0 < error.path_length_m < 70.0
+
+
+def test_an_error_is_no_share_of_a_path_that_is_too_short():
+    standing = drive(step_m=0.001, count=3)
+    error = absolute_error(pair(disturbed(standing), standing), Alignment.FIRST)
+    assert error.path_length_m < 1.0
+    assert error.share_of_path is None and "%" not in error.summary and "max" in error.summary
+    driven = absolute_error(pair(disturbed(drive()), drive()))
+    assert f"{100.0 * driven.share_of_path:.3f} % of {driven.path_length_m:.1f} m" in driven.summary
