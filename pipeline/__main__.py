@@ -7,7 +7,7 @@ import errno
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -112,10 +112,10 @@ def _record(
     return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
 
 
-def _show(path: Path, in_browser: bool) -> None:
+def _show(path: Path, tell: Callable[[str], None], in_browser: bool) -> None:
     from viz.show import show
 
-    show(path, in_browser=in_browser)
+    show(path, tell, in_browser=in_browser)
 
 
 def _draw(directory: Path, picture: Path) -> None:

@@ -13,6 +13,7 @@ from pipeline.errors import InputError, shown
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
@@ -32,6 +33,8 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True):
 class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What is read from the log. Empty topics are found automatically.
 
+    Scans that are malformed or have no valid point are left out, counted and reported; a run stops when they are
+    more than ``max_bad_scans_percent`` of all, rounded up: 0 allows none, anything above at least one.
     ``rate_hz`` is how often the scans of a folder come whose files are not named by their stamps.
     ``point_times`` is the unit of the per-point times, or the sense in which a lidar without any spins; it takes
     ``revolution_s`` for a turn that begins, at the stamp, at the azimuth ``revolution_start_rad`` (π is the rear).
@@ -44,7 +47,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     end_s: Positive = float("inf")
     every: Count = 1
     rate_hz: NonNegative = 0.0
-    bad_scans: Literal["stop", "skip"] = "stop"
+    max_bad_scans_percent: Percent = 10.0
     min_range_m: NonNegative = 0.0
     max_range_m: Positive = float("inf")
     point_times: Literal["auto", "none", "s", "ms", "us", "ns", "clockwise", "counterclockwise"] = "auto"

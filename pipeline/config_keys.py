@@ -18,7 +18,8 @@ from pipeline.errors import InputError, shown
 Value = bool | int | float | str
 Kind = Literal["bool", "int", "float", "choice", "str"]
 
-_UNITS = {"_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_voxels": "voxels", "_keyframes": "keyframes"}
+_UNITS = {"_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_voxels": "voxels", "_keyframes": "keyframes",
+          "_percent": "%"}  # fmt: skip
 _YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.config import Config
 from pipeline.data import (
     Closure,
@@ -30,6 +31,7 @@ from pipeline.graph.pose_graph import PoseGraph
 from pipeline.loops import LoopCloser, refined, spread
 from pipeline.odometry import FrontEnd, Located, checked_mounting
 from pipeline.point_store import PointStore
+from pipeline.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
 _GROWTH = 0.05  # of the graph, between two optimisations that change little
@@ -95,16 +97,14 @@ class Slam:
         """Place one scan that ``front_end`` located."""
         tracked = located.tracked
         scan = tracked.scan
-        started = perf_counter()
+        started = working_s()
         keyframe = self._keyframe(located)
         closures: tuple[Closure, ...] = ()
         state = None
         if keyframe >= 0 and self.config.loops.enabled:
             closures = self._close_loops()
             state = self._optimise_when_due()
-        timing = Timing(
-            scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, perf_counter() - started
-        )
+        timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
             scan=scan,
             points=tracked.matched,
@@ -120,16 +120,22 @@ class Slam:
             timing=timing,
         )
 
-    def finish(self) -> SlamResult:
-        """Close what is left, optimise once more, spread the corrections over all scans and refine these."""
+    def finish(self, tell: Callable[[str], None] = lambda stage: None) -> SlamResult:
+        """Close what is left, optimize once more, spread the corrections over all scans and refine these.
+
+        tell : told which of these stages begins
+        """
         if self.config.loops.enabled:
+            tell("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
+        tell(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimise("mended")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
         corrected = spread(state.poses, numbers, odometry)
         if self.keeps_scans:
+            tell(f"refining {counted(len(odometry), 'scan')}")
             corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),

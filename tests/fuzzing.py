@@ -123,7 +123,7 @@ def read(path):
     """The scans recovered, as (stamp, points), and the lines told about what was not."""
     scans = []
     try:
-        log = open_log(path, LogConfig(bad_scans="skip"))
+        log = open_log(path, LogConfig(max_bad_scans_percent=100.0))
         for scan in log.scans():
             scans.append((scan.log_time_ns, _content(scan)))
     except InputError as error:

@@ -79,7 +79,7 @@ def read(path, rate_hz):
     """The scans recovered, as (stamp, points), and the lines told about what was not."""
     scans = []
     try:
-        log = open_log(path, LogConfig(bad_scans="skip", rate_hz=rate_hz))
+        log = open_log(path, LogConfig(max_bad_scans_percent=100.0, rate_hz=rate_hz))
         for scan in log.scans():
             scans.append((scan.stamp_ns, scan.points.tobytes()))
         log.ground_truth()

@@ -264,7 +264,7 @@ NOWHERE = np.full(60, np.nan, "<f4").view(POINTS.dtype)
 def test_a_malformed_cloud_is_told_by_its_number_and_what_is_wrong(refused, tmp_path, lie, words):
     path = write(tmp_path / "x.mcap", [cloud_said(STAMP_NS, point_cloud(STAMP_NS, POINTS, **lie))])
     text = refused("run", path, "--out", tmp_path / "a")
-    says(text, f"{path}: scan 0 of /points is malformed", *words, "--log.bad_scans skip", "--topic")
+    says(text, f"{path}: scan 0 of /points is malformed", *words)
 
 
 @pytest.mark.parametrize(
@@ -279,12 +279,14 @@ def test_a_malformed_cloud_is_told_by_its_number_and_what_is_wrong(refused, tmp_
 def test_a_scan_without_a_valid_point_says_why_there_is_none(refused, tmp_path, said, why):
     path = write(tmp_path / "x.mcap", [said])
     text = refused("run", path, "--out", tmp_path / "a")
-    says(text, f"{path}: scan 0 of {said.topic} has no valid point", why, "--log.bad_scans skip", "--topic")
+    says(text, f"{path}: scan 0 of {said.topic} has no valid point", why)
 
 
 def test_a_span_without_a_scan_names_the_length_of_the_log(refused, tmp_path, office):
     text = refused("run", office, "--out", tmp_path / "a", "--start", "100")
-    says(text, office, "--start 100", "--end", "6.0 s long")
+    says(text, office, "after --start 100 s; the log is 6.0 s long")
+    text = refused("run", office, "--out", tmp_path / "a", "--start", "100", "--end", "101.5")
+    says(text, office, "between --start 100 s and --end 101.5 s; the log is")
 
 
 # what arguments can be wrong about
@@ -739,7 +741,18 @@ def test_info_tells_topics_rates_and_what_a_run_would_use(call, office):
     code, output, errors = call("info", office)
     assert (code, errors) == (0, "")
     says(output, office, "/odom", "/tf_static", "lidar     /scan: 2D, 60 scans", "wheels    /odom")
-    assert re.search(r"topic     /scan +sensor_msgs/LaserScan +60 messages +1[01]\.\d Hz  cdr", output)
+    assert re.search(r"topic     /scan +sensor_msgs/LaserScan +60 messages +10\.0 Hz  cdr", output)
+    says(output, "1 message ")
+
+
+@pytest.mark.parametrize("chunk_size", [1 << 20, 500])
+def test_twenty_scans_at_10_hz_are_told_as_10_hz_however_long_the_log_is_besides(call, tmp_path, chunk_size):
+    stamps_ns = [STAMP_NS + k * SECOND // 10 for k in range(20)]
+    said = [odometry_said(STAMP_NS + k * SECOND, odometry(STAMP_NS, 0, 0)) for k in (-5, 8)]
+    said += [scan_said(stamp, laser_scan(stamp, [1.0] * 9)) for stamp in stamps_ns]
+    path = write(tmp_path / "x.mcap", said, chunk_size=chunk_size)
+    rates = {topic["topic"]: topic["rate_hz"] for topic in json.loads(call("info", path, "--json")[1])["topics"]}
+    assert rates["/scan"] == pytest.approx(10.0) and rates["/odom"] == pytest.approx(1.0 / 13.0)
 
 
 def test_info_as_json_counts_what_the_mcap_package_counts(call, office):
@@ -923,7 +936,7 @@ def ring(tmp_path):
 def test_optimize_prints_what_it_did_and_writes_the_graph(call, tmp_path, ring):
     code, output, errors = call("optimize", ring, "--out", tmp_path / "done.g2o")
     assert (code, errors) == (0, "")
-    says(output, "2D, 4 poses, 5 edges", "1 lines PARAMS", "odometry, as the file has no vertices")
+    says(output, "2D, 4 poses, 5 edges", "1 line PARAMS", "odometry, as the file has no vertices")
     says(output, "chi2", "iterations", "below the tolerance", "certificate    globally optimal to within")
     written = (tmp_path / "done.g2o").read_text()
     assert written.count("VERTEX_SE2") == 4 and written.count("EDGE_SE2") == 5 and written.endswith("PARAMS 7\n")

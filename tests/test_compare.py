@@ -211,7 +211,7 @@ def test_a_reading_that_the_user_stopped_is_told(office, tmp_path):
     settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
     contest = Contest(logs=(office,), out=tmp_path / "out", methods=("mine",), settings_file=settings)
     table = compare(contest, lambda _: None, StopsAtOnce()).table
-    assert table.scans == 5 and "the user stopped the reading: 5 scans are compared" in text(table)
+    assert table.scans == 5 and "the user stopped the reading: 5 scans compared" in text(table)
 
 
 def test_stored_scans_are_the_decoded_ones_bit_by_bit(office, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from naive_logs import (
     SECOND,
     STAMP_NS,
+    Said,
     cloud_said,
     laser_scan,
     odometry,
@@ -17,7 +18,7 @@ from naive_logs import (
     transforms_said,
     write,
 )
-from scenes import shared_data
+from scenes import configured, shared_data
 
 from pipeline.__main__ import main
 from pipeline.config import Config, LogConfig
@@ -28,7 +29,7 @@ from pipeline.simulate import simulate
 
 STEP_NS = SECOND // 10
 CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]
-CHECKS += ["ranges", "duplicates", "rest", "mounting"]
+CHECKS += ["ranges", "duplicates", "rest", "mounting", "sensors"]
 
 
 def diagnose(*paths, **config):
@@ -68,9 +69,17 @@ def test_a_healthy_log_is_all_well(tmp_path):
     assert "0.200, 0.100" in found["mounting"].found
 
 
-def test_a_slow_log_without_wheels_is_noted(tmp_path):
+def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path):
     slow = {"stamp": lambda k: 9 * k * STEP_NS, "log": lambda k: 9 * k * STEP_NS}
-    assert diagnose(saved(tmp_path, drive(**slow)))["rate"].severity == "note"
+    planar = diagnose(saved(tmp_path, drive(**slow)))["rate"]
+    assert planar.severity == "note" and planar.remedy == ""  # the plane is searched by correlation
+    said = [cloud_said(STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, sweep(k))) for k in range(5)]
+    path = saved(tmp_path, said)
+    finding = diagnose(path)["rate"]
+    assert finding.remedy == "--matching.wide_reach_voxels 4 --matching.wide_max_distance_m 6"
+    wide = configured(3, {"matching.wide_reach_voxels": 4, "matching.wide_max_distance_m": 6.0})
+    findings = examine([path], lambda _: wide, LogConfig()).findings
+    assert next(each for each in findings if each.check == "rate").remedy == ""
 
 
 def test_a_gap_is_found_where_it_is(tmp_path):
@@ -82,18 +91,45 @@ def test_a_gap_is_found_where_it_is(tmp_path):
         finding.severity == "warning"
         and finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
     )
-    assert "--start" in finding.remedy and "at constant velocity" in finding.effect
+    assert finding.remedy == "--end 1.9" and "at constant velocity" in finding.effect
+    assert "--start 4, apart" in finding.effect
     on_wheels = diagnose(saved(tmp_path, drive(stamp=hole, log=hole, wheels=True)))["gaps"]
     assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
     later = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)), start_s=1.0)["gaps"]
     assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
 
+def test_missing_scans_are_counted_and_are_no_jitter(tmp_path):
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0.0, 0.0002, 100) * SECOND
+    missing = {20, 41, 42, 70, 90, 91, 92}
+    said = drive(100, stamp=lambda k: int(shifts[k]))
+    found = diagnose(saved(tmp_path, [each for k, each in enumerate(said, start=-1) if k not in missing]))
+    assert found["gaps"].severity == "note" and found["gaps"].found.endswith("; 7 scans missing in all")
+    assert found["jitter"].severity == "ok"
+    assert 0.2 < float(found["jitter"].found.split(" ms")[0].split()[-1]) < 0.4
+    single = diagnose(saved(tmp_path, [each for k, each in enumerate(drive(40), start=-1) if k != 20]))["gaps"]
+    assert single.severity == "note" and single.found == "none longer than 2.5 periods; 1 scan missing in all"
+
+
+def test_returns_below_range_min_are_told(tmp_path):
+    def near(k):
+        values = room(k)
+        values[:38] = 0.2
+        return values
+
+    finding = diagnose(saved(tmp_path, drive(ranges=near, low=0.45)))["returns"]
+    assert finding.severity == "note" and "38 % below range_min (0.45 m)" in finding.found
+    assert "below range_min is not used" in finding.effect
+    raised = diagnose(saved(tmp_path, sweeps()), min_range_m=3.0)["returns"]
+    assert "below range_min (3 m)" in raised.found
+
+
 def test_jitter_is_measured_against_the_period(tmp_path):
     rng = np.random.default_rng(0)
     shifts = rng.normal(0.0, 0.02, 400) * SECOND
     finding = diagnose(saved(tmp_path, drive(400, stamp=lambda k: int(shifts[k]))))["jitter"]
-    assert finding.severity == "note"
+    assert finding.severity == "note" and finding.remedy == ""
     told = float(finding.found.split("(")[1].split(" %")[0])
     assert told == pytest.approx(100 * 0.02 * np.sqrt(2) / 0.1, rel=0.15)
 
@@ -101,7 +137,7 @@ def test_jitter_is_measured_against_the_period(tmp_path):
 def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
     finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
     assert finding["stamp order"].severity == "warning"
-    assert finding["stamp order"].found == "2 header stamps step back, 1 repeat the one before"
+    assert finding["stamp order"].found == "2 steps back in the header stamps, 1 repeated"
 
 
 def test_stamps_that_were_never_set_are_a_problem(tmp_path):
@@ -113,8 +149,8 @@ def test_stamps_that_were_never_set_are_a_problem(tmp_path):
 def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
     found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
     assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
-    assert "40 of 40 scans have none" in found["wheels"].found
-    assert "constant-velocity" in found["wheels"].remedy
+    assert "40 of 40 scans without one" in found["wheels"].found
+    assert found["wheels"].remedy == found["clock"].remedy == ""  # without a reading nothing is taken from them
 
 
 def test_scans_that_were_logged_late_are_noted(tmp_path):
@@ -144,16 +180,20 @@ def test_nan_and_zero_shares_are_measured(tmp_path):
 
     finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
     assert finding.found == "30 % NaN or infinite, 50 % zero, 20 valid a scan (median)"
-    assert finding.severity == "warning" and "40 scans have fewer than 50 returns" in finding.effect
+    assert finding.severity == "warning" and "40 scans with fewer than 50 returns" in finding.effect
 
 
 def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
     said = drive()
     said[5].data = said[5].data[:50]
     said[9] = scan_said(said[9].log_ns, laser_scan(said[9].log_ns, np.full(100, np.nan)))
-    finding = diagnose(saved(tmp_path, said))["damage"]
-    assert finding.severity == "problem" and finding.remedy == "--log.bad_scans skip"
-    assert "1 malformed scans" in finding.found and "1 scans without a valid point" in finding.found
+    path = saved(tmp_path, said)
+    finding = diagnose(path, max_bad_scans_percent=2.0)["damage"]
+    assert finding.severity == "problem" and finding.remedy == "--log.max_bad_scans_percent 5"
+    assert "1 malformed scan (" in finding.found and "1 scan without a valid point" in finding.found
+    for percent in (5.0, LogConfig().max_bad_scans_percent):
+        finding = diagnose(path, max_bad_scans_percent=percent)["damage"]
+        assert finding.severity == "warning" and "left out" in finding.effect
 
 
 def test_a_log_that_was_cut_off_is_told(tmp_path):
@@ -189,6 +229,7 @@ def test_wheels_that_move_tell_a_corridor_from_a_rest(tmp_path):
 def test_wheels_without_a_mounting_are_told(tmp_path):
     finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["mounting"]
     assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
+    assert finding.remedy == "--odometry.prior constant-velocity"
 
 
 def test_a_lidar_that_pans_is_told_with_its_joint_and_range(tmp_path):
@@ -243,17 +284,36 @@ def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
     path = saved(tmp_path, sweeps(span=9.5))  # in hundredths of a second: no unit that is guessed fits
     finding = diagnose(path)["point times"]
     assert finding.severity == "warning" and "95 of the period" in finding.found
-    assert "--log.point_times" in finding.remedy
+    assert finding.remedy == "--log.point_times none"
     path = saved(tmp_path, sweeps(span=0.095))
-    assert diagnose(path, point_times="ms")["point times"].severity == "warning"
+    finding = diagnose(path, point_times="ms")["point times"]
+    assert finding.severity == "warning" and finding.remedy == "--log.point_times s"
     assert diagnose(path, point_times="s")["point times"].severity == "ok"
 
 
 def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
-    path = saved(tmp_path, sweeps(fields=np.dtype([(name, "<f4") for name in "xyz"])))
-    finding = diagnose(path)["point times"]
-    assert finding.severity == "note" and "--log.point_times clockwise --log.revolution_s 0.1" in finding.remedy
-    assert diagnose(path, point_times="clockwise")["point times"].severity == "ok"
+    plain = np.dtype([(name, "<f4") for name in "xyz"])
+
+    def turning(sense, times):
+        """A cloud in the order of firing, ``times`` around."""
+        azimuth = sense * np.linspace(0.0, 2.0 * np.pi * times, 640) + 1.0
+        rows = np.zeros(640, plain)
+        rows["x"], rows["y"] = 10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth)
+        return rows
+
+    def found(rows):
+        stamps_ns = [STAMP_NS + k * STEP_NS for k in range(20)]
+        path = saved(tmp_path, [cloud_said(stamp, point_cloud(stamp, rows)) for stamp in stamps_ns])
+        return path, diagnose(path)["point times"]
+
+    for sense, way in ((1.0, "counterclockwise"), (-1.0, "clockwise")):
+        path, finding = found(turning(sense, 1.0))
+        assert finding.severity == "note"
+        assert finding.remedy == f"--log.point_times {way} --log.revolution_s 0.1 --log.revolution_start_rad 1"
+        assert diagnose(path, point_times=way)["point times"].severity == "ok"
+    ring_by_ring, in_no_order, part = turning(1.0, 16.0), sweep(0, fields=plain), turning(1.0, 0.3)
+    for rows in (ring_by_ring, in_no_order, part):
+        assert found(rows)[1].remedy == ""
 
 
 def test_rings_that_come_and_go_are_noted(tmp_path):
@@ -285,12 +345,35 @@ def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
     assert still_s == first_s == pytest.approx(until_s, abs=0.15)
 
 
+def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
+    said = [*drive(wheels=True), odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")]
+    names = {"nav_msgs/msg/Path": "sensor_msgs/msg/Imu", "nav_msgs/msg/MapMetaData": "sensor_msgs/msg/NavSatFix"}
+    said += [Said(topic, kind, STAMP_NS, b"0") for topic, kind in zip(("/imu/data", "/fix"), names, strict=True)]
+    path = saved(tmp_path, said, rename=lambda kind: names.get(kind, kind))
+    finding = diagnose(path)["sensors"]
+    assert finding.severity == "ok"
+    assert finding.found.split("; ") == [
+        "GNSS /fix: not used", "ground truth /ground_truth: judges the result, is not used for it",
+        "IMU /imu/data: not used",
+    ]  # fmt: skip
+    assert main(["info", str(path)]) == 0
+    text = capfd.readouterr().out
+    for line in finding.found.split("; "):
+        assert f"sensor    {line}\n" in text
+    assert "wheels    /odom" in text and "/odom:" not in text
+    assert main(["info", str(path), "--json"]) == 0
+    assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
+        "GNSS", "ground truth", "IMU",
+    ]  # fmt: skip
+    assert diagnose(saved(tmp_path, drive()))["sensors"].found == "no IMU, GNSS or ground truth"
+
+
 # The whole
 
 
 def test_the_intel_log_is_known_for_its_stamps():
     found = diagnose(shared_data("2d/intel.mcap"))
-    assert found["stamp order"].found == "631 header stamps step back, 0 repeat the one before"
+    assert found["stamp order"].found == "631 steps back in the header stamps, 0 repeated"
     assert "81.83 m" in found["no return"].found and found["no return"].severity == "ok"
     assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found
 

@@ -435,3 +435,12 @@ def test_scans_in_the_dropouts_of_a_real_motion_capture_are_named():
     pairs = pair(Trajectory(stamps_ns, np.tile(np.eye(3), (len(stamps_ns), 1, 1))), log.ground_truth())
     assert (len(pairs), pairs.interpolated) == (380, 380)
     assert pairs.missing == "34 without a true pose: 34 in gaps of it wider than 0.05 s"
+
+
+def test_an_error_is_no_share_of_a_path_that_is_too_short():
+    standing = drive(step_m=0.001, count=3)
+    error = absolute_error(pair(disturbed(standing), standing), Alignment.FIRST)
+    assert error.path_length_m < 1.0
+    assert error.share_of_path is None and "%" not in error.summary and "max" in error.summary
+    driven = absolute_error(pair(disturbed(drive()), drive()))
+    assert f"{100.0 * driven.share_of_path:.3f} % of {driven.path_length_m:.1f} m" in driven.summary

@@ -187,7 +187,7 @@ def test_of_a_db3_only_the_messages_that_are_damaged_are_lost(tmp_path):
     stamps = {scan.stamp_ns for scan in scans}
     assert len(scans) == 29
     assert_clouds(scans, [sweep for sweep in sweeps if sweep.stamp_ns in stamps])
-    assert "at least 1 messages from" in log.damage[0] and "29 scans" in log.damage[1]
+    assert "at least 1 message from" in log.damage[0] and "29 scans" in log.damage[1]
 
 
 def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):

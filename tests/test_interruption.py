@@ -254,6 +254,7 @@ def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_pat
     errors = child.communicate(timeout=20)[1]
     assert child.returncode == 1 and errors.count("\n") == 1
     assert "interrupted; 100 scans until then are in" in errors
+    assert f"to go on with it: scanchain {' '.join(words)} --resume\n" in errors
     assert assert_readable(partial(out)) == 100
     assert start(office, out, *LIVELY, "--resume").wait() == 0
     same_result(out, whole)

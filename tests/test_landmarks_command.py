@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import shared_data
 
+from pipeline.landmarks.solvers import ESTIMATOR, METHODS
 from pipeline.trajectory import read_tum
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
@@ -15,26 +16,38 @@ RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 image = pytest.importorskip("matplotlib.image")
 
 
-@pytest.fixture
-def small(tmp_path):
-    """A linear problem of 30 poses and 5 landmarks, whose name would be markup if it were not escaped."""
+def linear_problem(path, poses_count, landmarks_count):
+    """A linear problem in which every fifth pose sees every landmark."""
     rng = np.random.default_rng(0)
-    poses, landmarks = np.cumsum(rng.normal(size=(30, 2)), axis=0), 4.0 * rng.normal(size=(5, 2))
+    poses = np.cumsum(rng.normal(size=(poses_count, 2)), axis=0)
+    landmarks = 4.0 * rng.normal(size=(landmarks_count, 2))
     poses -= poses[0]
-    pairs = np.stack(np.meshgrid(np.arange(30), np.arange(5), indexing="ij"), -1).reshape(-1, 2)
+    grid = np.meshgrid(np.arange(0, poses_count, 5), np.arange(landmarks_count), indexing="ij")
+    pairs = np.stack(grid, -1).reshape(-1, 2)
     seen = landmarks[pairs[:, 1]] - poses[pairs[:, 0]] + 0.1 * rng.normal(size=pairs.shape)
-    path = tmp_path / "a<b>&c.npz"
     np.savez(
         path, gt_traj=poses, gt_landmarks=landmarks, observations=np.concatenate([pairs, seen], axis=1),
-        odom=np.diff(poses, axis=0) + 0.1 * rng.normal(size=(29, 2)), sigma_odom=0.01 * np.eye(2),
+        odom=np.diff(poses, axis=0) + 0.1 * rng.normal(size=(poses_count - 1, 2)), sigma_odom=0.01 * np.eye(2),
         sigma_landmark=0.01 * np.eye(2),
     )  # fmt: skip
     return path
 
 
+@pytest.fixture
+def small(tmp_path):
+    """A problem whose name would be markup if it were not escaped."""
+    return linear_problem(tmp_path / "a<b>&c.npz", 30, 5)
+
+
+def methods_of(out):
+    return [
+        method["method"] for method in json.loads((out / "metrics.json").read_text())["problems"][0]["methods"]
+    ]
+
+
 def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path):
     out = tmp_path / "out"
-    code, output, _ = call("landmarks", small, "--out", out, "--repeat", "1")
+    code, output, _ = call("landmarks", small, "--out", out, "--repeat", "1", "--methods", "all")
     assert code == 0
     for method in ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd", "cholesky", "schur"):
         assert re.search(rf"^  {method} .* \d\.\de[+-]\d\d$", output, re.MULTILINE), method
@@ -47,6 +60,30 @@ def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path)
     pixels = image.imread(out / "a_b_c.png")
     assert np.mean(np.all(np.abs(pixels[..., :3] - [0.25, 0.47, 0.84]) < 0.1, axis=-1)) > 0.001
     assert json.loads((out / "run.json").read_text())["complete"]
+
+
+def test_one_solver_runs_unless_more_are_asked_for(call, small, tmp_path):
+    out = tmp_path / "out"
+    code, output, _ = call("landmarks", small, "--out", out)
+    assert code == 0 and methods_of(out) == [ESTIMATOR] and "differs by" not in output
+    page = (out / "report.html").read_text()
+    assert "--methods all" in page and "Differs by" not in page and "of every method" in page
+    for option in ("--method", "--methods"):
+        assert call("landmarks", small, "--out", out, "--force", option, "lu,qr")[0] == 0
+        assert methods_of(out) == ["lu", "qr"]
+    page = (out / "report.html").read_text()
+    assert "--methods all" not in page and "Differs by" in page
+
+
+def test_pinv_is_left_out_of_all_from_3000_unknowns_on_and_refused_by_name(call, small, tmp_path):
+    large, out = linear_problem(tmp_path / "large.npz", 1490, 10), tmp_path / "out"
+    code, output, _ = call("landmarks", large, small, "--methods", "all", "--repeat", "1", "--out", out)
+    assert code == 0 and "not compared   pinv" in output and "3,000 unknowns, its limit is 3,000" in output
+    assert methods_of(out) == [method for method in METHODS if method != "pinv"]
+    assert len(re.findall(r"^  pinv .* \d\.\de[+-]\d\d$", output, re.MULTILINE)) == 1  # of the small problem
+    code, _, errors = call("landmarks", large, "--methods", "lu,pinv", "--out", tmp_path / "named")
+    assert code == 2 and "3,000 unknowns" in errors and "name other --methods" in errors
+    assert not (tmp_path / "named").exists()
 
 
 def test_a_recording_holds_truth_before_and_after_and_is_not_overwritten(call, small, tmp_path):

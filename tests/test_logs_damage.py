@@ -30,7 +30,7 @@ from pipeline.logs import open_log
 def complaint(*paths, **config):
     """The one line that opening and reading ends with."""
     with pytest.raises(InputError) as caught:
-        list(open_log(list(paths), LogConfig(**config)).scans())
+        list(open_log(list(paths), LogConfig(**{"max_bad_scans_percent": 0.0} | config)).scans())
     text = str(caught.value)
     assert "\n" not in text and str(paths[-1]) in text, text
     return text
@@ -267,7 +267,7 @@ def test_a_file_cut_off_anywhere_is_read_up_to_the_cut(tmp_path, chunked, compre
         assert damage, f"cut at {length} of {len(whole)} and nothing told"
         if scans:
             assert_true(scans)
-            assert any(re.search(rf"\b{len(scans)} scans", line) for line in damage), damage
+            assert any(re.search(rf"\b{len(scans)} scans?", line) for line in damage), damage
         counts.append(len(scans))
     assert counts == sorted(counts) and counts[-1] > 30
 
@@ -340,7 +340,7 @@ def test_a_chunk_with_a_wrong_crc_is_left_out_and_told(tmp_path, compression):
     assert_true(scans)
     assert 20 < len(scans) < 40
     assert any("CRC" in line for line in damage)
-    assert any(f"{len(scans)} scans" in line for line in damage)
+    assert any(f"{len(scans)} scan" in line for line in damage)
 
 
 def test_a_mounting_in_a_damaged_chunk_is_told(tmp_path):
@@ -394,7 +394,7 @@ def test_a_real_cloud_log_cut_off_gives_the_sweeps_before_the_cut(tmp_path):
     path.write_bytes(whole[:10_000_000])
     scans, damage = recover(path)
     assert 6 <= len(scans) <= 9
-    assert any(f"{len(scans)} scans" in line for line in damage)
+    assert any(f"{len(scans)} scan" in line for line in damage)
 
 
 def test_malformed_messages_cost_no_more_than_good_ones(tmp_path):
@@ -410,7 +410,7 @@ def test_malformed_messages_cost_no_more_than_good_ones(tmp_path):
     calls = []
     for path in (*paths, *paths):  # the first time to import what is needed
         with cProfile.Profile() as profile:
-            scans, _ = recover(path, bad_scans="skip")
+            scans, _ = recover(path, max_bad_scans_percent=100.0)
         calls.append(pstats.Stats(profile).total_calls)
     assert len(scans) == 1
     assert calls[3] < 1.5 * calls[2]

@@ -206,13 +206,47 @@ def resident_bytes(path):
     raise AssertionError(f"{path} is not mapped")
 
 
-def test_bad_scans_are_left_out_and_counted_if_asked(tmp_path):
-    blind = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [np.nan] * 5)) for k in (5, 7)]
-    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blind]), bad_scans="skip")
+def blinded(*at):
+    """Scans without a return, at these seconds."""
+    return [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [np.nan] * 5)) for k in at]
+
+
+def test_one_scan_without_a_return_does_not_stop_a_log_and_is_told(tmp_path):
+    log, scans = read(write(tmp_path / "a.mcap", [*office(5), *blinded(5)]))
+    assert [scan.index for scan in scans] == list(range(5))
+    assert any("1 of 6 scans of /scan was left out (the first: " in line for line in log.damage)
+    assert any("5 scans of /scan were recovered" in line for line in log.damage)
+
+
+def test_one_empty_cloud_does_not_stop_a_log_of_clouds(tmp_path):
+    rows = np.ones(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    nowhere = np.full(60, np.nan, "<f4").view(rows.dtype)
+    said = [
+        cloud_said(
+            STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, {3: rows[:0], 4: nowhere}.get(k, rows))
+        )
+        for k in range(20)
+    ]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert len(scans) == 18 and any("2 of 20 scans of /points were left out" in line for line in log.damage)
+
+
+def test_more_bad_scans_than_the_limit_in_percent_are_refused_with_the_flag(tmp_path):
+    path = write(tmp_path / "a.mcap", [*office(10), *blinded(5, 7)])
+    with pytest.raises(InputError, match=r"scan 10 of /scan .*max_bad_scans_percent \(0\) allows; raise it"):
+        read(path, max_bad_scans_percent=0.0)
+    with pytest.raises(InputError, match=r"scan 11 of /scan has no valid point .* with it 2 of 12 scans cannot"):
+        read(path, max_bad_scans_percent=8.0)
+    assert len(read(path, max_bad_scans_percent=9.0)[1]) == 10
+
+
+def test_bad_scans_are_left_out_and_counted(tmp_path):
+    blind = blinded(5, 7)
+    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blind]), max_bad_scans_percent=100.0)
     assert [scan.index for scan in scans] == list(range(10))
     assert any("2 of 12 scans of /scan were left out (the first: " in line for line in log.damage)
     with pytest.raises(InputError, match=r"a\.mcap: no scan of /scan could be read: 2 of 2"):
-        read(write(tmp_path / "a.mcap", blind), bad_scans="skip")
+        read(write(tmp_path / "a.mcap", blind), max_bad_scans_percent=100.0)
 
 
 def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
@@ -223,8 +257,8 @@ def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
     for _ in range(2):
         assert [scan.stamp_ns - STAMP_NS for scan in log.scans()] == stamps
         assert len(log.notes) == 2
-        assert any("1 header stamps of /scan step back" in note for note in log.notes)
-        assert any("1 scans of /scan have the same header stamp" in note for note in log.notes)
+        assert any("1 step back in the header stamps of /scan" in note for note in log.notes)
+        assert any("1 scan of /scan with the header stamp of the one before" in note for note in log.notes)
 
 
 def test_a_chunk_that_says_nothing_of_its_times_loses_no_scan(tmp_path):
@@ -427,7 +461,7 @@ def test_a_cloud_that_leaves_the_plane_of_those_before_is_malformed(tmp_path):
     flat = [(x, y, 0.0) for x, y in np.random.default_rng(0).uniform(1, 9, (1100, 2))]
     path = write(tmp_path / "a.mcap", [cloud_of(0, flat), cloud_of(1, [*flat[:-1], (1, 1, 1)])])
     with pytest.raises(InputError, match=r"scan 1 .* a point lies 1 m off the plane z = 0 m"):
-        read(path)
+        read(path, max_bad_scans_percent=0.0)
 
 
 # a mounting that /tf tells

@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import rerun.blueprint as rrb
 from killing import same_recording
 from rerun.chunk import RrdReader
+from scenes import ROOT
 
 from pipeline import lie
 from pipeline.config import RecordingConfig
@@ -379,6 +381,33 @@ finally:
     assert answer.returncode == 0, answer.stderr
     assert "LOGGED True" in answer.stdout and "SAID True" in answer.stdout
     assert rows_of(tmp_path / "a.rrd")[0][entities.INLIERS] == 401
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_view_web_prints_one_address_and_takes_its_server_along(tmp_path, number):
+    record(tmp_path / "a.rrd", drive(60, 2), 2)
+    port, web_port = free_port(), free_port()
+    script = f"""
+import sys
+from pipeline.__main__ import main
+from viz import viewer
+viewer.PORT, viewer.WEB_PORT = {port}, {web_port}
+sys.exit(main(["view", "--web", sys.argv[1]]))
+"""
+    child = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / "a.rrd")], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert child.stdout.readline() == f"{viewer.web_address(port, web_port)}\n"
+    assert viewer.is_listening(port) and viewer.is_listening(web_port)
+    servers = psutil.Process(child.pid).children(recursive=True)
+    assert servers
+    child.send_signal(number)
+    output, errors = child.communicate(timeout=20)
+    assert (child.returncode, output, errors) == (0, "", "")
+    assert psutil.wait_procs(servers, timeout=10)[1] == []
+    assert not viewer.is_listening(port) and not viewer.is_listening(web_port)
 
 
 def run_script(script, path):

@@ -24,6 +24,7 @@ from pipeline.runs.job import Job
 from pipeline.runs.progress import Unwatched
 from pipeline.runs.rescue import PartialRunError
 from pipeline.runs.run import run
+from pipeline.settings import Override
 from pipeline.simulate import simulate
 
 
@@ -173,6 +174,25 @@ class Watcher(Unwatched):
             yield scan
 
 
+_NO_PROCESS = 999_999_999
+
+
+class Telling(Unwatched):
+    """Remembers every line."""
+
+    def __init__(self):
+        self.lines = []
+
+    def say(self, line):
+        self.lines.append(line)
+
+    tell = say
+
+    def track(self, scans, count):
+        yield from scans
+        self.lines.append("through")
+
+
 def job(log, out, **options):
     return Job(logs=(log,), out=out, sinks=frozenset(), **options)
 
@@ -246,8 +266,9 @@ def test_a_bad_scan_in_the_middle_is_bad_input_and_what_was_before_it_is_kept(tm
     good = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k * SECOND, [1.0] * 9)) for k in range(5)]
     bad = scan_said(STAMP_NS + 5 * SECOND, laser_scan(STAMP_NS, [np.inf] * 9))
     path = write(tmp_path / "log.mcap", [*good, bad])
+    none_bad = Override("log.max_bad_scans_percent", "0", "--log.max_bad_scans_percent")
     with pytest.raises(InputError, match=r"scan 5 of /scan has no valid point .*; 5 scans until then are in"):
-        run(job(path, tmp_path / "a"), _record, Unwatched())
+        run(job(path, tmp_path / "a", overrides=(none_bad,)), _record, Unwatched())
     assert not (tmp_path / "a").exists()
     assert len(np.loadtxt(partial_in(tmp_path) / "odometry.tum")) == 5
 
@@ -275,6 +296,36 @@ def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_
     usual = run(job(office, tmp_path / "b"), _record, Unwatched()).path
     tables = [pq.read_table(path / "steps.parquet").select(["x", "y", "qz"]) for path in (folder, usual)]
     assert tables[0].equals(tables[1])
+
+
+def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_its_run_exists(tmp_path, office):
+    left = run(job(office, tmp_path / "a"), _record, Watcher(20)).path.rename(
+        tmp_path / f"a.partial-{_NO_PROCESS}"
+    )
+    with pytest.raises(
+        InputError, match=rf"{left.name}: exists; .*: --out {tmp_path / 'a'} --resume goes on with it"
+    ):
+        RunDirectory(left, force=False)
+    told = Telling()
+    run(job(office, tmp_path / "a"), _record, told)
+    assert f"{left.name} is of a run that was stopped; --resume would go on with it" in "\n".join(told.lines)
+    with pytest.raises(InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume goes on"):
+        RunDirectory(tmp_path / "a", force=False)
+    resumed = run(job(office, tmp_path / "a", force=True, resume=True), _record, Unwatched())
+    assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
+
+
+def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
+    told = Telling()
+    run(job(office, tmp_path / "a"), _record, told)
+    stages = ["closing the last", "optimizing", "refining 60 scans", "the map", "the recording", "the report"]
+    after = told.lines[told.lines.index("through") + 1 :]
+    assert [stage for line in after for stage in stages if stage in line] == stages == stages[: len(after)]
+
+
+def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
+    text = run(job(office, tmp_path / "a"), _record, Watcher(3)).summary
+    assert "1 keyframe;" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 
 def test_a_file_named_twice_is_refused(tmp_path, office):
@@ -320,6 +371,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(tmp_path, office):
     assert child.returncode == 1
     assert errors.startswith("error: stopped by the user after ") and errors.count("\n") == 1
     assert str(folder) in errors and "PARTIAL" in output
+    assert errors.endswith(f"to go on with it: scanchain run {office} --out {tmp_path / 'a'} --resume\n")
     assert 40 <= len(np.loadtxt(folder / "trajectory.tum")) < 60
     assert list(RrdReader(str(folder / "recording.rrd")).stream())
 

@@ -15,6 +15,7 @@ from pipeline.batch.task import Row, State, said_file
 from pipeline.runs.metrics import Metrics
 from pipeline.source import source_of, without_keys
 from pipeline.trajectory import read_tum
+from pipeline.words import counted
 from viz import report
 from viz.courses import colour_of
 from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
@@ -46,7 +47,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     missing = len(rows) - len(done)
     unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
     page = Page(
-        title=f"Batch of {len(rows):,} logs",
+        title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in a process of its own.",
         facts=tuple(totals(rows)),
         warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)

@@ -55,16 +55,24 @@ def draw_estimate(path: Path, study: Study) -> None:
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
-    """Draw where the factor of every method is not zero, to a PNG; several problems stand side by side."""
+    """Draw where the factor of every method is not zero, to a PNG; several problems stand side by side.
+
+    The place of a method that a problem was not solved by stays empty.
+    """
     from matplotlib.figure import Figure
 
-    cells = [(study, number) for number in range(len(studies[0].methods)) for study in studies]
+    solved = [{method.method: method for method in study.methods} for study in studies]
+    names = dict.fromkeys(name for methods in solved for name in methods)
+    cells = [(study, methods.get(name)) for name in names for study, methods in zip(studies, solved, strict=True)]
     columns = len(studies) * max(1, min(_ACROSS, len(cells)) // len(studies))
     rows = -(-len(cells) // columns)
     figure = Figure(figsize=(2.9 * columns, (3.25 if len(studies) > 1 else 3.05) * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (study, number) in zip(panels, cells, strict=False):
-        _draw_factor(axes, study.methods[number], study.name if len(studies) > 1 else "")
+    for axes, (study, method) in zip(panels, cells, strict=False):
+        if method is None:
+            axes.set_axis_off()
+        else:
+            _draw_factor(axes, method, study.name if len(studies) > 1 else "")
     for axes in panels[len(cells) :]:
         axes.set_axis_off()
     figure.savefig(path, dpi=130, facecolor="white", bbox_inches="tight")

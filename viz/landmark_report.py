@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.landmarks.study import Study
-from pipeline.landmarks.write import HEADINGS, accuracy_lines, file_stem, row_of, size_of
+from pipeline.landmarks.write import accuracy_lines, file_stem, size_of, table_of
 from viz.landmark_plots import draw_estimate, draw_factors
 
 _PAGE = "report.html"
@@ -34,9 +34,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         if len(studies) > 1:
             draw_factors(directory / "factors.png", studies)
             together = _inline(directory / "factors.png")
-        page = environment.get_template("landmarks.html").render(
-            problems=problems, headings=HEADINGS, together=together
-        )
+        page = environment.get_template("landmarks.html").render(problems=problems, together=together)
         (directory / _PAGE).write_text(page, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
@@ -52,7 +50,8 @@ def _problem(directory: Path, study: Study) -> dict[str, object]:
     return {
         "name": study.name,
         "facts": [*facts, *accuracy_lines(study), ("A", size_of(study))],
-        "rows": [row_of(method) for method in study.methods],
+        "table": table_of(study),
+        "is_comparison": len(study.methods) > 1,
         "estimate": _inline(estimate),
         "factors": _inline(factors),
     }

@@ -23,6 +23,7 @@ from pipeline.runs.provenance import Provenance
 from pipeline.runs.step_table import STAGES
 from pipeline.settings import read_layer
 from pipeline.trajectory import read_tum
+from pipeline.words import counted
 from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
 from viz.courses import Course, Floats, colour_of
 from viz.map_viewer import SCRIPT
@@ -62,7 +63,7 @@ def _summary_lines(directory: Path) -> list[str]:
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     """The result first, what it took last."""
-    yield "trajectory", f"{m.travelled_m:.1f} m, {m.keyframes:,} keyframes"
+    yield "trajectory", f"{m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
@@ -74,7 +75,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     )
     yield "map", f"{m.map_points:,} points"
     yield "configuration", made.configuration
-    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time"
+    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"
 
 

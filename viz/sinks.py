@@ -23,6 +23,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from pipeline.errors import InputError
+from pipeline.words import counted
 from viz.messages import Message
 
 _QUEUED_BATCHES = 16
@@ -102,7 +103,7 @@ class Sink:
             if self.thread.is_alive():
                 self._give_up("it takes no more data")
         if self.dropped and not self.warnings:
-            self.warnings.append(f"{self.name} was too slow: it lacks {self.dropped} batches")
+            self.warnings.append(f"{self.name} was too slow: it lacks {counted(self.dropped, 'batch', 'batches')}")
 
     def _serve(self) -> None:
         try:

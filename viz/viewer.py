@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 from time import monotonic, sleep
 from urllib.parse import quote
 
@@ -44,11 +45,16 @@ def is_listening(port: int) -> bool:
         return False
 
 
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def start_window(port: int) -> None:
     """Open the viewer's window; it outlives the run. A viewer that is open already is used as it is."""
     if is_listening(port):
         return
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise ViewerError("no viewer spawned: there is no display; use --rerun web, or open the recording later")
     process = _launch("--port", str(port), "--expect-data-soon")
     try:
@@ -58,15 +64,16 @@ def start_window(port: int) -> None:
         raise
 
 
-def start_web(port: int, web_port: int) -> subprocess.Popen[bytes]:
-    """Serve the web viewer and take data for it, on this machine only."""
+def start_web(port: int, web_port: int, recording: Path | None = None) -> subprocess.Popen[bytes]:
+    """Serve the web viewer on this machine only: of a .rrd file, or of what is sent to ``port``."""
     for taken in (port, web_port):
         if is_listening(taken):
             raise ViewerError(f"no web viewer: port {taken} is taken; close what listens there (another viewer?)")
-    process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port))
+    files = [] if recording is None else [str(recording)]
+    process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port), *files)
     try:
         _wait(process, (port, web_port))
-    except ViewerError:
+    except BaseException:  # Ctrl-C as well: it is a process of its own session
         stop(process)
         raise
     return process

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.batch.task import Row, State
 from pipeline.runs.metrics import Metrics
+from pipeline.words import counted
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
@@ -82,7 +83,7 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
         yield (
             "ATE",
             f"rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
-            f"{len(errors_m):,} logs with ground truth",
+            f"{counted(len(errors_m), 'log')} with ground truth",
         )
 
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
-    """Look at every scan of a log: what is wrong, what it does to the result, and the flag that mends it.
+    """Look at every scan of a log: what is wrong, what it does to the result, and the flags that help.
 
-    Takes any key of the configuration as a run does, so that you can try whether a flag mends what was found.
+    Takes any key of the configuration as a run does, so that you can try whether a flag removes what was found.
 
     \b
     Examples:

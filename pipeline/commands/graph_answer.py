@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.data import fit_text
+from pipeline.words import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,10 +37,10 @@ class Answer:
         guess = done.initialisation
         if guess == "given":
             guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
-        size = f"{graph.dimension}D, {len(graph):,} poses, {len(graph.edges):,} edges"
+        size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
         lines = [
             f"graph          {self.change.name}: {size}",
-            *(f"kept as is     {count} lines {tag}" for tag, count in self.file.other_tags),
+            *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
             *self._projected,
             f"first guess    {guess}",
             f"chi2           {self._chi2}",

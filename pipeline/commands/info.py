@@ -13,6 +13,7 @@ from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, overrides
 from pipeline.settings import load_settings
 from pipeline.source import Source
+from pipeline.words import counted
 
 if TYPE_CHECKING:
     from pipeline.logs.info import LogInfo
@@ -46,17 +47,19 @@ def _text(log: LogInfo) -> str:
     ]
     width = max((len(topic.topic) for topic in log.topics), default=0)
     for topic in log.topics:
+        messages = f"{topic.messages:>8,} {'message ' if topic.messages == 1 else 'messages'}"
         name = f"{topic.topic:<{width}}  {topic.type_name or 'no schema':<28}"
-        lines.append(f"topic     {name}  {topic.messages:>8,} messages  {topic.rate_hz:7.1f} Hz  {topic.encoding}")
+        lines.append(f"topic     {name}  {messages}  {topic.rate_hz:7.1f} Hz  {topic.encoding}")
     if log.lidar:
         x, y = (row[-1] for row in log.T_base_lidar[:2])
         lines += [
-            f"lidar     {log.lidar}: {log.dimension}D, {log.scans:,} scans",
+            f"lidar     {log.lidar}: {log.dimension}D, {counted(log.scans, 'scan')}",
             f"mounting  at x {x:.3f} m, y {y:.3f} m on {log.base_frame or 'the base'}"
             + (f" at first; {log.mount_motion}" if log.mount_motion else ""),
             f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
             *([f"times     {log.point_times.removeprefix('point times: ')}"] if log.point_times else []),
         ]
+    lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log.sensors]
     lines += [f"note      {note}" for note in log.notes]
     lines += [f"damage    {line}" for line in log.damage]
     return "\n".join([*lines, *([f"problem   {log.problem}"] if log.problem else [])])

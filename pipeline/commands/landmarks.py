@@ -1,4 +1,4 @@
-"""``scanchain landmarks``: landmark problems, their solvers side by side."""
+"""``scanchain landmarks``: landmark problems solved, their linear solvers side by side where that is asked for."""
 
 from __future__ import annotations
 
@@ -30,7 +30,13 @@ if TYPE_CHECKING:
     help="Directory to write; must not exist.",
 )
 @click.option(
-    "--method", "methods", default="all", show_default=True, metavar="NAME,...", help="Linear solvers to compare."
+    "--methods",
+    "--method",
+    "methods",
+    default="schur",
+    show_default=True,
+    metavar="NAME,...",
+    help="Linear solvers: one to solve by, several (or all) to compare.",
 )
 @click.option(
     "--repeat", type=click.IntRange(1, 1000), default=3, show_default=True, help="Timed rounds; medians are told."
@@ -78,18 +84,20 @@ def landmarks(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Solve landmark problems, and compare linear solvers on them.
+    """Solve landmark problems and, where several are named, compare linear solvers on them.
 
     DATA is an npz problem of the course (linear, or of bearings and ranges), or a folder of the UTIAS MRCLAM data
     sets, of which one robot's log is used. The estimate goes to DIR with pictures, and report.html holds them all.
 
-    Methods: default, pinv, lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them; with the package
-    sparseqr also spqr and spqr_colamd.
+    Methods: default, pinv (below 3,000 unknowns), lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them;
+    with the package sparseqr also spqr and spqr_colamd. A robot's log is always estimated by schur, the others are
+    compared on its linear system.
 
     \b
     Examples:
-      scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --out runs/linear
-      scanchain landmarks 2d_nonlinear.npz --guess origin --method cholesky,schur --out runs/nonlinear
+      scanchain landmarks 2d_linear.npz --out runs/linear
+      scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --methods all --out runs/solvers
+      scanchain landmarks 2d_nonlinear.npz --guess origin --methods cholesky,schur --out runs/nonlinear
       scanchain landmarks 2d_nonlinear.npz --optimiser dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """

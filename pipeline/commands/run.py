@@ -91,6 +91,7 @@ def run(
     gc.set_threshold(_GARBAGE_EVERY)
     from pipeline.commands.terminal import Terminal
     from pipeline.runs.job import Job
+    from pipeline.runs.rescue import how_to_resume
     from pipeline.runs.run import run as run_log
 
     truth_file, truth_topic = ground_truth(gt)
@@ -116,7 +117,8 @@ def run(
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
     if finished.stopped:
-        raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}")
+        again = how_to_resume(job.command)
+        raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}; {again}")
     if not as_json:
         click.echo(f"written        {out}")
     if unreliable:

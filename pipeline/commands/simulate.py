@@ -8,6 +8,7 @@ import click
 
 from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
+from pipeline.words import counted
 
 
 @click.command(cls=OnceCommand)
@@ -74,4 +75,7 @@ def simulate(
             force=force,
             progress=terminal.count,
         )
-    click.echo(f"{destination}: {len(truth)} scans; ground truth in it and in {destination.with_suffix('.tum')}")
+    click.echo(
+        f"{destination}: {counted(len(truth), 'scan')}; ground truth in it and in "
+        f"{destination.with_suffix('.tum')}"
+    )

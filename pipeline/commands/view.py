@@ -35,6 +35,8 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
       scanchain view runs/log --web
       scanchain view runs/log --png log.png
     """
+    from pipeline.commands.terminal import Terminal
+
     if not directory.exists():
         raise InputError(
             f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
@@ -51,4 +53,5 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
         )
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
-    viewing.show(path, web)
+    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
+        viewing.show(path, click.echo, web)

@@ -29,6 +29,7 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, describe_start
 from pipeline.settings import Override, load_settings, named
 from pipeline.source import Source
+from pipeline.words import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,9 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
     provenance = describe_start(contest.command, contest.logs, ", ".join(names))
     with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
         scans = store(progress.track(log.scans(), log.scan_count), log.T_base_lidar, Path(shared))
-        stopped = f"the user stopped the reading: {len(scans):,} scans are compared" if progress.stopped else ""
+        stopped = (
+            f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
+        )
         reference = _reference(contest, log, scans)
         limits = limits_for(len(scans), contest.time_s, contest.memory_mib)
         outcomes = race(methods, scans, Path(shared), repeat=contest.repeat, limits=limits, progress=progress)

@@ -114,7 +114,7 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
     figures = msgspec.structs.replace(
         judged.figures,
         ate_m=ate.translation_m.rmse,
-        ate_share=ate.share_of_path if ate.path_length_m else None,
+        ate_share=ate.share_of_path,
         ate_rotation_rad=ate.rotation_rad.rmse,
         rpe_1_s_m=_rmse_m(second),
         rpe_10_m_m=_rmse_m(over_10_m),

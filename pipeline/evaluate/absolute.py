@@ -14,6 +14,8 @@ from pipeline.evaluate.alignment import Alignment, align
 from pipeline.evaluate.pairing import Pairs, during, pair
 from pipeline.evaluate.statistics import Statistics
 
+_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+
 
 @dataclass(frozen=True, slots=True)
 class AbsoluteError:
@@ -40,18 +42,18 @@ class AbsoluteError:
     errors_rad: NDArray[np.float64]
 
     @property
-    def share_of_path(self) -> float:
-        """Root mean squared translational error over the length of the path; inf where nothing moved."""
-        return self.translation_m.rmse / self.path_length_m if self.path_length_m else float("inf")
+    def share_of_path(self) -> float | None:
+        """Root mean squared translational error over the length of the path; None where that is too short."""
+        return self.translation_m.rmse / self.path_length_m if self.path_length_m >= _SHORTEST_PATH_M else None
 
     @property
     def summary(self) -> str:
         """The figures in one line."""
-        rotation = self.rotation_rad.scaled(np.degrees(1.0))
+        rotation, share = self.rotation_rad.scaled(np.degrees(1.0)), self.share_of_path
+        of_path = "" if share is None else f"; {100.0 * share:.3f} % of {self.path_length_m:.1f} m"
         return (
             f"ATE rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
-            f"max {self.translation_m.maximum:.4f}; {100.0 * self.share_of_path:.3f} % of "
-            f"{self.path_length_m:.1f} m), rotation rmse {rotation.rmse:.3f} deg"
+            f"max {self.translation_m.maximum:.4f}{of_path}), rotation rmse {rotation.rmse:.3f} deg"
         )
 
 

@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.evaluate.absolute import path_length
 from pipeline.evaluate.pairing import Pairs
 from pipeline.evaluate.relative import motion_errors
+from pipeline.words import counted
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
@@ -53,7 +54,8 @@ class KittiError:
         """The figures in one line, in the units they are published in."""
         return (
             f"KITTI translation {100.0 * self.translation_share:.4f} %, rotation "
-            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over {self.stretches} stretches"
+            f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over "
+            f"{counted(self.stretches, 'stretch', 'stretches')}"
         )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.clock import working_s
 from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
@@ -73,17 +73,17 @@ def certify(
     measurements for such a function are bounded by zero instead: their χ² is part of the gap. Where poses are
     ``free``, nothing is certified. ``names`` (K,) are what the poses are called.
     """
-    begin = time.perf_counter()
+    begin = working_s()
     kept = weights > 0.0
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
     if free:
-        return Certificate(False, chi2, chi2, free_text(free), time.perf_counter() - begin)
+        return Certificate(False, chi2, chi2, free_text(free), working_s() - begin)
     if chi2 < _NOTHING:
-        return Certificate(True, chi2, chi2, "", time.perf_counter() - begin)
+        return Certificate(True, chi2, chi2, "", working_s() - begin)
     if len(poses) - len(problem.free) > 1:
         reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
-        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
+        return Certificate(False, chi2, chi2, reason, working_s() - begin)
     centred = poses.copy()
     centred[:, :-1, -1] -= centred[:, :-1, -1].mean(axis=0)
     minorants = minorise(problem, centred, weights)
@@ -93,7 +93,7 @@ def certify(
     if loose.any() and (given_up > _SHARES[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
         i, j = names[problem.edges[loose][0]]
         reason = f"{loose.sum()} edges are too far from their measurements to be bounded, first {i}-{j}"
-        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
+        return Certificate(False, chi2, chi2, reason, working_s() - begin)
     gap = _gap(problem, minorants, kept & ~loose, chi2)
     if gap is None:
         reason = "the dual matrix is not positive definite, as at a local minimum"
@@ -101,8 +101,8 @@ def certify(
         if borrowing.any():
             i, j = names[problem.edges[borrowing][0]]
             reason += f", or where Ω says little of some direction, first at {i}-{j} of {borrowing.sum():,} edges"
-        return Certificate(False, chi2, chi2, reason, time.perf_counter() - begin)
-    return Certificate(True, min(gap + given_up, chi2), chi2, "", time.perf_counter() - begin)
+        return Certificate(False, chi2, chi2, reason, working_s() - begin)
+    return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 
 
 def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:

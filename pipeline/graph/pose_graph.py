@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import checks, lie
+from pipeline.clock import working_s
 from pipeline.config import GraphConfig
 from pipeline.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from pipeline.errors import InputError
@@ -186,7 +185,7 @@ class PoseGraph:
 
         judgement : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
         """
-        begin = time.perf_counter()
+        begin = working_s()
         problem = self._prepared()
         chi2_before = problem.chi2(problem.errors(self.poses))
         try:
@@ -206,7 +205,7 @@ class PoseGraph:
             converged=minimum.converged,
             reason=minimum.reason,
             initialisation=solved.initialisation,
-            time_s=time.perf_counter() - begin,
+            time_s=working_s() - begin,
         )
 
     def certify(self) -> Certificate:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.clock import working_s
 from pipeline.data import Matrix
 from pipeline.landmarks.assembly import landmark_columns, pose_columns
 from pipeline.landmarks.bearing_range import BearingRangeProblem
@@ -15,7 +15,7 @@ from pipeline.landmarks.dead_reckoning import OdometryNoise
 from pipeline.landmarks.mrclam import RangeLog
 from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_fit import LogModel, fit_log
-from pipeline.landmarks.solvers import create_solver
+from pipeline.landmarks.solvers import ESTIMATOR, create_solver
 from pipeline.landmarks.student import StudentLoss
 
 
@@ -60,7 +60,7 @@ class RangeSolution:
     guess: State
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = "schur") -> RangeSolution:
+def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None for an estimate of it
@@ -70,7 +70,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = "s
     a while, by what the residuals show (``Likeness``): each sighting counts as a share of an independent one.
     Raises InputError where the observations are too few for that.
     """
-    begin = perf_counter()
+    begin = working_s()
     model = LogModel(log)
     fit = fit_log(model, noise, create_solver(method))
     layout, minimum, found = fit.problem.pattern.layout, fit.minimum, fit.consistency
@@ -92,7 +92,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = "s
         iterations=fit.iterations,
         converged=minimum.converged,
         reason=minimum.reason,
-        time_s=perf_counter() - begin,
+        time_s=working_s() - begin,
         problem=fit.problem,
         guess=fit.guess,
     )

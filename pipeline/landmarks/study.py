@@ -22,6 +22,7 @@ Guess = Literal["odometry", "disturbed", "origin"]
 class Options:
     """How to study a problem.
 
+    ``methods`` are the linear solvers by name, or "all"; the first one estimates what a file holds.
     ``robot`` and ``noise`` are for MRCLAM folders, where a noise of None is to be estimated; ``guess`` and
     ``optimiser`` for nonlinear files.
     """
@@ -40,6 +41,11 @@ class Fact:
 
     label: str
     value: str
+
+
+def left_out_fact(what: str) -> list[Fact]:
+    """The line about a method that was not compared, none where all were."""
+    return [Fact("not compared", what)] if what else []
 
 
 @dataclass(frozen=True, slots=True)

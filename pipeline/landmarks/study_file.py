@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.landmarks import guess as guesses
 from pipeline.landmarks.accuracy import of_positions
 from pipeline.landmarks.assembly import landmark_columns, pose_columns
@@ -19,15 +19,16 @@ from pipeline.landmarks.minimise import minimise
 from pipeline.landmarks.npz import read_landmark_data
 from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.relative_position import linear_system, state_of
-from pipeline.landmarks.solvers import create_solver
-from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study
+from pipeline.landmarks.solvers import create_solver, methods_for
+from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
 from pipeline.landmarks.system import LinearSystem
+from pipeline.words import counted
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 
 
 def study_file(path: Path, options: Options) -> Study:
-    """Read a problem, solve it by every method, compare with the truth in the file."""
+    """Read a problem, solve it by every method that is asked for, compare with the truth in the file."""
     data = read_landmark_data(path)
     return _write_up(data, _linear(data, options) if data.kind == "linear" else _nonlinear(data, options))
 
@@ -44,14 +45,16 @@ class _Solved:
 
 
 def _linear(data: LandmarkData, options: Options) -> _Solved:
-    begin = perf_counter()
+    begin = working_s()
     system = linear_system(data)
-    build_s = perf_counter() - begin
-    methods = compare_linear(system, options.methods, options.repeats)
+    build_s = working_s() - begin
+    names, left_out = methods_for(options.methods, system.pattern.shape[1])
+    methods = compare_linear(system, names, options.repeats)
     chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
     facts = (
         Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
         chi2_fact(chi2, len(system.b), system.pattern.shape[1]),
+        *left_out_fact(left_out),
     )
     before, after = guesses.of_relative_positions(data), state_of(data, methods[0].x)
     return _Solved(before, after, True, system, build_s, methods, facts)
@@ -60,20 +63,25 @@ def _linear(data: LandmarkData, options: Options) -> _Solved:
 def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     problem = BearingRangeProblem(world_referenced(data))
     guess = _guess(problem, options.guess)
-    minimum = minimise(problem, guess, create_solver(options.methods[0]), optimiser=options.optimiser)
-    begin = perf_counter()
+    names, left_out = methods_for(options.methods, problem.pattern.shape[1])
+    minimum = minimise(problem, guess, create_solver(names[0]), optimiser=options.optimiser)
+    begin = working_s()
     system = problem.system(problem.linearise(minimum.state), minimum.weights)
-    build_s = perf_counter() - begin
+    build_s = working_s() - begin
     if options.optimiser == "gradient-descent":  # solves no linear system: compare them on the one at its end
-        methods = compare_linear(system, options.methods, options.repeats)
+        methods = compare_linear(system, names, options.repeats)
     else:
-        methods = compare_nonlinear(problem, guess, options.optimiser, options.methods, options.repeats)
+        methods = compare_nonlinear(problem, guess, options.optimiser, names, options.repeats)
     ended = "converged" if minimum.converged else "DID NOT CONVERGE"
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
         Fact("guess", options.guess),
-        Fact("iteration", f"{options.optimiser} {ended} after {minimum.iterations} steps: {minimum.reason}"),
+        Fact(
+            "iteration",
+            f"{options.optimiser} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
+        ),
         chi2_fact(minimum.cost, len(system.b), system.pattern.shape[1]),
+        *left_out_fact(left_out),
     )
     return _Solved(guess, minimum.state, minimum.converged, system, build_s, methods, facts)
 

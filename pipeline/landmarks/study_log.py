@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.data import Trajectory
 from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
 from pipeline.landmarks.compare import compare_linear
@@ -16,28 +16,31 @@ from pipeline.landmarks.dead_reckoning import OWN, OWN_UNITS
 from pipeline.landmarks.mrclam import RangeLog, read_mrclam
 from pipeline.landmarks.problem import State
 from pipeline.landmarks.range_slam import RangeSolution, solve_range_log
-from pipeline.landmarks.study import Estimate, Fact, Options, Study
+from pipeline.landmarks.solvers import methods_for
+from pipeline.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
+from pipeline.words import counted
 
 _DOUBTED = 0.25  # of the weight of an observation as expected
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
 
 
 def study_log(folder: Path, options: Options) -> Study:
-    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture and with every method.
+    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
 
-    The linear solvers are compared on the first step from where the estimate began, with the noise that it found.
+    The linear solvers that are asked for run on the first step from where the estimate began, with the noise that
+    it found; ``ESTIMATOR`` makes the estimate.
     """
     log = read_mrclam(folder, options.robot)
-    solve_range_log(log, options.noise)  # compiles, which is no part of the time
     solution = solve_range_log(log, options.noise)
-    begin = perf_counter()
+    begin = working_s()
     at = solution.problem.linearise(solution.guess)
     system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
-    build_s = perf_counter() - begin
+    build_s = working_s() - begin
+    names, left_out = methods_for(options.methods, system.pattern.shape[1])
     truth = truth_at(log, solution.nodes_s, solution.landmarks)
     return Study(
         name=log.name,
-        facts=_facts(log, solution, is_stated=options.noise is not None),
+        facts=(*_facts(log, solution, is_stated=options.noise is not None), *left_out_fact(left_out)),
         before=_estimate(solution.reckoned, solution.nodes_s, truth),
         after=_estimate(solution.state, solution.nodes_s, truth),
         converged=solution.converged,
@@ -50,7 +53,7 @@ def study_log(folder: Path, options: Options) -> Study:
         columns=system.pattern.shape[1],
         entries=len(system.values),
         build_s=build_s,
-        methods=compare_linear(system, options.methods, options.repeats),
+        methods=compare_linear(system, names, options.repeats),
         trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.state.poses)),
     )
 
@@ -76,7 +79,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     )
     own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
-    after = f"{ended} after {solution.iterations} steps: {solution.reason}"
+    after = f"{ended} after {counted(solution.iterations, 'step')}: {solution.reason}"
     doubted = int(np.count_nonzero(solution.weights < _DOUBTED * solution.loss.share))
     return (
         Fact("observations", seen),
@@ -88,7 +91,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
             f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(solution.motion_chi2)}",
         ),
         Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
-        Fact("doubted", f"{doubted} observations count less than {_DOUBTED:g} of what others do"),
+        Fact("doubted", f"{counted(doubted, 'observation')} with less than {_DOUBTED:g} of the weight of others"),
     )
 
 

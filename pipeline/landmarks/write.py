@@ -15,7 +15,7 @@ from pipeline.landmarks.compare import MethodResult
 from pipeline.landmarks.study import Study
 from pipeline.trajectory import write_tum
 
-HEADINGS = (
+_HEADINGS = (
     "method",
     "build ms",
     "factor ms",
@@ -33,8 +33,13 @@ def file_stem(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "problem"
 
 
-def row_of(method: MethodResult) -> tuple[str, ...]:
-    """A method's line of the table, as ``HEADINGS`` has it."""
+def table_of(study: Study) -> list[tuple[str, ...]]:
+    """Headings, then a row a method; a single one differs from none."""
+    rows = [_HEADINGS, *(_row(method) for method in study.methods)]
+    return rows if len(study.methods) > 1 else [row[:-1] for row in rows]
+
+
+def _row(method: MethodResult) -> tuple[str, ...]:
     times = (method.build_s, method.factor_s, method.solve_s, method.total_s, method.again_s)
     return (
         method.method,
@@ -50,8 +55,8 @@ def text_of(study: Study) -> str:
     lines = [study.name, *(f"  {fact.label:<15}{fact.value}" for fact in study.facts)]
     lines += [f"  {label:<15}{value}" for label, value in accuracy_lines(study)]
     lines.append(f"  {'A':<15}{size_of(study)}")
-    rows = [HEADINGS, *(row_of(method) for method in study.methods)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADINGS))]
+    rows = table_of(study)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (
             f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config import PreprocessConfig
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.rest import LEAST_S, Rest
 from pipeline.logs.survey import Survey
+from pipeline.logs.tally import most_bad_scans
+from pipeline.words import counted
 
 _MANY_LOST = 0.5
+_MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use
+_SOME_BELOW = 0.05  # of beams, below range_min
 _STUCK_SHARE = 0.01  # of beams, all at the farthest range
 _LONG_REST_S = 5.0
 _WHEELS_MOVE = 0.02  # metres, or the sine of a turn
@@ -38,29 +44,52 @@ def _damage(seen: Survey) -> Finding:
     bad = len(seen.malformed) + empty
     lines = list(seen.damage)
     if seen.malformed:
-        lines.append(f"{len(seen.malformed)} malformed scans (the first: {seen.malformed[0]})")
+        lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
     if empty:
-        lines.append(f"{empty} scans without a valid point")
+        lines.append(f"{counted(empty, 'scan')} without a valid point")
     if not lines:
         return Finding("damage", Severity.OK, "every scan is readable and has points")
-    if bad:
-        return Finding("damage", Severity.PROBLEM, "; ".join(lines), "a run stops there", "--log.bad_scans skip")
+    messages = len(seen.scans) + len(seen.malformed)
+    if bad > most_bad_scans(messages, seen.log.config):
+        effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}"
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
     effect = "what was damaged is left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
 
 
 def _returns(seen: Survey) -> Finding:
     undefined, zero = seen.share(lambda scan: scan.undefined), seen.share(lambda scan: scan.zero)
-    kept = [scan.kept for scan in seen.scans]
-    median = int(np.median(kept))
-    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, {median:,} valid a scan (median)"
-    few = int(np.count_nonzero(np.array(kept) < _FEW_POINTS))
+    below = seen.share(lambda scan: scan.below)
+    kept = np.array([scan.kept for scan in seen.scans])
+    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, "
+    if below:
+        found += (
+            f"{100 * below:.2g} % below range_min ({np.median([scan.limits_m[0] for scan in seen.scans]):.3g} m), "
+        )
+    found += f"{int(np.median(kept)):,} valid a scan (median)"
+    poor = kept < _FEW_POINTS
+    few = int(np.count_nonzero(poor))
     if few:
-        effect = f"{few} scans have fewer than {_FEW_POINTS} returns: their matches are weak or lost"
-        return Finding("returns", Severity.WARNING, found, effect, "--start or --end, where they are at an end")
-    if undefined + zero > _MANY_LOST:
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
+        return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
+    if undefined + zero + below > _MANY_LOST:
         return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
+    if below > _SOME_BELOW:
+        return Finding(
+            "returns", Severity.NOTE, found, "what lies below range_min is not used: the sensor's own limit"
+        )
     return Finding("returns", Severity.OK, found)
+
+
+def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
+    """The flags that leave out scans at the start and at the end, where these are the poor ones and no others."""
+    good = np.flatnonzero(~poor)
+    if not len(good) or poor[good[0] : good[-1] + 1].any():
+        return ""
+    start_s, end_s = (seen.into_log_s(int(seen.log_ns[place])) for place in (good[0], good[-1]))
+    flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
+    return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
 
 
 def _no_return(seen: Survey) -> Finding:
@@ -82,20 +111,20 @@ def _no_return(seen: Survey) -> Finding:
 
 
 def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
-    near_m = float(np.nanmedian([scan.nearest_m for scan in seen.scans]))
-    far_m = float(np.nanmedian([scan.far_m for scan in seen.scans]))
+    ranges_m = np.array([scan.ranges_m for scan in seen.scans if scan.kept], np.float64)
+    near_m, far_m = np.median(ranges_m[:, [1, 99]], axis=0).tolist() if len(ranges_m) else (np.nan, np.nan)
     found = f"98 % of the returns lie between {near_m:.3g} and {far_m:.4g} m (medians)"
     low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
     if far_m > high_m:
-        effect = f"returns beyond {high_m:g} m are not used"
-        return Finding("ranges", Severity.NOTE, found, effect, f"--preprocess.max_range_m {np.ceil(far_m):g}")
+        unused = float(np.mean(ranges_m > high_m))
+        effect = f"{100 * unused:.2g} % lie beyond {high_m:g} m and are not used"
+        remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
     if near_m < low_m:
-        effect = (
-            f"returns nearer than {low_m:g} m are not used, which is as it should be if they are the robot itself"
-        )
-        return Finding(
-            "ranges", Severity.NOTE, found, effect, f"--preprocess.min_range_m {near_m:.2g}, to use them"
-        )
+        unused = float(np.mean(ranges_m < low_m))
+        effect = f"{100 * unused:.2g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
+        remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
     return Finding("ranges", Severity.OK, found)
 
 
@@ -104,7 +133,7 @@ def _rings(seen: Survey) -> Finding:
     if not any(rings):
         return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
     most, least = max(rings), min(rings)
-    found = f"{most} rings" if most == least else f"{least} to {most} rings"
+    found = counted(most, "ring") if most == least else f"{least} to {most} rings"
     if least < most:
         return Finding("rings", Severity.NOTE, found, "scans without some of their rings are sparser, no more")
     return Finding("rings", Severity.OK, found)
@@ -136,7 +165,7 @@ def _rest(seen: Survey) -> Finding:
         effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
         return Finding("rest", Severity.WARNING, found, effect)
     if first_s > _LONG_REST_S:
-        effect = "it does no harm, but takes time"
+        effect = "the trajectory drifts by millimeters meanwhile, and it takes time"
         return Finding(
             "rest", Severity.NOTE, found, effect, f"--start {np.floor(seen.into_log_s(rests[0].end_ns)):g}"
         )
@@ -165,9 +194,11 @@ def _mounting(seen: Survey) -> Finding:
         )
     told = next((note for note in seen.log.notes if note.startswith("no static transform")), "")
     if told:
-        effect = "trajectories are the lidar's; the wheels' turns are taken about the lidar instead of the robot"
-        remedy = "record /tf_static, or --odometry.prior constant-velocity"
-        return Finding("mounting", Severity.WARNING, told, effect, remedy)
+        effect = "trajectories are the lidar's; record /tf_static"
+        if not seen.wheels:
+            return Finding("mounting", Severity.WARNING, told, effect)
+        effect += ", as the wheels' turns are taken about the lidar instead of the robot"
+        return Finding("mounting", Severity.WARNING, told, effect, "--odometry.prior constant-velocity")
     place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
     mounting = seen.log.mounting
     if mounting.motion is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,29 @@ def complete(index: FileIndex) -> None:
     if not index.is_counted:
         index.counts = dict(counts)
         index.is_counted = True
+
+
+def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
+    """How many messages a topic has, and the log times of the first and the last of them; 0, 0 where unknown.
+
+    Exact where a file has a message index, else as exactly as its chunks say.
+    """
+    messages, ends_ns = 0, []
+    for index in indexes:
+        for number in (number for number, channel in index.channels.items() if channel.topic == topic):
+            messages += index.counts.get(number, 0)
+            holding = [block for block in index.blocks if any(entry.channel == number for entry in block.entries)]
+            for block in {id(block): block for block in holding[:1] + holding[-1:]}.values():
+                ends_ns += _ends(index, block, number)
+    return messages, min(ends_ns, default=0), max(ends_ns, default=0)
+
+
+def _ends(index: FileIndex, block: Block, channel: int) -> list[int]:
+    """Log times of the first and last message of a channel in a block that holds some."""
+    if not any(e.channel == channel and e.offset >= 0 for e in block.entries):
+        return [block.start_ns, block.end_ns]
+    times_ns = log_times(index, block, channel)
+    return [int(times_ns.min()), int(times_ns.max())] if len(times_ns) else [block.start_ns, block.end_ns]
 
 
 def messages_of(index: FileIndex, block: Block) -> list[Message]:

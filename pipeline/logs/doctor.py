@@ -1,4 +1,4 @@
-"""What is wrong with a log, what that does to the result, and the flag that mends it."""
+"""What is wrong with a log, what that does to the result, and the flags that help."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pipeline.config import Config, LogConfig
 from pipeline.logs.checks_scans import check_scans
 from pipeline.logs.checks_time import check_time
 from pipeline.logs.finding import Finding, Severity
-from pipeline.logs.log import open_log
+from pipeline.logs.log import Log, open_log
 from pipeline.logs.survey import survey
+from pipeline.logs.topics import other_sensors
 from pipeline.source import Source
 
 _ORDER = tuple(reversed(Severity))
@@ -44,6 +45,14 @@ def examine(
     log = open_log(sources, log_config)
     notes = tuple(log.notes)
     seen = survey(log, progress)
-    findings = [*check_time(seen), *check_scans(seen, config_of(log.dimension).preprocess)]
+    config = config_of(log.dimension)
+    findings = [*check_time(seen, config.matching), *check_scans(seen, config.preprocess), _sensors(log)]
     ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())
+
+
+def _sensors(log: Log) -> Finding:
+    """What else there is, and whether a run uses it."""
+    seen = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
+    found = "; ".join(f"{each.sensor} {each.topic}: {each.use}" for each in seen)
+    return Finding("sensors", Severity.OK, found or "no IMU, GNSS or ground truth")

@@ -24,7 +24,7 @@ class Finding:
     check : what was looked at, one word or two
     found : what was measured, with units
     effect : what it does to the result, empty where it does nothing
-    remedy : the flag of ``scanchain run`` that mends it, or what to do before, empty where nothing is to be done
+    remedy : flags of ``scanchain run`` that help, as they are typed and nothing else; empty where none does
     """
 
     check: str

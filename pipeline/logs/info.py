@@ -7,18 +7,23 @@ from dataclasses import dataclass
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
+from pipeline.logs.counting import times_of
 from pipeline.logs.log import Log
 from pipeline.logs.opening import index_files
 from pipeline.logs.readers import kind
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import whole_span
 from pipeline.logs.sizes import size_of
+from pipeline.logs.topics import OtherSensor, other_sensors, topics_of
 from pipeline.source import Source
 
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic: its message type, how it is encoded, how many messages there are and how often they come."""
+    """A topic: its message type, how it is encoded, how many messages there are, and their mean rate.
+
+    The rate is that between the first and the last of them, 0 where there is one alone.
+    """
 
     topic: str
     type_name: str
@@ -31,6 +36,7 @@ class TopicInfo:
 class LogInfo:
     """A log: its files and topics, what a run would take of it, and what is wrong with it.
 
+    ``sensors`` are those beside lidar and wheels.
     ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
     nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
     ``base_frame`` is empty where the log does not tell it.
@@ -45,6 +51,7 @@ class LogInfo:
     dimension: int
     scans: int
     odometry: str
+    sensors: tuple[OtherSensor, ...]
     point_times: str
     T_base_lidar: tuple[tuple[float, ...], ...]
     base_frame: str
@@ -60,6 +67,7 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
     indexes = index_files(sources, config.rate_hz)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
+    wheels, truth = ("", "") if log is None else (log.odometry_topic, log.ground_truth_topic)
     return LogInfo(
         files=tuple(str(source) for source in sources),
         size_bytes=sum(size_of(source) for source in sources),
@@ -69,7 +77,8 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         lidar="" if log is None else log.topic,
         dimension=0 if log is None else log.dimension,
         scans=0 if log is None else log.scan_count,
-        odometry="" if log is None else log.odometry_topic,
+        odometry=wheels,
+        sensors=tuple(other_sensors(indexes, wheels=wheels, truth=truth)),
         point_times="" if log is None else log.assumed_point_times(),
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         base_frame="" if log is None else log.mounting.base,
@@ -89,11 +98,10 @@ def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, 
 
 def _topics(indexes: Sequence[FileIndex], duration_s: float) -> tuple[TopicInfo, ...]:
     """Every topic, its messages added up over the files."""
-    topics: dict[str, TopicInfo] = {}
-    for index in indexes:
-        for number, channel in index.channels.items():
-            known = topics.get(channel.topic)
-            messages = index.counts.get(number, 0) + (known.messages if known else 0)
-            rate_hz = messages / duration_s if duration_s > 0.0 else 0.0
-            topics[channel.topic] = TopicInfo(channel.topic, kind(channel), channel.encoding, messages, rate_hz)
-    return tuple(topics[topic] for topic in sorted(topics))
+    result = []
+    for topic, channel in topics_of(indexes).items():
+        messages, first_ns, last_ns = times_of(indexes, topic)
+        span_s = (last_ns - first_ns) * 1e-9 or duration_s
+        rate_hz = (messages - 1) / span_s if span_s > 0.0 and messages > 1 else 0.0
+        result.append(TopicInfo(topic, kind(channel), channel.encoding, messages, rate_hz))
+    return tuple(result)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
+from pipeline.clock import working_s
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError
@@ -32,17 +32,17 @@ from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reade
 from pipeline.logs.records import FileIndex
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
-from pipeline.logs.tally import Tally
+from pipeline.logs.tally import Tally, most_bad_scans
 from pipeline.logs.told_poses import Beside, ToldPoses
 from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
 from pipeline.source import Source, source_of
+from pipeline.words import counted
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
 _POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start_rad")
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
-_REMEDY = "leave such scans out with --log.bad_scans skip, or choose another --topic"
 
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
@@ -123,8 +123,8 @@ class Log:
     def scans(self) -> Iterator[Scan]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
 
-        Raises InputError where a scan is malformed or has no valid point at all, unless ``log.bad_scans`` is skip:
-        then it is counted in ``damage`` and left out, like damaged chunks.
+        A scan that is malformed or has no valid point at all is counted in ``damage`` and left out, like damaged
+        chunks. Raises InputError when there are more of them than ``log.max_bad_scans_percent`` allows.
         """
         self.damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
@@ -133,22 +133,21 @@ class Log:
             Tally(self.topic, self.odometry_topic),
         )
         times = PointTimes(self.config)
-        count, index, asked = 0, 0, perf_counter()
+        count, index, asked = 0, 0, working_s()
         for message, beside in self._with_poses(poses, times):
             count += 1
             if (count - 1) % self.config.every:
                 continue
             complaint = self._complaint(message, count - 1)
-            if complaint and self.config.bad_scans == "skip":
-                tally.skip(complaint)
-                continue
             if complaint:
-                raise InputError(f"{complaint}; {_REMEDY}")
-            scan = self._scan(index, message, beside, waited_s=perf_counter() - asked)
+                tally.skip(complaint)
+                self._check_bad(tally.bad, complaint)
+                continue
+            scan = self._scan(index, message, beside, waited_s=working_s() - asked)
             tally.take(scan)
             yield scan
             index += 1
-            asked = perf_counter()
+            asked = working_s()
         self._truth = poses.ground_truth()
         self.scans_with_wheels = index - tally.without_wheels
         self.damage += [*tally.losses(), *poses.complaints()]
@@ -156,7 +155,8 @@ class Log:
         if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
-            self.damage.append(f"{count - tally.bad} scans of {self.topic} were recovered")
+            scans = counted(count - tally.bad, "scan")
+            self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _scan(self, index: int, message: Decoded, beside: Beside, *, waited_s: float) -> Scan:
         returns = message.value
@@ -277,6 +277,15 @@ class Log:
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
         ahead = self.config.prefetch_chunks
         return decoded_messages(self.indexes, decoders, self.span, ahead=ahead, damage=damage)
+
+    def _check_bad(self, bad: int, complaint: str) -> None:
+        """Refuse more bad scans than are allowed."""
+        if bad > most_bad_scans(self.scan_count, self.config):
+            raise InputError(
+                f"{complaint}; with it {bad} of {counted(self.scan_count, 'scan')} cannot be used, more than "
+                f"log.max_bad_scans_percent ({self.config.max_bad_scans_percent:g}) allows; raise it, or choose "
+                "another --topic"
+            )
 
     def _complaint(self, message: Decoded, number: int) -> str:
         """What is wrong with a scan, empty where it is good."""

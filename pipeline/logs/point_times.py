@@ -11,7 +11,7 @@ from pipeline.logs.limits import NO_TIMES
 
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
-_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once (log.point_times can tell them by the azimuth)"
 _SHORTEST_SCAN_NS = 500_000  # whole numbers that span less are microseconds
 _LONGEST_SCAN = 1e4  # in milliseconds; floats that span more are micro- or nanoseconds
@@ -28,7 +28,7 @@ class PointTimes:
 
     def __init__(self, config: LogConfig) -> None:
         self.config = config
-        self.unit = config.point_times if config.point_times in _UNITS_S else ""
+        self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.assumed = _NONE
 
@@ -64,7 +64,7 @@ class PointTimes:
         if span == 0.0:  # as where a float32 holds an absolute time
             return NO_TIMES
         unit = self.unit or _likely_unit(span, is_whole=is_whole)
-        unit_s = _UNITS_S[unit]
+        unit_s = UNITS_S[unit]
         per_second = round(1.0 / unit_s)
         stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
         origin = "after the stamp"

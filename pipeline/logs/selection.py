@@ -81,7 +81,14 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
     chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
         raise InputError(
-            f"{path}: no scan of {topic} lies between --start {config.start_s:g} s and --end {config.end_s:g} s; "
-            f"the log is {whole.duration_s:.1f} s long"
+            f"{path}: no scan of {topic} lies {_part(config)}; the log is {whole.duration_s:.1f} s long"
         )
     return -(-chosen // config.every)
+
+
+def _part(config: LogConfig) -> str:
+    """The chosen part in words."""
+    start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
+    if config.end_s == float("inf"):
+        return f"after {start}"
+    return f"between {start} and {end}" if config.start_s else f"before {end}"

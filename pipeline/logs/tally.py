@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
+from pipeline.config import LogConfig
 from pipeline.data import Scan
+from pipeline.words import counted
+
+
+def most_bad_scans(scans: int, config: LogConfig) -> int:
+    """How many of so many scans may be left out."""
+    return math.ceil(0.01 * config.max_bad_scans_percent * scans)
 
 
 class Tally:
@@ -32,19 +41,24 @@ class Tally:
 
     def losses(self) -> list[str]:
         """What was left out."""
-        first = f" (the first: {self.first_complaint})"
-        return [f"{self.bad} of {self.scans} scans of {self.topic} were left out{first}"] if self.bad else []
+        if not self.bad:
+            return []
+        share = f"{self.bad} of {counted(self.scans, 'scan')} of {self.topic} {'was' if self.bad == 1 else 'were'}"
+        return [f"{share} left out (the first: {self.first_complaint})"]
 
     def notes(self) -> list[str]:
         """What was assumed."""
         lines = []
         if self.backwards:
-            lines.append(f"{self.backwards} header stamps of {self.topic} step back; the log's order is kept")
+            steps = counted(self.backwards, "step")
+            lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")
         if self.repeated:
-            lines.append(f"{self.repeated} scans of {self.topic} have the same header stamp as the one before")
+            lines.append(
+                f"{counted(self.repeated, 'scan')} of {self.topic} with the header stamp of the one before"
+            )
         if self.odometry_topic and self.without_wheels:
             lines.append(
-                f"{self.without_wheels} of {self.scans} scans have no reading of {self.odometry_topic} near their "
-                "stamp; their motion is predicted from the scans"
+                f"{self.without_wheels} of {counted(self.scans, 'scan')} without a reading of "
+                f"{self.odometry_topic} near the stamp; their motion is predicted from the scans"
             )
         return lines

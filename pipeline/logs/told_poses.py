@@ -13,6 +13,7 @@ from pipeline.logs.mounting import Mounting, edge
 from pipeline.logs.poses import StampedPose
 from pipeline.logs.stream import Decoded
 from pipeline.logs.wheels import WheelTrack
+from pipeline.words import counted
 
 
 class Beside(NamedTuple):
@@ -83,6 +84,6 @@ class ToldPoses:
     def complaints(self) -> list[str]:
         """One line for each topic that had malformed messages."""
         return [
-            f"{count} malformed messages of {topic} were left out (the first: {self.reasons[topic]})"
+            f"{counted(count, 'malformed message')} of {topic} left out (the first: {self.reasons[topic]})"
             for topic, count in self.malformed.items()
         ]

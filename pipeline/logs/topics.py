@@ -1,14 +1,19 @@
-"""Which topic of a log is the lidar, which the wheels."""
+"""Which topic of a log is the lidar, which the wheels, and what other sensors there are."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from pipeline.errors import InputError
-from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan
+from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
 from pipeline.logs.records import Channel, FileIndex
 
 _MOST_LISTED = 8
+_IMU = ("sensor_msgs/Imu",)
+_GNSS = (
+    "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
+)  # fmt: skip
 _UNDERSTOOD = ", ".join(LIDAR_TYPES)
 
 
@@ -66,6 +71,28 @@ def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -
     if wanted == default and not any(channel.topic == wanted for channel in _with_poses(indexes)):
         return None
     return _chosen(indexes, wanted, "log.ground_truth_topic")
+
+
+@dataclass(frozen=True, slots=True)
+class OtherSensor:
+    """A topic beside lidar and wheels: which sensor, and what a run makes of it."""
+
+    sensor: str
+    topic: str
+    use: str
+
+
+def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> list[OtherSensor]:
+    """IMU, GNSS and poses of a log whose wheels and ground truth have these topics."""
+    found = []
+    for topic, channel in topics_of(indexes).items():
+        if topic == truth:
+            found.append(OtherSensor("ground truth", topic, "judges the result, is not used for it"))
+        elif kind(channel) in _IMU or kind(channel) in _GNSS:
+            found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
+        elif has_poses(channel) and topic != wheels:
+            found.append(OtherSensor("poses", topic, "not used; --log.ground_truth_topic takes them as the truth"))
+    return found
 
 
 def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import checks, lie
+from pipeline.clock import working_s
 from pipeline.config import Config
 from pipeline.data import Match, Points, Pose, Scan, State
 from pipeline.errors import InputError
@@ -59,7 +59,7 @@ class Odometry:
                 f"scan {scan.index} has {scan.points.shape[1]}D points; wanted (N, {self.dimension}), because "
                 f"T_base_lidar is a pose of SE({self.dimension})"
             )
-        started = perf_counter()
+        started = working_s()
         sweep, sparse = self.resolution.look(scan)
         if self.resolution.scale != self.local_map.scale:
             self._remake_map()
@@ -69,7 +69,7 @@ class Odometry:
                 f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
                 f"({self.config.preprocess.max_range_m:g}); widen them"
             )
-        prepared = perf_counter()
+        prepared = working_s()
         prediction = self.predictor.predict(scan)
         matched = sparse.from_middle(self.predictor.velocity)
         usual_cost, elsewhere_m = self.usual_cost, 0.0
@@ -90,7 +90,7 @@ class Odometry:
             state, reason = State.OK, match.reason
             self.first_sweep, self.first_points = sweep, sweep.points
         T_odom_middle = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
-        aligned = perf_counter()
+        aligned = working_s()
         T_stamp_middle = self._from_middle_to_stamp(scan, sweep, T_odom_middle)
         self.predictor.correct(scan, prediction, match, state)
         points = sweep.from_middle(self.predictor.velocity)
@@ -105,7 +105,7 @@ class Odometry:
             reason=reason,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
-            map_s=perf_counter() - aligned,
+            map_s=working_s() - aligned,
             elsewhere_m=elsewhere_m,
         )
         return tracked if T_stamp_middle is None else seen_from(tracked, T_stamp_middle)

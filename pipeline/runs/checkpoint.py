@@ -10,6 +10,7 @@ from time import perf_counter
 
 import pipeline
 from pipeline import config, data
+from pipeline.clock import working_s
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.kernels.voxels import Voxels
@@ -50,7 +51,7 @@ def _version() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The chain after ``scans`` scans, which took ``run_s`` seconds.
+    """The chain after ``scans`` scans, which took ``run_s`` seconds of work.
 
     The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
     numbers the processes that wrote to the run directory, from 0.
@@ -90,7 +91,7 @@ class Checkpoints:
         self.path = folder / CHECKPOINT_FILE
         self.process = process
         self.every_s = every_s
-        self.began_s = perf_counter() - run_s
+        self.began_s = working_s() - run_s
         self.next_s = perf_counter() + every_s
 
     def are_due(self) -> bool:
@@ -100,7 +101,7 @@ class Checkpoints:
     def write(self, slam: Slam, recorded_bytes: int = 0) -> None:
         """Write one. Raises OSError on a full disk; the last one stays."""
         started = perf_counter()
-        run_s = started - self.began_s
+        run_s = working_s() - self.began_s
         checkpoint = Checkpoint(len(slam.stamps_ns), run_s, self.process, recorded_bytes, slam)
         write_snapshot(self.path, checkpoint, _CLASSES)
         now = perf_counter()

@@ -99,24 +99,38 @@ class RunDirectory:
             shutil.rmtree(old, ignore_errors=True)  # also one that a killed process left
 
 
-def left_behind(destination: Path, marked_by: str) -> Path | None:
-    """The latest directory marked partial that holds the file ``marked_by``; None where there is none.
+def left_behind(destination: Path) -> Path | None:
+    """The latest directory marked partial that holds a checkpoint; None where there is none.
 
     Raises InputError where the process that writes it still runs.
     """
+    latest = _latest_left(destination)
+    if latest is not None and (writer := _writer(latest)):
+        raise InputError(f"{latest}: is being written by process {writer}; wait for its end or stop it")
+    return latest
+
+
+def resumable(destination: Path) -> Path | None:
+    """What a run into ``destination`` that was stopped left to go on with; None where there is nothing."""
+    latest = _latest_left(destination)
+    return latest if latest is None or not _writer(latest) else None
+
+
+def _latest_left(destination: Path) -> Path | None:
     destination = destination.resolve()
     left = [
         path
         for path in destination.parent.glob(f"{escape(destination.name)}.partial-*")
-        if (path / marked_by).is_file() and (path / RUN_FILE).is_file()
+        if (path / CHECKPOINT_FILE).is_file() and (path / RUN_FILE).is_file()
     ]
-    if not left:
-        return None
-    latest = max(left, key=lambda path: (path / marked_by).stat().st_mtime_ns)
-    number = latest.name.rpartition("-")[2]
-    if number.isdigit() and int(number) != os.getpid() and _is_written_by(int(number), latest / RUN_FILE):
-        raise InputError(f"{latest}: is being written by process {number}; wait for its end or stop it")
-    return latest
+    return max(left, key=lambda path: (path / CHECKPOINT_FILE).stat().st_mtime_ns, default=None)
+
+
+def _writer(partial: Path) -> int:
+    """Number of another process that still writes there, 0 if none does."""
+    number = partial.name.rpartition("-")[2]
+    is_other = number.isdigit() and int(number) != os.getpid()
+    return int(number) if is_other and _is_written_by(int(number), partial / RUN_FILE) else 0
 
 
 def _is_written_by(pid: int, run_file: Path) -> bool:
@@ -135,9 +149,19 @@ def _check(destination: Path, force: bool) -> None:
     if not destination.is_dir():
         raise InputError(f"{destination}: is a file; choose another --out")
     if not force:
-        raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it")
+        resume = _how_to_resume(destination)
+        raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(
             f"{destination}: is not a run ({RUN_FILE} is missing), so --force does not replace it; "
             "choose another --out"
         )
+
+
+def _how_to_resume(destination: Path) -> str:
+    """What else to do where the name that exists is, or belongs to, a run that was stopped."""
+    whole, mark, _ = destination.name.rpartition(".partial-")
+    if mark and (destination / CHECKPOINT_FILE).is_file():
+        return f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume goes on with it"
+    left = resumable(destination)
+    return "" if left is None else f"; {left.name} is of a run that was stopped: --force --resume goes on with it"

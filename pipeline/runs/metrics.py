@@ -18,10 +18,11 @@ from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
 from pipeline.runs.verdicts import JudgedClosure
 from pipeline.slam import SlamResult
+from pipeline.words import counted
 
 _FEW_POINTS = 100  # of a scan; lidars, planar ones included, have more
-_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth
+_NOTICEABLE_S = 0.5  # of compiling; less is not told
 
 
 class Accuracy(Struct, frozen=True):
@@ -66,6 +67,7 @@ class GroundTruth(Struct, frozen=True):
 class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
+    No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
     Of the closures tried, some were verified by matching; of those the optimised graph accepted some and rejected
     the others. ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``unreliable`` says why the result as a whole is not to be used, empty where it is.
@@ -101,6 +103,7 @@ class Metrics(Struct, frozen=True):
     ground_truth: GroundTruth | None
     warnings: tuple[str, ...]
     unreliable: str = ""
+    compile_s: float = 0.0
 
     @property
     def residual(self) -> str:
@@ -111,6 +114,13 @@ class Metrics(Struct, frozen=True):
     def fit(self) -> str:
         """Of the pose graph, in words."""
         return fit_text(self.chi2, self.degrees_of_freedom, self.closures_rejected)
+
+    @property
+    def compiling(self) -> str:
+        """How long kernels were compiled besides, in words; empty where they came from the cache."""
+        if self.compile_s < _NOTICEABLE_S:
+            return ""
+        return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
 
     def write(self, path: Path) -> None:
         """Write as JSON; what is not finite becomes null."""
@@ -124,6 +134,7 @@ def measure(
     judged: Sequence[JudgedClosure],
     *,
     run_s: float,
+    compile_s: float,
     ground_truth: GroundTruth | None,
     warnings: Sequence[str] = (),
 ) -> Metrics:
@@ -164,6 +175,7 @@ def measure(
         ground_truth=ground_truth,
         unreliable=_unreliable(states, [row.points for row in steps.rows]),
         warnings=tuple(warnings),
+        compile_s=compile_s,
     )
 
 
@@ -192,21 +204,23 @@ def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
     """The numbers as a person reads them."""
     m = metrics
-    dropped = f", {m.dropped_points:,} invalid returns left out" if m.dropped_points else ""
+    dropped = f", {counted(m.dropped_points, 'invalid return')} left out" if m.dropped_points else ""
     lines = [
         *([f"UNRELIABLE     {m.unreliable}"] if m.unreliable else []),
         heading,
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
         f"{m.lost:,} lost{dropped}",
-        f"way            {m.travelled_m:.1f} m, {m.keyframes:,} keyframes; "
-        f"{m.closures_tried:,} loop closures tried, {m.closures_verified:,} verified, {m.closures_accepted:,} "
-        "accepted",
+        f"way            {m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}; "
+        f"{counted(m.closures_tried, 'loop closure')} tried, {m.closures_verified:,} verified, "
+        f"{m.closures_accepted:,} accepted",
         f"pose graph     {m.fit}",
-        f"map            {m.map_points:,} points; {m.moving_points_removed:,} more left out as having moved",
+        f"map            {counted(m.map_points, 'point')}; "
+        f"{m.moving_points_removed:,} more left out as having moved",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
-        f"residual {m.residual}, {m.median_iterations:.0f} iterations (medians)",
-        f"time           {m.run_s:.1f} s, {m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
+        f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
+        f"time           {m.run_s:.1f} s{m.compiling}, "
+        f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
         "  95 % below   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
@@ -230,7 +244,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rmse_m=ate.translation_m.rmse,
         ate_mean_m=ate.translation_m.mean,
         ate_max_m=ate.translation_m.maximum,
-        ate_share_of_path=ate.share_of_path if ate.path_length_m >= _SHORTEST_PATH_M else None,
+        ate_share_of_path=ate.share_of_path,
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
@@ -242,7 +256,8 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
     missing = f"; {truth.optimised.missing}" if truth.optimised.missing else ""
     lines = [
-        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, {truth.optimised.pairs:,} scans{missing}"
+        f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, "
+        f"{counted(truth.optimised.pairs, 'scan')}{missing}"
     ]
     for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
         share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)

@@ -78,9 +78,9 @@ def process(
                 checkpoints.write(slam, recording.secure())
         if progress.stopped:
             checkpoints.write(slam, recording.secure())
-        progress.say("optimising and writing")
-        result = slam.finish()
+        result = slam.finish(progress.say)
         judged = final_verdicts(result.closures, result.state)
+        progress.say("drawing and writing the map")
         with directory.results() as folder:
             cloud = write_results(folder, result, judged, config, recording)
             write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
@@ -90,6 +90,7 @@ def process(
                 write_results_mcap(folder, log, steps, result)
         slam.points.close()
         held_s = _hold(recording, progress)
+        progress.say("writing the rest of the recording")
     return Processed(result, cloud, judged, (*notes, *recording.warnings), held_s)
 
 

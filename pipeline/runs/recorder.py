@@ -107,7 +107,8 @@ class OpenRecorder(Protocol):
 class Viewing:
     """What the commands ask of a viewer.
 
-    ``record`` a run; ``show`` a recording, in a browser if the flag is set; ``draw`` a run directory to a PNG;
+    ``record`` a run; ``show`` a recording, with the flag set in a browser whose address it tells;
+    ``draw`` a run directory to a PNG;
     ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
     ``present_batch`` adds a page on the rows that a command made;
     ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording;
@@ -116,7 +117,7 @@ class Viewing:
     """
 
     record: OpenRecorder
-    show: Callable[[Path, bool], None]
+    show: Callable[[Path, Callable[[str], None], bool], None]
     draw: Callable[[Path, Path], None]
     report: Callable[[Path], None]
     present_batch: Callable[[Path, Sequence[Row], Sequence[str]], None]

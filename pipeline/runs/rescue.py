@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import shlex
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
 from pipeline.errors import InputError, ScanchainError, told
-from pipeline.runs.directory import RUN_FILE, RunDirectory
+from pipeline.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.provenance import Provenance
 from pipeline.runs.step_table import StepTable
+from pipeline.source import without_keys
 from pipeline.trajectory import write_tum
+from pipeline.words import counted
 
 
 class PartialRunError(ScanchainError):
     """A run that failed after some scans; what there is lies in a directory marked partial."""
+
+
+def how_to_resume(command: Sequence[str]) -> str:
+    """What goes on with a run that this command line began; one without was begun by a script."""
+    words = [*without_keys(command[1:]), *([] if "--resume" in command else ["--resume"])]
+    again = f"scanchain {shlex.join(words)}" if len(command) > 1 else "the same with --resume"
+    return f"to go on with it: {again}"
 
 
 def rescued(
@@ -31,14 +42,17 @@ def rescued(
         error.filename = str(directory.destination)
     reason = _reason(error)
     what = "traceback.txt and the " if is_bug else ""
-    where = f"{what}{len(steps):,} scans until then are in {directory.path}"
+    until = f"{counted(len(steps), 'scan')} until then {'is' if len(steps) == 1 else 'are'}"
+    where = f"{what}{until} in {directory.path}"
     try:
         _keep(
             error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
         )
     except OSError as failure:
         why = "" if isinstance(error, OSError) else f" ({told(failure) or failure.strerror})"
-        where = f"{len(steps):,} scans until then are in {directory.path / JOURNAL_FILE} alone{why}"
+        where = f"{until} in {directory.path / JOURNAL_FILE} alone{why}"
+    if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
+        where += f"; {how_to_resume(provenance.command)}"
     if isinstance(error, InputError):
         return InputError(f"{error}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""

@@ -14,6 +14,7 @@ from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from pipeline.runs.journal import JOURNAL_FILE, read_journal
 from pipeline.runs.recorder import Recorder
 from pipeline.runs.step_table import StepRow, StepTable
+from pipeline.words import counted
 
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -34,7 +35,7 @@ def find_left(out: Path, configuration: str) -> Left | None:
 
     configuration : that of now, as TOML. Raises InputError where that run's, or its version, was another.
     """
-    folder = left_behind(out, CHECKPOINT_FILE)
+    folder = left_behind(out)
     if folder is None:
         return None
     if (folder / "config.toml").read_text(encoding="utf-8") != configuration:
@@ -80,7 +81,7 @@ def go_on_recording(folder: Path, left: Left, recording: Recorder, checkpoints: 
     recording.go_on(before if is_whole else None, left.steps.rows, slam.closures, slam.graph.state())
     recorded_bytes = recording.secure()
     checkpoints.write(slam, recorded_bytes)
-    note = f"went on after {checkpoint.scans:,} scans"
+    note = f"went on after {counted(checkpoint.scans, 'scan')}"
     if recorded_bytes and is_whole:
         before.unlink()
     elif before.exists():

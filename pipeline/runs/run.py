@@ -6,20 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
+from pipeline.clock import compiled_s, working_s
 from pipeline.config import Config, RecordingConfig
 from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import TruthFile, check_overlap, during, read_truth
 from pipeline.logs import Log, open_log
 from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory
+from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
 from pipeline.runs.job import Job
 from pipeline.runs.journal import JOURNAL_FILE
 from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
@@ -28,12 +28,13 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.provenance import Hashing, Provenance, describe_start
 from pipeline.runs.recorder import OpenRecorder
 from pipeline.runs.rescue import rescued
-from pipeline.runs.resuming import find_left
+from pipeline.runs.resuming import Left, find_left
 from pipeline.runs.step_table import StepTable
 from pipeline.runs.whole_file import write_whole
 from pipeline.settings import dump, load_settings, named
 from pipeline.slam import SlamResult
 from pipeline.trajectory import write_tum
+from pipeline.words import counted
 
 _RECORDING_KEYS = RecordingConfig.__struct_fields__
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -61,7 +62,7 @@ def run(
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
-    started = perf_counter()
+    started, compiled_before_s = working_s(), compiled_s()
     job.check_logs()
     truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
@@ -74,12 +75,11 @@ def run(
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
     _check_truth(job, log, truth_file)
-    progress.say(f"{log.topic}: {log.dimension}D, {log.scan_count:,} scans; {settings.source}")
+    progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
-    if left is not None:
-        started -= left.checkpoint.run_s
-        progress.tell(f"going on after {len(steps):,} scans of {left.folder.name}")
+    started -= 0.0 if left is None else left.checkpoint.run_s
+    _tell_beginning(job, left, progress)
     rehearsal = ("pipeline.runs.rehearsal", str(log.dimension))
     with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress, rehearsal):
         provenance.write(directory.path / RUN_FILE)
@@ -87,8 +87,9 @@ def run(
         try:
             true_poses = partial(_true_poses, log, truth_file, progress)
             done = process(job, log, settings.config, directory, record, progress, steps, left, true_poses)
-            run_s = perf_counter() - started - done.held_s
-            stopped = f"stopped by the user after {len(steps):,} scans" if progress.stopped else ""
+            run_s = working_s() - started - done.held_s
+            compile_s = compiled_s() - compiled_before_s
+            stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
             with directory.results() as folder:
                 truth, note = _judge(
                     true_poses, str(job.ground_truth or log.ground_truth_topic), done.result, folder
@@ -96,15 +97,32 @@ def run(
                 warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.judged,
-                    run_s=run_s, ground_truth=truth, warnings=warnings,
+                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
-            warnings += _complete(directory, provenance, hashing, stopped, run_s, report)
+            warnings += _complete(
+                directory, provenance, hashing, stopped, run_s + compile_s, partial(_draw, progress, report)
+            )
         except (Exception, KeyboardInterrupt) as error:
             raise rescued(error, directory, steps, provenance) from error
     return Finished(directory.path, metrics, text, warnings, stopped)
+
+
+def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
+    """Say whether an earlier run is taken up, or lies there and is not."""
+    if left is not None:
+        progress.tell(f"going on after {counted(len(left.steps), 'scan')} of {left.folder.name}")
+    elif (idle := resumable(job.out)) is not None:
+        progress.tell(
+            f"{idle.name} is of a run that was stopped; --resume would go on with it, this one starts again"
+        )
+
+
+def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> None:
+    progress.say("drawing the report")
+    report(folder)
 
 
 def _idle_keys(job: Job, log: Log) -> dict[str, str]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pipeline.errors import InputError
 from pipeline.landmarks.solvers.cholesky import CholeskySolver
 from pipeline.landmarks.solvers.qr import QrSolver
 from pipeline.landmarks.solvers.schur import SchurSolver
-from pipeline.landmarks.solvers.scipy_direct import DefaultSolver, LuSolver, PinvSolver
+from pipeline.landmarks.solvers.scipy_direct import PINV_BELOW, DefaultSolver, LuSolver, PinvSolver, check_pinv
 from pipeline.landmarks.solvers.solution import Factor, LinearSolver, Solution, UndeterminedError
 from pipeline.landmarks.solvers.suitesparse import SuiteSparseQrSolver
 
-__all__ = ["METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver", "parse_methods"]
+__all__ = [
+    "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver",
+    "methods_for", "parse_methods",
+]  # fmt: skip
 
 _MAKERS = {
     "default": DefaultSolver,
@@ -25,6 +30,7 @@ _MAKERS = {
     "spqr_colamd": lambda: SuiteSparseQrSolver("colamd"),
 }
 METHODS = tuple(name for name in _MAKERS if not name.startswith("spqr"))
+ESTIMATOR = "schur"  # the fastest: it estimates where no other is asked for
 
 
 def create_solver(method: str) -> LinearSolver:
@@ -35,12 +41,27 @@ def create_solver(method: str) -> LinearSolver:
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
-    """The names of a list with commas, each once; "all" is every method of the default installation."""
+    """The names of a list with commas, each once; "all" stands for every method that suits the problem."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    chosen = [method for name in names for method in (METHODS if name == "all" else (name,))]
-    for name in chosen:
-        if name not in _MAKERS:
+    for name in names:
+        if name != "all" and name not in _MAKERS:
             raise InputError(f"there is no method {name!r}; choose from all, {', '.join(_MAKERS)}")
-    if not chosen:
+    if not names:
         raise InputError(f"no method is named; choose from all, {', '.join(_MAKERS)}")
-    return tuple(dict.fromkeys(chosen))
+    return tuple(dict.fromkeys(names))
+
+
+def methods_for(asked: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:
+    """Methods to run on a problem of so many unknowns, and what is to be said of one that "all" leaves out there.
+
+    "all" is every method of the default installation. Raises InputError where one is named that is too slow.
+    """
+    if "pinv" in asked:
+        check_pinv(unknowns)
+    chosen = dict.fromkeys(method for name in asked for method in (METHODS if name == "all" else (name,)))
+    if "pinv" not in chosen or unknowns < PINV_BELOW:
+        return tuple(chosen), ""
+    del chosen["pinv"]
+    return tuple(
+        chosen
+    ), f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"

@@ -16,7 +16,7 @@ from pipeline.errors import InputError
 from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from pipeline.landmarks.system import LinearSystem
 
-_MOST_UNKNOWNS = 10_000  # whose explicit inverse, all but dense, takes 1.6 GB with its indices
+PINV_BELOW = 3_000  # unknowns: their inverse is all but dense, 110 MB with its indices, and takes seconds
 
 
 class PinvSolver:
@@ -25,11 +25,7 @@ class PinvSolver:
     def solve(self, system: LinearSystem) -> Solution:
         """Solve in the least-squares sense; the factor is the inverse."""
         n = system.pattern.shape[1]
-        if n > _MOST_UNKNOWNS:
-            raise InputError(
-                f"pinv: the inverse of {n} × {n} numbers would be all but dense, its limit is {_MOST_UNKNOWNS};"
-                " choose another method"
-            )
+        check_pinv(n)
         watch = Stopwatch()
         H, g = _normal_equations(system)
         build_s = watch.lap()
@@ -42,6 +38,15 @@ class PinvSolver:
         x = inverse @ g
         solve_s = watch.lap()
         return Solution(x, build_s, factor_s, solve_s, lambda: Factor("(AᵀA)⁻¹", inverse, np.arange(n)))
+
+
+def check_pinv(unknowns: int) -> None:
+    """Refuse to invert a matrix of so many rows. Raises InputError."""
+    if unknowns >= PINV_BELOW:
+        raise InputError(
+            f"pinv: the inverse of AᵀA would be all but dense for {unknowns:,} unknowns, its limit is"
+            f" {PINV_BELOW:,}; name other --methods"
+        )
 
 
 class DefaultSolver:

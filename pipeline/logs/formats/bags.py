@@ -17,6 +17,7 @@ from pipeline.logs.formats.ros1_bag import index_ros1_bag
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 from pipeline.logs.ros2_definitions import schema_text
 from pipeline.logs.sizes import size_of
+from pipeline.words import counted
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
 _MOST_BLOCKS = 4096
@@ -87,7 +88,7 @@ class _Bag:
                     Message(self.index.channels[self.numbers[id(connection)]], time_ns, memoryview(data))
                     for connection, time_ns, data in found
                 ]
-        what = f"at least {lost} messages from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
+        what = f"at least {counted(lost, 'message')} from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
         return Contents(messages, f"{self.index.path}: {what}" if lost else "")
 
     def _ends(self, block: Block) -> tuple[int, int]:

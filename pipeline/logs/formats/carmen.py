@@ -18,6 +18,7 @@ from pipeline.logs.formats.packed_text import read_text
 from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
 from pipeline.source import Source
+from pipeline.words import counted
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans
@@ -140,4 +141,4 @@ class _Carmen:
 def _complaint(path: Source, malformed: list[int]) -> str:
     if not malformed:
         return ""
-    return f"{path}: {len(malformed)} malformed lines were left out (the first: line {malformed[0]})"
+    return f"{path}: {counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
