@@ -40,6 +40,8 @@ _HOMES = {
     "write_tum": "trajectory",
 }
 
+_COMPILED = {"Odometry", "PoseGraph", "Slam", "VoxelMap", "create_matcher"}  # take a minute when first called
+
 __all__ = [
     "Config",
     "InputError",
@@ -64,10 +66,12 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return [*(name for name in globals() if name.startswith("__")), *__all__]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
-    return getattr(import_module(f"pipeline.{_HOMES[name]}"), name)
+    if name in _COMPILED:
+        import_module("pipeline.clock").tell_compilation()
+    return globals().setdefault(name, getattr(import_module(f"pipeline.{_HOMES[name]}"), name))

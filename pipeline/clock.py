@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from time import perf_counter
 from typing import Any
 
 from numba.core import event
+
+_TOLD = "compiling kernels, once after an installation: the first calls take up to a minute in all"
 
 
 class _Compilation(event.Listener):
@@ -14,11 +17,15 @@ class _Compilation(event.Listener):
     def __init__(self) -> None:
         self.depth = 0
         self.began_s = self.ended_s = 0.0
+        self.is_silent = True
 
     def on_start(self, event: Any) -> None:
         if not self.depth:
             self.began_s = perf_counter()
         self.depth += 1
+        if not self.is_silent and event.data["dispatcher"].py_func.__module__.startswith("pipeline."):
+            self.is_silent = True
+            logging.getLogger("scanchain").warning(_TOLD)
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
@@ -28,6 +35,11 @@ class _Compilation(event.Listener):
 
 _compilation = _Compilation()
 event.register("numba:compile", _compilation)
+
+
+def tell_compilation() -> None:
+    """Log a warning when kernels are next compiled: a caller of the Python API would wait in silence."""
+    _compilation.is_silent = False
 
 
 def compiled_s() -> float:

@@ -5,6 +5,7 @@ import re
 import pytest
 from scenes import ROOT
 
+import pipeline
 from pipeline.simulate import simulate
 
 README = ROOT / "README.md"
@@ -27,12 +28,21 @@ def test_blocks_are_found_between_their_fences():
     assert blocks("a\n```python\nb = 1\n```\n```\nno\n```\n```python\nc = 2\n```\n") == ["b = 1\n", "c = 2\n"]
 
 
-def test_every_block_of_python_in_the_readme_runs(folder, capsys):
-    """Later blocks may use the names of earlier ones."""
-    found = blocks(README.read_text(encoding="utf-8"))
-    assert found
-    names = {"__name__": "readme"}
-    for number, block in enumerate(found, start=1):
-        exec(compile(block, f"README.md, block {number}", "exec"), names)
-    assert "ok" in capsys.readouterr().out
+def test_every_block_of_python_in_the_readme_runs_alone(folder, capsys):
+    """In the order of the README: only the files that a block writes are there for the next."""
+    printed = []
+    for number, block in enumerate(blocks(README.read_text(encoding="utf-8")), start=1):
+        exec(compile(block, f"README.md, block {number}", "exec"), {"__name__": "readme"})
+        printed.append(capsys.readouterr().out)
+    slam, clouds, stream, graph, errors = printed
+    assert re.findall(r"^(\d+) ok ", slam, re.MULTILINE) == [str(k) for k in range(30)]
+    assert clouds.startswith("True converged")
+    assert stream.count("ok") == 30
+    assert "3.00" in graph and graph.rstrip().endswith("3")
+    ate_m = float(re.search(r"rmse ([\d.]+) m", errors)[1])
+    assert ate_m < 0.02
     assert (folder / "trajectory.tum").exists()
+
+
+def test_the_names_of_the_api_are_listed():
+    assert {name for name in dir(pipeline) if not name.startswith("_")} == set(pipeline.__all__)
