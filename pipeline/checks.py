@@ -18,7 +18,7 @@ from pipeline.kernels.validity import largest_magnitude, largest_moved, rigidity
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat
-_LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
+LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
 
 
 def dimension(value: object, name: str = "dimension") -> int:
@@ -91,10 +91,10 @@ def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
     if array.shape not in ((count,), (0,)):
         raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or (0,) for none")
     farthest_s = float(np.abs(array).max(initial=0.0))
-    if not farthest_s <= _LONGEST_SWEEP_S:
+    if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
             f"{name}: a point lies {farthest_s:.3g} s from the stamp of its scan; wanted seconds after the stamp, "
-            f"at most {_LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
+            f"at most {LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
         )
     return value if _is_ready(value, np.float32) else array.astype(np.float32)  # type: ignore[return-value]
 

@@ -437,6 +437,15 @@ def cloud_of(k, points):
     return cloud_said(stamp_ns, point_cloud(stamp_ns, rows))
 
 
+def test_point_times_far_from_the_stamp_are_told_with_the_setting_that_mends_them(tmp_path):
+    """Whole numbers in nanoseconds, taken as seconds."""
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    path = write(tmp_path / "a.mcap", [cloud_of(k, points) for k in range(3)])
+    with pytest.raises(InputError, match=r"scan 0 of /points has a point 8e\+06 s from .* \(log.point_times sets"):
+        read(path, point_times="s", max_bad_scans_percent=0.0)
+    assert len(read(path, point_times="ns")[1]) == 3
+
+
 @pytest.mark.parametrize("height_m", [0.0, 0.3])
 def test_clouds_with_all_points_at_one_height_are_a_planar_log(tmp_path, height_m):
     said = [cloud_of(k, [(1, 2, height_m), (3, 4, height_m), (5, 6, height_m)]) for k in range(3)]

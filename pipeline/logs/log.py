@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
+from pipeline.checks import LONGEST_SWEEP_S
 from pipeline.clock import working_s
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
@@ -289,9 +290,13 @@ class Log:
 
     def _complaint(self, message: Decoded, number: int) -> str:
         """What is wrong with a scan, empty where it is good."""
-        if isinstance(message.value, Returns) and len(message.value.points):
+        returns = message.value
+        farthest_s = float(np.abs(returns.times_s).max(initial=0.0)) if isinstance(returns, Returns) else 0.0
+        if isinstance(returns, Returns) and len(returns.points) and farthest_s <= LONGEST_SWEEP_S:
             return ""
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
-        if isinstance(message.value, Returns):
-            return f"{where} has no valid point ({message.value.why})"
-        return f"{where} is malformed: {message.value}"
+        if not isinstance(returns, Returns):
+            return f"{where} is malformed: {returns}"
+        if farthest_s > LONGEST_SWEEP_S:
+            return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
+        return f"{where} has no valid point ({returns.why})"
