@@ -28,6 +28,11 @@ def dimension(value: object, name: str = "dimension") -> int:
     raise InputError(f"{name} is {shown(value)}; it must be 2 (laser scans) or 3 (clouds)")
 
 
+def shape(value: object, name: str) -> tuple[int, ...]:
+    """Shape of an array or of nested lists."""
+    return value.shape if isinstance(value, np.ndarray) else _array(value, name, "an array").shape
+
+
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
     array = _numbers(value, name, f"an (N, {d}) array of metres", dtype)
@@ -129,24 +134,30 @@ def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
     return array
 
 
-def matrices(value: object, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def matrices(value: object, name: str, wanted: tuple[int, ...]) -> NDArray[np.float64]:
     """Finite numbers of a shape."""
-    array = _numbers(value, name, f"an array of the shape {shape}", np.float64)
-    if array.shape != shape:
-        raise InputError(f"{name} has the shape {array.shape}; wanted {shape}")
+    array = _numbers(value, name, f"an array of the shape {wanted}", np.float64)
+    if array.shape != wanted:
+        raise InputError(f"{name} has the shape {array.shape}; wanted {wanted}")
     if not np.isfinite(array).all():
         raise InputError(f"{name} holds NaN or infinite values")
     return array
 
 
+def whole_numbers(value: object, name: str, wanted: str) -> NDArray[np.int64]:
+    """An array of whole numbers; floats are refused, since seconds are told from nanoseconds by that alone."""
+    array = _array(value, name, wanted)
+    if array.dtype.kind not in "iu" and array.size:
+        raise InputError(f"{name} holds {_kind(array)}; wanted whole numbers: {wanted}")
+    return array.astype(np.int64, copy=False)
+
+
 def indices(value: object, name: str) -> NDArray[np.int64]:
     """Pairs (E, 2) of whole numbers."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(
-            f"{name} is {shown(array)} of {_kind(array)}; wanted (E, 2) whole numbers: indices of poses"
-        )
-    return array.astype(np.int64)
+    array = _array(value, name, "(E, 2) indices of poses")
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise InputError(f"{name} is {shown(array)}; wanted (E, 2) whole numbers: indices of poses")
+    return whole_numbers(array, name, "(E, 2) indices of poses")
 
 
 def instance(value: object, kind: type, name: str, remedy: str) -> None:
@@ -161,14 +172,18 @@ def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike) -> NDArray
         return value  # type: ignore[return-value]
     if np.ma.is_masked(value):
         raise InputError(f"{name} has masked entries; leave them out")
-    try:
-        array = np.asarray(value)
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise InputError(f"{name} is {shown(value)}, no array ({_one_line(error)}); wanted {wanted}") from None
+    array = _array(value, name, wanted)
     if array.dtype.kind not in "iuf":
         raise InputError(f"{name} holds {_kind(array)}, not real numbers; wanted {wanted}")
     with np.errstate(over="ignore"):  # what becomes infinite is refused as such
         return np.require(array, dtype, ["C_CONTIGUOUS", "WRITEABLE", "ALIGNED"]).view(np.ndarray)
+
+
+def _array(value: object, name: str, wanted: str) -> NDArray[Any]:
+    try:
+        return np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{name} is {shown(value)}, no array ({_one_line(error)}); wanted {wanted}") from None
 
 
 def _is_ready(value: object, dtype: DTypeLike) -> bool:

@@ -65,7 +65,7 @@ class Scan:
         for name, wanted in _WHOLE:
             if type(value := getattr(self, name)) is not int:
                 object.__setattr__(self, name, checks.integer(value, name, wanted))
-        d = 2 if np.shape(self.points)[1:] == (2,) else 3
+        d = 2 if checks.shape(self.points, "points")[1:] == (2,) else 3
         points = checks.points(self.points, "points", d, dtype=np.float32)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
@@ -317,12 +317,16 @@ class Trajectory:
     poses: Matrix
 
     def __post_init__(self) -> None:
-        """Raises InputError where there is not one pose for each stamp."""
-        stamps, poses = np.shape(self.stamps_ns), np.shape(self.poses)
+        """Check and convert. Raises InputError where there is not one rigid pose for each stamp."""
+        from pipeline import checks  # compiled, as above
+
+        stamps, poses = checks.shape(self.stamps_ns, "stamps_ns"), checks.shape(self.poses, "poses")
         if len(stamps) != 1 or len(poses) != 3 or poses[1:] not in ((3, 3), (4, 4)) or poses[0] != stamps[0]:
             raise InputError(
                 f"poses has the shape {poses}, stamps_ns {stamps}; wanted (N, 3, 3) or (N, 4, 4) and (N,)"
             )
+        object.__setattr__(self, "stamps_ns", checks.whole_numbers(self.stamps_ns, "stamps_ns", "nanoseconds"))
+        object.__setattr__(self, "poses", checks.poses(self.poses, "poses", poses[1] - 1))
 
     @property
     def dimension(self) -> int:

@@ -24,9 +24,12 @@ from pipeline import (
     lie,
     load_settings,
     open_log,
+    read_tum,
     rigid_transform,
+    write_tum,
 )
 from pipeline.config import LocalMapConfig, MatchingConfig, PreprocessConfig
+from pipeline.evaluate import absolute_error, pair
 
 CALLS = 2000
 
@@ -102,7 +105,7 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: PoseGraph(3).add_edge(0, 1, I3, np.eye(6)), r"T_ij has the shape \(3, 3\)"),
         (lambda: PoseGraph(2).add_edge(0, 1, I3, np.eye(6)), r"information has the shape \(6, 6\); wanted"),
         (lambda: PoseGraph(2).add_edge(0.0, 1, I3, I3), "i is 0.0; wanted the index of a pose"),
-        (lambda: PoseGraph(2).add_edges([[0.5, 1]], I3[None], I3[None], [False]), "edges is .*; wanted"),
+        (lambda: PoseGraph(2).add_edges([[0.5, 1]], I3[None], I3[None], [False]), "edges holds float64; wanted"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
@@ -228,7 +231,8 @@ def arrays(draw):
         array = np.zeros(values.shape, dtype) if dtype in ("M8[s]", "V4") else values.astype(dtype)
     form = draw(st.sampled_from(["as it is", "list", "read-only", "fortran", "masked", "strided"]))
     if form == "list":
-        return array.tolist()
+        rows = array.tolist()
+        return [*rows, [1.0]] if isinstance(rows, list) and draw(st.booleans()) else rows
     if form == "masked":
         return np.ma.masked_invalid(array) if array.dtype.kind == "f" else array
     if form == "fortran":
@@ -252,6 +256,11 @@ def poses(draw):
 numbers = st.one_of(st.integers(), st.floats(), st.none(), st.text(max_size=2), st.booleans(), arrays())
 anything = st.one_of(arrays(), poses(), numbers)
 good_points = st.sampled_from([ROOM[::40], ROOM[::7] * 3.0, FLAT[::30], FLAT[::9] + 1e-3])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
 
 
 def fuzzed(*strategies):
@@ -305,7 +314,8 @@ def test_a_pose_called_converged_is_right_whatever_the_scale_density_and_motion(
     source += 0.01 * rng.uniform() * rng.normal(size=source.shape)
     match = align.align(source, target, lie.identity(dimension), wide=wide)
     distance_m, angle_rad = lie.apart(T, match.T_target_source)
-    assert not match.converged or (distance_m < (0.1 if dimension == 2 else 0.25) and angle_rad < 0.1), match
+    limit_m = 0.1 if dimension == 2 else 0.5  # a voxel in the plane, half a voxel in space
+    assert not match.converged or (distance_m < limit_m and angle_rad < 0.15), match
 
 
 @fuzzed(arrays(), arrays(), arrays())
@@ -346,6 +356,21 @@ def test_a_graph_takes_poses_and_edges_or_refuses_them_and_stays_whole(dimension
     tried(lambda: graph.fix(index))
     assert np.isfinite(graph.poses).all() and np.isfinite(graph.information).all()
     assert len(graph.edges) == len(graph.measurements) == len(graph.information) == len(graph.is_loop)
+
+
+@fuzzed(arrays(), st.one_of(arrays(), st.lists(poses(), max_size=4)), st.lists(st.integers(0, 10**10), max_size=4))
+def test_a_trajectory_of_anything_is_written_and_read_and_judged_or_refused(folder, stamps_ns, poses, whole):
+    for stamps in (stamps_ns, whole, np.arange(len(poses) if isinstance(poses, list) else 4)):
+        made = tried(lambda: Trajectory(stamps, poses))  # noqa: B023
+        if made is not None and len(made):
+            write_tum(folder / "a.tum", made)
+            again = read_tum(folder / "a.tum")
+            assert np.abs(again.poses - lie.lift(made.poses)).max() <= 1e-3 * max(1.0, np.abs(made.poses).max())
+            error = tried(lambda: absolute_error(pair(made, made)))  # noqa: B023
+            is_one_to_one = len(set(made.stamps_ns.tolist())) == len(made)
+            assert (
+                error is None or not is_one_to_one or error.translation_m.rmse <= 1e-6 * np.abs(made.poses).max()
+            )
 
 
 @fuzzed(st.sampled_from([*msgspec.structs.fields(Config)]), st.data())

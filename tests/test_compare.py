@@ -188,7 +188,9 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
     def fake(method, scans, folder, limits):
         ran.append(folder.name)
         report = EndReport(Status.OK, "", has_compiled=len(ran) == 1)
-        return Outcome(report, blank, Trajectory(blank, np.zeros((2, 3, 3))), blank + len(ran), blank, folder)
+        return Outcome(
+            report, blank, Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1))), blank + len(ran), blank, folder
+        )
 
     monkeypatch.setattr("pipeline.compare.race._run", fake)
     methods = resolve(("plicp",), 2, file=None)

@@ -94,9 +94,9 @@ def forced(log, tmp_path_factory):
     """The directory of a run into which false loops were forced at its end."""
 
     class Forced(Slam):
-        def finish(self):
+        def finish(self, tell):
             self._take(false_closures(self, 0.3))
-            return super().finish()
+            return super().finish(tell)
 
     out = tmp_path_factory.mktemp("forced") / "run"
     with pytest.MonkeyPatch.context() as patch:

@@ -9,9 +9,10 @@ from pipeline.data import Scan
 from pipeline.words import counted
 
 
-def most_bad_scans(scans: int, config: LogConfig) -> int:
-    """How many of so many scans may be left out."""
-    return math.ceil(0.01 * config.max_bad_scans_percent * scans)
+def most_bad_scans(scans: int, config: LogConfig) -> float:
+    """How many of so many scans may be left out; at 100 % any number: damaged logs may hold more than they say."""
+    share = 0.01 * config.max_bad_scans_percent
+    return math.ceil(share * scans) if share < 1.0 else math.inf
 
 
 class Tally:

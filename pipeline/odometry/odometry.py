@@ -240,4 +240,6 @@ def checked_mounting(config: Config, T_base_lidar: Pose) -> Pose:
     """Where the lidar sits; InputError where that is no pose, or the configuration contradicts itself."""
     checks.instance(config, Config, "config", "load_settings(dimension).config")
     check_order(config)
-    return checks.pose(T_base_lidar, "T_base_lidar", 2 if np.shape(T_base_lidar) == (3, 3) else 3)
+    return checks.pose(
+        T_base_lidar, "T_base_lidar", 2 if checks.shape(T_base_lidar, "T_base_lidar") == (3, 3) else 3
+    )

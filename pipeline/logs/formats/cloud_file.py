@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pipeline.logs.formats.point_rows import CloudFileError
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 _MOST_COLUMNS = 16
 _LIKELY_COLUMNS = (4, 3, 5, 6)  # of .bin files; the first where nothing speaks for another
-_SAMPLE_BYTES = 1 << 20
+_SAMPLE_BYTES, _VOTERS = 1 << 20, 5  # read of a .bin file, and of how many files about
 _SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # sizes of numbers that are plausible, and how many must be
 _FEWEST_ROWS = 20  # that tell columns apart
 _ALIKE, _HARDLY = 0.5, 0.05  # differences of columns, in spreads of the two, and of all, that are none
@@ -74,14 +75,25 @@ def read_npy(path: Path) -> NDArray[np.void]:
 def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
     """How a point lies in .bin files, which do not say: float32 or float64, x y z and up to three more columns.
 
-    A layout must divide the size of each file. Of several the one whose columns differ most from each other in
-    mean and spread is taken: numbers that are cut into wrong rows mix them, so that all columns look alike. x, y,
-    z, intensity where nothing speaks for another. Raises CloudFileError where none fits.
+    A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
+    columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
+    so that all columns look alike. x, y, z, intensity where nothing speaks for another. Raises CloudFileError
+    where none fits.
     """
     sizes = [file.stat().st_size for file in files]
-    sample = next((np.fromfile(file, np.uint8, _SAMPLE_BYTES) for file in files if file.stat().st_size), None)
-    if sample is None:
+    filled = [file for file, size in zip(files, sizes, strict=True) if size]
+    if not filled:
         return _XYZI
+    voters = filled[:: max(len(filled) // _VOTERS, 1)]
+    layouts = [_layout(np.fromfile(file, np.uint8, _SAMPLE_BYTES), sizes) for file in voters]
+    votes = Counter(layout for layout in layouts if layout is not None)
+    if not votes:
+        raise CloudFileError("holds neither float32 nor float64 numbers of 3 to 6 columns")
+    return votes.most_common(1)[0][0]
+
+
+def _layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[np.void] | None:
+    """How the points of one file seem to lie, None where no layout fits."""
     for kind in (np.dtype("<f4"), np.dtype("<f8")):
         values = sample[: len(sample) - len(sample) % kind.itemsize].view(kind)
         if not _are_plausible(values):
@@ -98,7 +110,7 @@ def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
             if best == 6 and 3 in contrasts and _repeats(values):
                 best = 3
             return _columns(kind, best)
-    raise CloudFileError("holds neither float32 nor float64 numbers of 3 to 6 columns")
+    return None
 
 
 def _are_plausible(values: NDArray[np.floating]) -> bool:
@@ -126,7 +138,8 @@ def _repeats(values: NDArray[np.floating]) -> bool:
 
 
 def _finite_rows(values: NDArray[np.floating], columns: int) -> NDArray[np.float64]:
-    rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
+    with np.errstate(invalid="ignore"):  # a damaged number may be a signaling NaN
+        rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
     return rows[np.isfinite(rows).all(axis=1)]
 
 
