@@ -178,6 +178,26 @@ def test_a_single_point_or_a_plane_is_not_called_converged(matcher):
         assert not match.converged and match.reason != "converged"
 
 
+def corridor(beams, noise_m, rng):
+    """A laser scan between two walls without end, which looks the same everywhere."""
+    angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    ranges = 1.0 / np.maximum(np.abs(np.sin(angles)), 1e-6) + noise_m * rng.normal(size=beams)
+    seen = ranges < 30.0
+    return (ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))[seen]
+
+
+@pytest.mark.parametrize("matcher", ["plicp", "svd"])
+@pytest.mark.parametrize("noise_m", [0.005, 0.01, 0.02, 0.03])
+@pytest.mark.parametrize("beams", [360, 1080])
+def test_scans_of_a_bare_corridor_are_not_called_converged_however_noisy(matcher, noise_m, beams):
+    """Noise bends the walls' normals, which then seem to hold the scan along the corridor."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        align, target = mapped(corridor(beams, noise_m, rng), matcher)
+        match = align.align(corridor(beams, noise_m, rng), target, I3, wide=True)
+        assert not match.converged and "undetermined" in match.reason
+
+
 def sweeps(name, *numbers):
     """Sweeps of a real log."""
     wanted = dict.fromkeys(numbers)

@@ -18,7 +18,7 @@ from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _DOTTED = "Dotted: the truth. "
 _MEDIANS = "Of long logs, medians of neighbouring scans."
-_FIRST_NUMBER = re.compile(r" -?\d[\d.e+-]*")
+_FIGURES = re.compile(r", χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*")  # of one closure; limits stand behind them
 
 
 def chip(course: Course) -> Chip:
@@ -162,7 +162,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
     for place, (verdict, reason) in enumerate(
         zip(*(closures[key].to_pylist() for key in ("verdict", "reason")), strict=True)
     ):
-        groups[verdict, _FIRST_NUMBER.sub("", reason, count=1)].append(place)
+        groups[verdict, _FIGURES.sub("", reason, count=1)].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),

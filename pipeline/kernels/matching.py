@@ -25,7 +25,7 @@ from pipeline.kernels.pose_log import twist_3d
 from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
 from pipeline.kernels.registration import NO_PARTNERS, align, position_of
 from pipeline.kernels.residuals import information, robust_sums
-from pipeline.kernels.signal import listen
+from pipeline.kernels.signal import listen, weakest_signal
 from pipeline.kernels.trust import weigh
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
@@ -45,7 +45,8 @@ class Quality(NamedTuple):
 
     pairs, on_surfaces : points with a correspondence, and those of them on a plane or line
     residual_m, fit : as in ``Match``
-    H (k, k), weights : information of planes and lines about the lidar's position, and the sum of all weights
+    H (k, k), weights : information of planes and lines, and the sum of all weights
+    origin (3,), partner (N,), trust (N,) : as in ``Outcome``
     """
 
     pairs: int
@@ -54,16 +55,23 @@ class Quality(NamedTuple):
     fit: float
     H: NDArray[np.float64]
     weights: float
+    origin: NDArray[np.float64]
+    partner: NDArray[np.int32]
+    trust: NDArray[np.float64]
 
 
 class Answer(NamedTuple):
-    """How a matching ended; fields as in ``Match``, ``range_m`` of the points, a code of ``registration``."""
+    """How a matching ended; fields as in ``Match``, ``range_m`` of the points, a code of ``registration``.
+
+    surface_signal : along the weakest direction, where ``signal`` does not judge it; infinite where that is strong
+    """
 
     T: NDArray[np.float64]
     information: NDArray[np.float64]
     direction: NDArray[np.float64]
     eigenvalue: float
     signal: float
+    surface_signal: float
     fit: float
     range_m: float
     residual_m: float
@@ -107,7 +115,10 @@ def match(voxels, points, T_first, expected, terms):
         add(information, hold(spectrum, outcome.weights, believed, terms))
         T = T_first.copy()
     quality = _quality_of(voxels, points, T, outcome, range_m, terms)
-    return answer_of(T, T_first, outcome, spectrum, quality, range_m, terms.variance)
+    surface_signal = np.inf
+    if points.shape[1] == 2:
+        surface_signal = weakest_signal(voxels, points, T, quality, spectrum, terms)
+    return answer_of(T, T_first, outcome, spectrum, surface_signal, quality, range_m, terms.variance)
 
 
 @njit(cache=True, nogil=True)
@@ -118,24 +129,35 @@ def judge(voxels, points, T, outcome, terms):
     therefore judged by the surfaces.
     """
     range_m = root_mean_square_range(points)
-    quality = _quality_at(voxels, points, T, range_m, terms)
+    quality = _quality_at(voxels, points, T, position_of(T), range_m, terms)
     spectrum = spectrum_of(quality.H, quality.weights, range_m)
-    return answer_of(T, T, outcome, spectrum, quality, range_m, terms.variance)
+    surface_signal = weakest_signal(voxels, points, T, quality, spectrum, terms)
+    return answer_of(T, T, outcome, spectrum, surface_signal, quality, range_m, terms.variance)
 
 
 @njit(cache=True, nogil=True)
 def _quality_of(voxels, points, T, outcome, range_m: float, terms):
     """The ``Quality`` of an outcome: by its own correspondences, or by closer ones where the search was wider."""
     if terms.reach != terms.last_reach or terms.max_distance_m != terms.last_distance_m:
-        return _quality_at(voxels, points, T, range_m, terms)
+        return _quality_at(voxels, points, T, outcome.origin, range_m, terms)
     residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
     fit = fit_of(outcome.H, outcome.unweighted, range_m)
-    return Quality(outcome.pairs, _positive(outcome.trust), residual_m, fit, outcome.H, outcome.weights)
+    return Quality(
+        outcome.pairs,
+        _positive(outcome.trust),
+        residual_m,
+        fit,
+        outcome.H,
+        outcome.weights,
+        outcome.origin,
+        outcome.partner,
+        outcome.trust,
+    )
 
 
 @njit(cache=True, nogil=True)
-def _quality_at(voxels, points, T, range_m: float, terms):
-    """The ``Quality`` of points (N, d) at the pose T (d+1, d+1)."""
+def _quality_at(voxels, points, T, origin, range_m: float, terms):
+    """The ``Quality`` of points (N, d) at the pose T (d+1, d+1), twists about an origin (3,)."""
     k = 3 if points.shape[1] == 2 else 6
     partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
     pairs = associate(voxels, points, T, terms.last_reach, terms.last_distance_m, partner)
@@ -143,9 +165,10 @@ def _quality_at(voxels, points, T, range_m: float, terms):
     _, weights, squares = robust_sums(voxels, points, T, partner, trust, terms.scale_m)
     leave_out_points(voxels, partner, trust)
     H, unweighted = np.empty((k, k)), np.empty((k, k))
-    information(voxels, points, T, position_of(T), partner, trust, terms.scale_m, H, unweighted)
+    information(voxels, points, T, origin, partner, trust, terms.scale_m, H, unweighted)
     residual_m = math.sqrt(squares / weights) if weights > 0.0 else math.inf
-    return Quality(pairs, _positive(trust), residual_m, fit_of(H, unweighted, range_m), H, weights)
+    fit = fit_of(H, unweighted, range_m)
+    return Quality(pairs, _positive(trust), residual_m, fit, H, weights, origin, partner, trust)
 
 
 @njit(cache=True, inline="always")
@@ -158,7 +181,7 @@ def _positive(values) -> int:
 
 
 @njit(cache=True, inline="always")
-def answer_of(T, T_first, outcome, spectrum, quality, range_m: float, variance: float):
+def answer_of(T, T_first, outcome, spectrum, surface_signal: float, quality, range_m: float, variance: float):
     """The ``Answer`` that an outcome amounts to, turned into the source's own frame.
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
@@ -174,6 +197,7 @@ def answer_of(T, T_first, outcome, spectrum, quality, range_m: float, variance: 
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
+        surface_signal,
         quality.fit,
         range_m,
         quality.residual_m,

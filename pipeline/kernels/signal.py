@@ -18,6 +18,7 @@ from pipeline.kernels.voxels import (
     move,
 )
 
+_FAR_FROM_WEAK = 0.1  # information per weight that noise of normals does not produce
 _OLD = 2  # insertions after its first, from which on a voxel bears witness
 
 
@@ -34,9 +35,20 @@ def listen(voxels, points, T, outcome, spectrum, terms):
             break
 
 
+@njit(cache=True, inline="always")
+def weakest_signal(voxels, points, T, outcome, spectrum, terms) -> float:
+    """Signal along the direction of least information, infinite where that is far from weak."""
+    if spectrum.values[0] > _FAR_FROM_WEAK:
+        return np.inf
+    twist = np.empty(spectrum.values.shape[0])
+    for i in range(twist.shape[0]):
+        twist[i] = spectrum.vectors[i, 0] * spectrum.scale[i]
+    return signal_along(voxels, points, T, outcome, twist, terms.insertions)
+
+
 @njit(cache=True, nogil=True)
 def signal_along(voxels, points, T, outcome, twist, insertions: int) -> float:
-    """How many times as much the pairs tell along a twist (6,) as the errors of their normals alone would feign.
+    """How many times as much the pairs tell along a twist as the errors of their normals alone would feign.
 
     A normal n that was fitted to m points, of variance τ² about their plane and with eigenvalues λ' along u and λ
     along v, is off by some δ. Of a pair of weight w, which the twist displaces by d, the information w (n·d)² is
@@ -47,8 +59,9 @@ def signal_along(voxels, points, T, outcome, twist, insertions: int) -> float:
     the lidar and move along with it. So the voxel that tells most does not count, nor do those around it, nor
     those that are new in the map, as far as it has older ones.
 
-    outcome : of aligning the points (N, 3) to the map; T (4, 4), where it ended
+    outcome : of aligning the points (N, d) to the map; T (d+1, d+1), where it ended; twist (k,)
     """
+    used_up = 2.0 if points.shape[1] == 2 else 3.0
     told = np.zeros(points.shape[0])
     total, feigned, most, loudest = 0.0, 0.0, 0.0, -1
     youngest = insertions - min(_OLD, insertions - 1)
@@ -61,7 +74,7 @@ def signal_along(voxels, points, T, outcome, twist, insertions: int) -> float:
         along = cell[DIRECTION] * dx + cell[DIRECTION + 1] * dy + cell[DIRECTION + 2] * dz
         beside = dx * dx + dy * dy + dz * dz - along * along
         if cell[SHAPE] == PLANE:
-            feigned += weight * _error(cell, dx, dy, dz, beside)
+            feigned += weight * _error(cell, dx, dy, dz, beside, used_up)
         if voxels.history[voxel, BORN] <= youngest:
             told[i] = weight * (along * along if cell[SHAPE] == PLANE else beside)
             total += told[i]
@@ -77,6 +90,8 @@ def _displaced(T, points, i: int, origin, twist):
     """What a twist about the origin displaces a point by that T has moved."""
     x, y, z = move(T, points, i)
     x, y, z = x - origin[0], y - origin[1], z - origin[2]
+    if points.shape[1] == 2:
+        return twist[0] - twist[2] * y, twist[1] + twist[2] * x, 0.0
     return (
         twist[0] + twist[4] * z - twist[5] * y,
         twist[1] + twist[5] * x - twist[3] * z,
@@ -85,14 +100,14 @@ def _displaced(T, points, i: int, origin, twist):
 
 
 @njit(cache=True, inline="always")
-def _error(cell, dx: float, dy: float, dz: float, beside: float) -> float:
+def _error(cell, dx: float, dy: float, dz: float, beside: float, used_up: float) -> float:
     """Variance of n·d for the normal of a cell, ``beside`` being the squared length of d within the plane.
 
-    τ² is taken from m points, of which the plane has used up three.
+    τ² is taken from m points, of which the fit has used up three, in the plane two.
     """
     across = cell[ACROSS] * dx + cell[ACROSS + 1] * dy + cell[ACROSS + 2] * dz
     m = 1.0 / cell[MEAN_TERM]
-    variance = cell[THICKNESS] * m / max(m - 3.0, 1.0)
+    variance = cell[THICKNESS] * m / max(m - used_up, 1.0)
     return variance * (cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * (beside - across * across))
 
 

@@ -2,7 +2,7 @@
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
-(3), direction (3), shape; of a line or plane in space the variance across it; and of a plane there its second
+(3), direction (3), shape; of a line or plane the variance across it; and of a plane in space its second
 direction (3), and how that variance carries over to the fit: at the mean, and by squared distance along both
 directions. Its row of ``history`` holds the ticks of the first and of the last insertion, and the number of points
 when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
@@ -199,6 +199,8 @@ def _fit_2d(m, cell):
     if large > 1e-12 and small < 0.1 * large:
         cell[SHAPE] = PLANE
         cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
+        cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / min(n, MANY)
+        cell[SLOPE_ALONG] = cell[MEAN_TERM] / large
     return large
 
 

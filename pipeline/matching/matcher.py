@@ -130,6 +130,11 @@ def _problem(answer: Answer, points: int, target: VoxelMap, observability: float
             f"motion along [{direction}] is undetermined: observability {observability:.1e} < 1, by "
             f"matching.min_signal ({config.min_signal:g}) or matching.min_information ({config.min_information:g})"
         )
+    if answer.surface_signal < config.min_signal:
+        return (
+            f"motion along the weakest direction is undetermined: the points show {answer.surface_signal:.1g} "
+            f"times what errors of the normals alone would, below matching.min_signal ({config.min_signal:g})"
+        )
     if answer.ending != registration.CONVERGED:
         return _ENDINGS[answer.ending]
     return _contradiction(answer, config) or _chance(answer, points, target)
@@ -161,8 +166,8 @@ def _chance(answer: Answer, points: int, target: VoxelMap) -> str:
         return f"the map has {len(target)} voxels, fewer than {2 * _REDUNDANCY} for each degree of freedom"
     if answer.range_m < _SPAN_VOXELS * voxel_m:
         return (
-            f"the points spread over {answer.range_m:.2g} m, too little for voxels of {voxel_m:g} m "
-            "(local_map.voxel_size_m)"
+            f"the points spread over {answer.range_m:.2g} m, less than {_SPAN_VOXELS:g} voxels: lower "
+            f"local_map.voxel_size_m ({voxel_m:g})"
         )
     return ""
 
