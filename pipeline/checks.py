@@ -89,12 +89,14 @@ def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: fl
 
 
 def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
-    """Seconds (N,) of points relative to their scan's stamp, or (0,) where there are none."""
+    """Seconds (N,) of points relative to their scan's stamp; (0,), as None becomes, where there are none."""
+    if value is None:
+        return np.empty(0, np.float32)
     if type(value) is np.ndarray and value.dtype == np.float32 and value.shape == (0,):
         return value
     array = _numbers(value, name, "seconds, one a point", np.float64)
     if array.shape not in ((count,), (0,)):
-        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or (0,) for none")
+        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or None")
     farthest_s = float(np.abs(array).max(initial=0.0))
     if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
@@ -172,6 +174,8 @@ def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike) -> NDArray
         return value  # type: ignore[return-value]
     if np.ma.is_masked(value):
         raise InputError(f"{name} has masked entries; leave them out")
+    if value is None:
+        raise InputError(f"{name} is None; wanted {wanted}")
     array = _array(value, name, wanted)
     if array.dtype.kind not in "iuf":
         raise InputError(f"{name} holds {_kind(array)}, not real numbers; wanted {wanted}")

@@ -18,8 +18,10 @@ from pipeline.errors import InputError, shown
 Value = bool | int | float | str
 Kind = Literal["bool", "int", "float", "choice", "str"]
 
-_UNITS = {"_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_voxels": "voxels", "_keyframes": "keyframes",
-          "_percent": "%"}  # fmt: skip
+_UNITS = {  # by the ending of a name; the first that fits
+    "_m_s": "m/s", "_rad_s": "rad/s", "_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_percent": "%",
+    "_voxels": "voxels", "_keyframes": "keyframes",
+}  # fmt: skip
 _YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
 

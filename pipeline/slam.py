@@ -25,6 +25,7 @@ from pipeline.data import (
     Trajectory,
     Verdict,
 )
+from pipeline.errors import InputError
 from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.pose_graph import PoseGraph
@@ -125,6 +126,8 @@ class Slam:
 
         tell : told which of these stages begins
         """
+        if not self.keyframes:
+            raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         if self.config.loops.enabled:
             tell("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))

@@ -93,6 +93,10 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: scan(np.zeros((9, 3)), times_s=np.arange(8.0)), r"times_s has the shape \(8,\); wanted \(9,\)"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0, 10**8]), "times_s: a point lies 1e.08 s from the stamp"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0.0, np.nan]), "times_s"),
+        (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
+        (lambda: open_log(3), "a log is 3; wanted a path"),
+        (lambda: open_log([]), r"a log is \[\]; wanted a path"),
+        (lambda: open_log([None]), r"a log is \[None\]; wanted a path"),
         (lambda: scan(np.zeros((2, 2)), T_odom_base=I4), r"T_odom_base has the shape \(4, 4\); wanted a \(3, 3\)"),
         (lambda: replace(scan(I3), stamp_ns=1.7e9), "stamp_ns is 1700000000.0; wanted nanoseconds as int"),
         (lambda: Odometry(Config(), I4).track(I3), "scan is an array of the shape .*; wanted a Scan"),
@@ -133,7 +137,7 @@ def test_a_wrong_argument_is_named_with_what_came_and_what_is_wanted(call, words
         (ROOM, 2.0 * I4, "T_first is no rigid transformation"),
         (ROOM, np.diag([1.0, 1.0, -1.0, 1.0]), "T_first is no rigid transformation"),
         (ROOM, I3, r"T_first has the shape \(3, 3\); wanted a \(4, 4\) pose, because the points are 3D"),
-        (ROOM, None, "T_first holds objects"),
+        (ROOM, None, "T_first is None; wanted a"),
     ],
 )
 def test_what_cannot_be_aligned_or_inserted_is_refused(matcher, points, T_first, words):

@@ -301,3 +301,14 @@ def test_every_default_and_every_preset_lies_within_its_own_range():
     for dimension in (2, 3):
         for name, value in flatten(load_settings(dimension).config).items():
             assert config_keys()[name].check(value, name) == value
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        ("odometry.max_speed_m_s", "m/s"), ("odometry.max_turn_rad_s", "rad/s"), ("log.start_s", "s"),
+        ("matching.max_distance_m", "m"), ("log.max_bad_scans_percent", "%"), ("matching.min_signal", ""),
+    ],
+)  # fmt: skip
+def test_a_key_has_the_unit_that_its_name_ends_with(key, unit):
+    assert config_keys()[key].unit == unit

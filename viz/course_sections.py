@@ -18,7 +18,9 @@ from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _DOTTED = "Dotted: the truth. "
 _MEDIANS = "Of long logs, medians of neighbouring scans."
-_FIGURES = re.compile(r", χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*")  # of one closure; limits stand behind them
+_FIGURES = re.compile(
+    r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
+)  # of one closure; limits stand behind them
 
 
 def chip(course: Course) -> Chip:

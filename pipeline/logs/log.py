@@ -13,7 +13,7 @@ from pipeline.checks import LONGEST_SWEEP_S
 from pipeline.clock import working_s
 from pipeline.config import LogConfig
 from pipeline.data import Pose, Scan, Trajectory
-from pipeline.errors import InputError
+from pipeline.errors import InputError, shown
 from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
 from pipeline.logs.limits import RangeLimits, Returns
@@ -49,6 +49,9 @@ _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
     """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
     named = [sources] if isinstance(sources, Source | str) else sources
+    is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
+    if not is_named or not named:
+        raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 

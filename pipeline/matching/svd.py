@@ -17,7 +17,7 @@ class DegeneratePairsError(ScanchainError):
     """The pairs leave a rotation free: all on one point, or in 3D on one line."""
 
 
-def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64]) -> Pose:
+def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] | None = None) -> Pose:
     """The pose T that minimises Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
 
     With centred x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
@@ -25,7 +25,7 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64])
     (Arun, Huang & Blostein 1987; the determinant after Umeyama 1991, eq. 43; weights after Sorkine-Hornung &
     Rabinovich 2017, eq. 22). Without the determinant noisy or planar points give a reflection.
 
-    source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0
+    source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0, 1 where left out
     Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
     """
     d = 2 if checks.shape(source, "source")[1:] == (2,) else 3
@@ -33,7 +33,7 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64])
     target = checks.points(target, "target", d)
     if len(target) != len(source):
         raise InputError(f"target has {len(target)} points, source {len(source)}; wanted pairs, row by row")
-    weight = checks.weights(weight, "weight", len(source))
+    weight = np.ones(len(source)) if weight is None else checks.weights(weight, "weight", len(source))
     total = weight.sum()
     if len(source) < d or total <= 0.0:
         raise DegeneratePairsError(f"{len(source)} pairs of weight {total:g} do not determine a rotation in {d}D")

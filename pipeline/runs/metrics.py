@@ -191,7 +191,7 @@ def _unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
     if np.median(points) < _FEW_POINTS:
         few = f"scans have {np.median(points):.0f} valid points (median)"
         return f"{line}; {few}, as a radar's have: choose a lidar with --topic"
-    return f"{line}; scanchain doctor looks for the cause"
+    return f"{line}: the surroundings leave it open there, or the log is at fault (scanchain doctor)"
 
 
 def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth:
