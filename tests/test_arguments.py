@@ -288,8 +288,8 @@ def folder(tmp_path_factory):
 
 
 def fuzzed(*strategies):
-    """2,000 calls; what is drawn twice is drawn from what is right as often as from what is not."""
-    return lambda test: settings(max_examples=CALLS)(given(*strategies)(test))
+    """2,000 calls, the same each time; what is drawn twice is right as often as it is not."""
+    return lambda test: settings(max_examples=CALLS, derandomize=True)(given(*strategies)(test))
 
 
 def tried(call):

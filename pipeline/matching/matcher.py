@@ -23,7 +23,7 @@ OPTIMISERS = {
     "levenberg-marquardt": LEVENBERG_MARQUARDT,
 }
 
-_MAJORITY = 0.5  # share of the points that must have a correspondence for a pose to be relied on
+_LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _ENDINGS = {
@@ -155,8 +155,8 @@ def _contradiction(answer: Answer, config: MatchingConfig) -> str:
 def _chance(answer: Answer, points: int, target: VoxelMap) -> str:
     """Why so good a fit may be chance, empty if it cannot."""
     freedom, voxel_m = len(answer.information), target.voxels.size_m
-    if answer.pairs < _MAJORITY * points:
-        return f"{answer.pairs} of {points} points have a correspondence: no majority"
+    if answer.pairs < _LEAST_OVERLAP * points:
+        return f"{answer.pairs} of {points} points have a correspondence, fewer than {100 * _LEAST_OVERLAP:.0f} %"
     if answer.on_surfaces < _REDUNDANCY * freedom:
         return (
             f"{answer.on_surfaces} correspondences with a surface, fewer than {_REDUNDANCY} for each of {freedom} "
