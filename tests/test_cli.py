@@ -1032,6 +1032,36 @@ def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, r
     assert (tmp_path / "done.graph").read_text().startswith("VERTEX2 0 ")
 
 
+@pytest.mark.parametrize("name", ["done.g2o", "done.graph", "done_rejected.g2o", "done.marginals.csv", "ring.png"])
+def test_a_full_disk_leaves_the_files_of_an_earlier_answer_as_they_are(call, monkeypatch, tmp_path, ring, name):
+    ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
+    out = tmp_path / ("done.graph" if name == "done.graph" else "done.g2o")
+    words = ["--out", out, "--robust", "truncated", "--marginals", "all", "--png", tmp_path / "ring.png"]
+    assert call("optimize", ring, *words)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    write_bytes = Path.write_bytes
+
+    def fill_up(path, data):
+        if not path.name.startswith(name):
+            return write_bytes(path, data)
+        write_bytes(path, data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fill_up)
+    code, output, errors = call("optimize", ring, *words, "--force")
+    assert (code, output, errors) == (1, "", f"error: {tmp_path / name}: {FULL}\n")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, ring):
+    words = ["optimize", ring, "--graph.max_iterations", "1", "--out", tmp_path / "done.g2o", "--force"]
+    code, output, errors = call(*words)
+    assert (code, errors) == (1, "") and (tmp_path / "done.g2o").exists()
+    says(output, "iterations     1 in", "; DID NOT CONVERGE: 1 iterations reached")
+    code, output, _ = call(*words, "--json")
+    assert code == 1 and json.loads(output)["converged"] is False
+
+
 @pytest.mark.parametrize(("optimiser", "initialise"), [("dogleg", "chordal"), ("newton", "spanning-tree")])
 def test_optimize_takes_an_optimiser_and_a_first_guess(call, ring, optimiser, initialise):
     words = ["--optimiser", optimiser, "--initialise", initialise, "--graph.max_iterations", "99", "--json"]

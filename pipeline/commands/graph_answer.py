@@ -44,7 +44,7 @@ class Answer:
             *self._projected,
             f"first guess    {guess}",
             f"chi2           {self._chi2}",
-            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
+            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {self._ending}",
         ]
         if graph.is_loop.any():
             rest = "; they do not count" if done.rejected.any() else ""
@@ -69,6 +69,12 @@ class Answer:
         if projection is None:
             return []
         return [f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"]
+
+    @property
+    def _ending(self) -> str:
+        """Why the iteration stopped."""
+        done = self.optimisation
+        return done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
 
     @property
     def _chi2(self) -> str:
