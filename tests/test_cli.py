@@ -1018,6 +1018,17 @@ def test_a_chain_has_no_loops_to_check(call, ring):
     says(output, "chi2           no loops to check")
 
 
+def test_loops_that_leave_no_degrees_of_freedom_have_a_chi2_all_the_same(call, ring):
+    lines = [f"EDGE_SE2 {i} {i + 1} 1 0 0 100 0 0 100 0 1000" for i in range(2)]
+    ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
+    says(call("optimize", ring)[1], "chi2           100 before, 33.333333 after, over 1 degrees of freedom")
+    lines[0] = "EDGE_SE2 0 1 1 0 0 100 0 0 100 0 0"
+    ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
+    code, output, _ = call("optimize", ring)
+    says(output, " after, over 0 degrees of freedom")
+    assert code == 0 and "no loops" not in output
+
+
 def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, ring):
     png, rrd = tmp_path / "ring.png", tmp_path / "ring.rrd"
     words = ["--out", tmp_path / "done.graph", "--marginals", "0,2", "--png", png, "--recording", rrd]
@@ -1094,6 +1105,13 @@ def test_optimize_refuses_bad_graphs_in_one_line(refused, tmp_path, ring):
     says(refused("optimize", ring), "2 of 4 poses are not joined to a fixed one")
     ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 x\n")
     says(refused("optimize", ring), "ring.g2o:1: EDGE_SE2: could not convert")
+    ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 a b 1 0 0 1 0 0 1 0 1\n")
+    says(refused("optimize", ring), "ring.g2o:2: EDGE_SE2: vertex id 'a' is not a whole number; write 0, 1")
+    ring.write_text("FIX 99999999999999999999\n")
+    says(
+        refused("optimize", ring),
+        "ring.g2o:1: FIX: vertex id '99999999999999999999' is too large; the limit is 9223",
+    )
 
 
 # as a program
