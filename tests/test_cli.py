@@ -1064,6 +1064,21 @@ def test_a_full_disk_leaves_the_files_of_an_earlier_answer_as_they_are(call, mon
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_recording_that_fails_leaves_the_one_before(call, monkeypatch, tmp_path, ring):
+    words = ["optimize", ring, "--recording", tmp_path / "ring.rrd", "--force"]
+    assert call(*words)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fill_up(_, path):
+        path.write_bytes(b"RRF")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("viz.graph_recording.record_graph", fill_up)
+    code, _, errors = call(*words)
+    assert (code, errors) == (1, f"error: {tmp_path / 'ring.rrd'}: {FULL}\n")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, ring):
     words = ["optimize", ring, "--graph.max_iterations", "1", "--out", tmp_path / "done.g2o", "--force"]
     code, output, errors = call(*words)

@@ -158,7 +158,13 @@ class Outputs:
             with _written(self.picture):
                 viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
-            viewing.record_graph(answer.change, self.recording)
+            new = self.recording.with_name(f"{self.recording.name}.new")
+            with _written(self.recording):
+                try:
+                    viewing.record_graph(answer.change, new)
+                    new.replace(self.recording)
+                finally:
+                    new.unlink(missing_ok=True)
         return written
 
 
