@@ -1018,6 +1018,17 @@ def test_a_chain_has_no_loops_to_check(call, ring):
     says(output, "chi2           no loops to check")
 
 
+def test_loops_that_leave_no_degrees_of_freedom_have_a_chi2_all_the_same(call, ring):
+    lines = [f"EDGE_SE2 {i} {i + 1} 1 0 0 100 0 0 100 0 1000" for i in range(2)]
+    ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
+    says(call("optimize", ring)[1], "chi2           100 before, 33.333333 after, over 1 degrees of freedom")
+    lines[0] = "EDGE_SE2 0 1 1 0 0 100 0 0 100 0 0"
+    ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
+    code, output, _ = call("optimize", ring)
+    says(output, " after, over 0 degrees of freedom")
+    assert code == 0 and "no loops" not in output
+
+
 def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, ring):
     png, rrd = tmp_path / "ring.png", tmp_path / "ring.rrd"
     words = ["--out", tmp_path / "done.graph", "--marginals", "0,2", "--png", png, "--recording", rrd]
@@ -1030,6 +1041,51 @@ def test_optimize_writes_covariances_a_picture_and_a_recording(call, tmp_path, r
     assert float(rows[1][1]) == 0.0 and 0.0 < float(rows[2][1]) < 0.02
     assert png.read_bytes().startswith(b"\x89PNG") and rrd.read_bytes().startswith(b"RRF")
     assert (tmp_path / "done.graph").read_text().startswith("VERTEX2 0 ")
+
+
+@pytest.mark.parametrize("name", ["done.g2o", "done.graph", "done_rejected.g2o", "done.marginals.csv", "ring.png"])
+def test_a_full_disk_leaves_the_files_of_an_earlier_answer_as_they_are(call, monkeypatch, tmp_path, ring, name):
+    ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
+    out = tmp_path / ("done.graph" if name == "done.graph" else "done.g2o")
+    words = ["--out", out, "--robust", "truncated", "--marginals", "all", "--png", tmp_path / "ring.png"]
+    assert call("optimize", ring, *words)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    write_bytes = Path.write_bytes
+
+    def fill_up(path, data):
+        if not path.name.startswith(name):
+            return write_bytes(path, data)
+        write_bytes(path, data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fill_up)
+    code, output, errors = call("optimize", ring, *words, "--force")
+    assert (code, output, errors) == (1, "", f"error: {tmp_path / name}: {FULL}\n")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_recording_that_fails_leaves_the_one_before(call, monkeypatch, tmp_path, ring):
+    words = ["optimize", ring, "--recording", tmp_path / "ring.rrd", "--force"]
+    assert call(*words)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fill_up(_, path):
+        path.write_bytes(b"RRF")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("viz.graph_recording.record_graph", fill_up)
+    code, _, errors = call(*words)
+    assert (code, errors) == (1, f"error: {tmp_path / 'ring.rrd'}: {FULL}\n")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, ring):
+    words = ["optimize", ring, "--graph.max_iterations", "1", "--out", tmp_path / "done.g2o", "--force"]
+    code, output, errors = call(*words)
+    assert (code, errors) == (1, "") and (tmp_path / "done.g2o").exists()
+    says(output, "iterations     1 in", "; DID NOT CONVERGE: 1 iterations reached")
+    code, output, _ = call(*words, "--json")
+    assert code == 1 and json.loads(output)["converged"] is False
 
 
 @pytest.mark.parametrize(("optimiser", "initialise"), [("dogleg", "chordal"), ("newton", "spanning-tree")])
@@ -1064,6 +1120,13 @@ def test_optimize_refuses_bad_graphs_in_one_line(refused, tmp_path, ring):
     says(refused("optimize", ring), "2 of 4 poses are not joined to a fixed one")
     ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 x\n")
     says(refused("optimize", ring), "ring.g2o:1: EDGE_SE2: could not convert")
+    ring.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 a b 1 0 0 1 0 0 1 0 1\n")
+    says(refused("optimize", ring), "ring.g2o:2: EDGE_SE2: vertex id 'a' is not a whole number; write 0, 1")
+    ring.write_text("FIX 99999999999999999999\n")
+    says(
+        refused("optimize", ring),
+        "ring.g2o:1: FIX: vertex id '99999999999999999999' is too large; the limit is 9223",
+    )
 
 
 # as a program

@@ -249,6 +249,23 @@ def test_a_graph_without_contradictions_is_optimal_whatever_the_rounding():
     assert certificate.verdict == "globally optimal: χ² is zero"
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_minimum_and_its_certificate_do_not_depend_on_the_unit_of_the_information(dimension):
+    of_all, poses = [], []
+    for unit in (1.0, 1e-6, 1e-12):
+        ring, graph = closed_ring(dimension, 40, 0, 0.1), PoseGraph(dimension)
+        for k, pose in enumerate(ring.poses):
+            graph.add_pose(pose, k)
+        graph.add_edges(ring.edges, ring.measurements, unit * ring.information, ring.is_loop)
+        answer, certificate = graph.optimise(PLAIN, initialise="given"), graph.certify()
+        assert answer.converged and answer.chi2_after < 0.9 * answer.chi2_before
+        assert certificate.certified and not certificate.is_zero and certificate.relative_gap < 1e-3
+        of_all.append(answer.chi2_after / unit)
+        poses.append(graph.poses)
+    assert of_all == pytest.approx([of_all[0]] * 3, rel=1e-6)
+    assert np.abs(np.array(poses) - poses[0]).max() < 1e-5
+
+
 def test_an_unfinished_answer_has_a_wider_gap():
     graph = read_g2o(shared_data("graphs/sphere2500.g2o")).graph
     best = graph.optimise(GraphConfig(robust="none")).chi2_after

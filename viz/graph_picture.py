@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import GraphState, fit_text
-from pipeline.errors import InputError
 from pipeline.graph.optimisation import GraphChange
+from pipeline.runs.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,21 +22,24 @@ _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right 
 
 
 def draw_graph(change: GraphChange, path: Path) -> None:
-    """Draw it to a PNG: from above in 2D, obliquely in 3D; every panel in its own frame and scale."""
+    """Draw it to a PNG: from above in 2D, obliquely in 3D; every panel in its own frame and scale.
+
+    Raises OSError.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.0 * _PANEL_INCHES, _PANEL_INCHES), layout="constrained")
     panels = figure.subplots(1, 2)
     for axes, state, when in zip(panels, (change.before, change.after), ("before", "after"), strict=True):
         _draw_state(axes, state)
-        fit = fit_text(state.chi2, state.degrees_of_freedom, int(state.is_rejected.sum()), "edges")
+        rejected = int(state.is_rejected.sum())
+        fit = fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=change.has_loops)
         axes.set_title(f"{change.name} {when}\n{fit}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    try:
-        figure.savefig(path, dpi=150, facecolor="white")
-    except OSError as error:
-        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+    picture = BytesIO()
+    figure.savefig(picture, dpi=150, facecolor="white", format="png")
+    write_whole(path, picture.getvalue())
 
 
 def _draw_state(axes: Axes, state: GraphState) -> None:

@@ -44,7 +44,7 @@ class Answer:
             *self._projected,
             f"first guess    {guess}",
             f"chi2           {self._chi2}",
-            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {done.reason}",
+            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {self._ending}",
         ]
         if graph.is_loop.any():
             rest = "; they do not count" if done.rejected.any() else ""
@@ -71,10 +71,16 @@ class Answer:
         return [f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"]
 
     @property
+    def _ending(self) -> str:
+        """Why the iteration stopped."""
+        done = self.optimisation
+        return done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
+
+    @property
     def _chi2(self) -> str:
         """Of the edges in force, with how many degrees of freedom."""
         done, degrees = self.optimisation, self.optimisation.state.degrees_of_freedom
-        if degrees == 0:
+        if degrees == 0 and not self.change.has_loops:
             return fit_text(done.chi2_after, degrees, 0)
         return f"{done.chi2_before:.6g} before, {done.chi2_after:.8g} after, over {degrees:,} degrees of freedom"
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -13,7 +14,7 @@ import click
 from pipeline.commands.graph_answer import Answer
 from pipeline.commands.outputs import check_output
 from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.errors import InputError
+from pipeline.errors import InputError, told
 from pipeline.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -76,7 +77,8 @@ def optimize(
 
     GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
     below. Edges that --robust rejects count in no χ²: --out FILE.g2o holds the edges in force, each with its
-    robust weight in its information matrix, and FILE_rejected.g2o the rejected ones, if there are any.
+    robust weight in its information matrix, and FILE_rejected.g2o the rejected ones, if there are any. Poses that
+    did not converge are written all the same, and the exit code is 1.
 
     \b
     Examples:
@@ -94,6 +96,8 @@ def optimize(
     answer = _solved(file, source.name, config, cast("Initialisation", initialise))
     written = outputs.write(answer, ctx.obj)
     click.echo(answer.json(written) if as_json else answer.text(written))
+    if not answer.optimisation.converged:
+        ctx.exit(1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,18 +143,41 @@ class Outputs:
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
         written = self.paths
         if self.graph is not None and self.rejected is not None:
-            write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
-            self.rejected.unlink(missing_ok=True)  # of an earlier answer, whose place --force gave away
-            if file.graph.is_rejected.any():
-                write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
-                written.insert(1, self.rejected)
+            with _written(self.graph):
+                write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+            with _written(self.rejected):
+                if file.graph.is_rejected.any():
+                    write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
+                    written.insert(1, self.rejected)
+                else:  # of an earlier answer, whose place --force gave away
+                    self.rejected.unlink(missing_ok=True)
         if self.table is not None:
-            write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
+            with _written(self.table):
+                write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
-            viewing.draw_graph(answer.change, self.picture)
+            with _written(self.picture):
+                viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
-            viewing.record_graph(answer.change, self.recording)
+            new = self.recording.with_name(f"{self.recording.name}.new")
+            with _written(self.recording):
+                try:
+                    viewing.record_graph(answer.change, new)
+                    new.replace(self.recording)
+                finally:
+                    new.unlink(missing_ok=True)
         return written
+
+
+@contextmanager
+def _written(path: Path) -> Generator[None]:
+    """Say which file could not be written, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        if told(error):
+            raise
+        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
 
 
 def _aliases(options: dict[str, str | None]) -> list[Override]:

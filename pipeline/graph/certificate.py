@@ -17,7 +17,7 @@ from pipeline.graph.observability import FreePose, free_text
 from pipeline.graph.soundness import is_connected
 from pipeline.kernels.graph_dual import scatter_dual
 
-_NOTHING = 1e-9  # χ² that is zero but for rounding
+_NOTHING = 1e-9  # χ² that is zero but for rounding; this share of the largest information where that is below 1
 _SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
 
 
@@ -32,6 +32,7 @@ class Certificate:
     chi2 : Σ w eᵀΩe that was certified
     reason : why there is no certificate; empty where there is one
     time_s : wall time
+    is_zero : whether χ² is zero but for rounding
     """
 
     certified: bool
@@ -39,16 +40,17 @@ class Certificate:
     chi2: float
     reason: str
     time_s: float
+    is_zero: bool = False
 
     @property
     def relative_gap(self) -> float:
         """The gap as a share of χ², 0 to 1; 0 where χ² is zero."""
-        return self.gap / self.chi2 if self.chi2 > _NOTHING else 0.0
+        return 0.0 if self.is_zero else self.gap / self.chi2
 
     @property
     def verdict(self) -> str:
         """One line for people."""
-        if self.certified and self.chi2 < _NOTHING:
+        if self.certified and self.is_zero:
             return "globally optimal: χ² is zero"
         if self.certified:
             return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
@@ -77,10 +79,11 @@ def certify(
     kept = weights > 0.0
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
+    is_zero = chi2 <= _NOTHING * min(float(problem.information.max(initial=0.0)), 1.0)
     if free:
-        return Certificate(False, chi2, chi2, free_text(free), working_s() - begin)
-    if chi2 < _NOTHING:
-        return Certificate(True, chi2, chi2, "", working_s() - begin)
+        return Certificate(False, chi2, chi2, free_text(free), working_s() - begin, is_zero)
+    if is_zero:
+        return Certificate(True, chi2, chi2, "", working_s() - begin, is_zero)
     if len(poses) - len(problem.free) > 1:
         reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)

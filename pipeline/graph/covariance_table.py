@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
+from pipeline.runs.whole_file import write_whole
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 
@@ -32,13 +34,14 @@ def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
 def write_covariances(path: Path, ids: NDArray[np.int64], covariances: Matrix) -> None:
     """Write a CSV file, a line a pose: its id and the upper triangle of its covariance (K, k, k).
 
-    Of twists in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad².
+    Of twists in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad². Raises OSError.
     """
     names = _NAMES[covariances.shape[-1]]
     upper = np.triu_indices(len(names))
     header = ["id", *(f"{names[a]}_{names[b]}" for a, b in zip(*upper, strict=True))]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for name, row in zip(ids.tolist(), covariances[:, upper[0], upper[1]].tolist(), strict=True):
-            writer.writerow([name, *row])
+    file = io.StringIO(newline="")
+    writer = csv.writer(file)
+    writer.writerow(header)
+    for name, row in zip(ids.tolist(), covariances[:, upper[0], upper[1]].tolist(), strict=True):
+        writer.writerow([name, *row])
+    write_whole(path, file.getvalue().encode())

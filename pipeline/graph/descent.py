@@ -35,11 +35,12 @@ class Descent(Generic[E]):
 def descend(landscape: Landscape[E], now: E, rule: StepRule, max_iterations: int, tolerance: float) -> Descent[E]:
     """Go downhill; done where the relative change of χ², every entry of the gradient or the step is that small.
 
-    Entries of the gradient count in units of their own curvature.
+    Entries of the gradient count in units of their own curvature; the largest counts as 1 where all are below.
     """
     for iteration in range(max_iterations):
         model = landscape.model(now)
-        if np.all(np.abs(model.gradient) <= tolerance * np.sqrt(np.maximum(model.diagonal, 1e-300))):
+        unit = np.sqrt(min(model.diagonal.max(initial=0.0), 1.0))
+        if np.all(np.abs(model.gradient) <= unit * tolerance * np.sqrt(np.maximum(model.diagonal, 1e-300))):
             return Descent(now, iteration, True, "gradient below the tolerance")
         start = now
         move = rule.move(now, model, lambda step, start=start: landscape.moved(start, step))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
-from pipeline.errors import InputError
+from pipeline.errors import InputError, shown
 from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
 
 VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
@@ -18,6 +18,7 @@ EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 POINT, SIGHTING = "VERTEX_XY", "EDGE_SE2_XY"
 POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
 TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
+_LARGEST_ID = 2**63 - 1  # int64
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, r
     if len(words) != 1 + ids + numbers:
         raise InputError(f"{path}:{number}: {words[0]} has {len(words) - 1} values, needs {ids + numbers}")
     try:
-        rows.ids.append([int(word) for word in words[1 : 1 + ids]])
+        rows.ids.append([_vertex_id(word) for word in words[1 : 1 + ids]])
         values = [float(word) for word in words[1 + ids :]]
     except ValueError as error:
         raise InputError(f"{path}:{number}: {words[0]}: {error}") from error
@@ -129,3 +130,14 @@ def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, r
         raise InputError(f"{path}:{number}: {words[0]} has a value that is not finite; remove or mend the line")
     rows.numbers.append(values)
     rows.lines.append(number)
+
+
+def _vertex_id(word: str) -> int:
+    """Raises ValueError."""
+    try:
+        value = int(word)
+    except ValueError:
+        raise ValueError(f"vertex id {shown(word)} is not a whole number; write 0, 1, 2, ...") from None
+    if abs(value) > _LARGEST_ID:
+        raise ValueError(f"vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
+    return value

@@ -15,6 +15,7 @@ from pipeline.errors import InputError
 from pipeline.graph.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
 from pipeline.graph.pose_graph import PoseGraph
 from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
+from pipeline.runs.whole_file import write_whole
 
 TORO_SUFFIXES = (".graph", ".toro")
 
@@ -30,12 +31,9 @@ def write_graph(
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
 ) -> None:
-    """Write a g2o file, or a TORO one where the name ends in .graph or .toro."""
+    """Write a g2o file, or a TORO one where the name ends in .graph or .toro. Raises OSError."""
     write = write_toro if path.suffix in TORO_SUFFIXES else write_g2o
-    try:
-        write(path, graph, ids=ids, other_lines=other_lines, edges=edges)
-    except OSError as error:
-        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+    write(path, graph, ids=ids, other_lines=other_lines, edges=edges)
 
 
 def rejected_path(path: Path) -> Path:
@@ -101,7 +99,7 @@ def write_toro(
 
 
 def _write(path: Path | str, lines: list[str]) -> None:
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(Path(path), "\n".join([*lines, ""]).encode())
 
 
 def _numbers(poses: Matrix) -> Matrix:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import GraphState
 from pipeline.graph.initialise import Initialisation
+from pipeline.graph.soundness import has_loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +19,11 @@ class GraphChange:
     name: str
     before: GraphState
     after: GraphState
+
+    @property
+    def has_loops(self) -> bool:
+        """Whether an edge in force joins poses that the others join already."""
+        return has_loop(self.after.edges[~self.after.is_rejected], len(self.after.poses))
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,9 +77,19 @@ def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
 
 def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Poses that no chain of edges joins to a fixed one."""
-    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(fixed), len(fixed)))
-    _, part = connected_components(links, directed=False)
+    _, part = _parts(edges, len(fixed))
     return np.flatnonzero(~np.isin(part, part[fixed]))
+
+
+def has_loop(edges: NDArray[np.int64], pose_count: int) -> bool:
+    """Whether the edges are more than it takes to join what they join."""
+    return len(edges) > pose_count - _parts(edges, pose_count)[0]
+
+
+def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.int32]]:
+    """How many parts the edges leave the poses in, and the part of each pose."""
+    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(pose_count, pose_count))
+    return connected_components(links, directed=False)
 
 
 def listed(names: NDArray[np.int64]) -> str:
