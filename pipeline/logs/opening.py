@@ -17,6 +17,7 @@ from pipeline.logs.index import index_file
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.remote import RemoteFile
 from pipeline.logs.remote_index import index_by_summary
+from pipeline.logs.sizes import misspelled
 from pipeline.logs.whole import fetch_whole
 from pipeline.source import Source
 
@@ -39,6 +40,9 @@ def index_files(sources: Sequence[Source], rate_hz: float = 0.0) -> list[FileInd
     if not sources:
         raise InputError("no log was named; give at least one file or folder")
     files = [part for source in sources for part in _parts(source)]
+    for each in files:
+        if complaint := misspelled(each):
+            raise InputError(complaint)
     indexes = [_index(source, number, rate_hz) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
@@ -83,7 +87,7 @@ def _other_parts(source: Source) -> list[str]:
     parts = _parts(source)
     if not isinstance(source, Path) or source in parts or (source / "metadata.yaml").is_file():
         return []
-    return left_out(source, parts[0].suffix, (*_PART_SUFFIXES, *SUFFIXES))
+    return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))
 
 
 def _indexer(path: Path, rate_hz: float) -> Indexer:
