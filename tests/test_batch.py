@@ -150,6 +150,57 @@ def test_logs_that_are_damaged_absent_or_slow_are_rows(drawers, tmp_path):
     assert rows["log_03.mcap"]["state"] == "done"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes there")
+def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, tmp_path, capfd):
+    content = (drawers / "log_00.mcap").read_bytes()
+    bad = tmp_path / os.fsdecode(b"bad\xff.mcap")
+    bad.write_bytes(content)
+    (tmp_path / os.fsdecode(b"parts\xff")).mkdir()
+    (tmp_path / os.fsdecode(b"parts\xff") / "part.mcap").write_bytes(content)
+    for name in (bad, bad.with_name(os.fsdecode(b"parts\xff"))):
+        assert main(["run", str(name), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+        errors = capfd.readouterr()[1]
+        assert errors.startswith(f"error: {tmp_path}/") and errors.count("\n") == 1
+        assert "\\xff" in errors and errors.endswith(": the name is not UTF-8; rename it\n")
+    out = tmp_path / "out"
+    logs = [str(bad), str(bad.with_name(os.fsdecode(b"parts\xff"))), str(drawers / "log_01.mcap")]
+    assert main(["batch", *logs, "--out", str(out)]) == 1
+    rows = table(out)
+    assert [row["state"] for row in rows.values()] == ["failed", "failed", "done"]
+    assert rows["bad\\xff.mcap"]["reason"] == f"{tmp_path}/bad\\xff.mcap: the name is not UTF-8; rename it"
+    assert "bad\\xff.mcap" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_path, capfd):
+    content = (drawers / "log_00.mcap").read_bytes()
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out"
+    cut.write_bytes(content[:-20])
+    assert main(["batch", str(cut), str(drawers / "log_01.mcap"), "--out", str(out)]) == 0
+    rows, (output, _) = table(out), capfd.readouterr()
+    metrics = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())
+    assert rows["cut.mcap"]["warnings"] == len(metrics["warnings"]) > 0 == rows["log_01.mcap"]["warnings"]
+    assert f"warned         {cut}: {metrics['warnings'][0]}" in output and "in 1 log" in output
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert f'<td class="bad">{len(metrics["warnings"])}</td>' in page
+
+
+def test_a_log_that_fails_is_not_blamed_on_another_of_the_same_contents(tmp_path):
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "empty.mcap").touch()
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(b"no log at all")
+    out = tmp_path / "out"
+    logs = [str(tmp_path / f"{name}.mcap") for name in ("folder", "empty", "a", "b")]
+    assert main(["batch", *logs, "--out", str(out)]) == 1
+    reasons = {name: row["reason"] for name, row in table(out).items()}
+    for name in ("folder.mcap", "empty.mcap"):
+        assert reasons[name].startswith(f"{tmp_path / name}: ")
+    assert "is a folder" in reasons["folder.mcap"] and "is a folder" not in reasons["empty.mcap"]
+    one, other = sorted(("a.mcap", "b.mcap"), key=lambda name: reasons[name].startswith("has the contents"))
+    assert reasons[one].startswith(f"{tmp_path / one}: is no log")
+    assert reasons[other] == f"has the contents of {tmp_path / one}: {reasons[one]}"
+
+
 def test_a_wrong_configuration_ends_the_batch_before_any_log(drawers, tmp_path, capfd):
     words = ["batch", str(drawers / "log_00.mcap"), "--out", str(tmp_path / "out"), "--matching.reach", "2"]
     assert main(words) == 2 and not (tmp_path / "out").exists()

@@ -1161,3 +1161,13 @@ print([name for name in ("numba", "scipy", "pyarrow", "rerun") if name in sys.mo
 """
     answer = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert answer.stderr == "[]\n"
+
+
+def test_info_and_convert_take_the_short_option_that_the_error_names(call, tmp_path):
+    said = [scan_said(STAMP_NS, laser_scan(STAMP_NS, [1.0] * 9), topic) for topic in ("/front", "/rear")]
+    path = write(tmp_path / "two.mcap", said)
+    says(call("info", path)[1], "choose one with --topic")
+    code, output, _ = call("info", path, "--topic", "/rear")
+    assert code == 0 and "lidar     /rear: 2D, 1 scan" in output and "problem" not in output
+    code, output, _ = call("convert", path, tmp_path / "rear.mcap", "--topic", "/rear")
+    assert code == 0 and "/rear" in output and "/front" not in output

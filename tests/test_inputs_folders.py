@@ -12,6 +12,7 @@ from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs import open_log
 from pipeline.logs.formats.cloud_folder import stamp_of_name
+from pipeline.simulate import simulate
 
 
 def read(path, **config):
@@ -341,3 +342,20 @@ def test_the_mounting_of_a_folder_is_not_known_and_taken_as_the_origin(tmp_path)
     xyzi(recorders.clouds(1)[0]).tofile(tmp_path / "1.0.bin")
     log, _ = read(tmp_path)
     np.testing.assert_array_equal(log.T_base_lidar, lie.lift(np.eye(3)))
+
+
+def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
+    np.save(tmp_path / "1.0.npy", swept(0))
+    np.save(tmp_path / "2.0.npy", swept(1))
+    assert not any("left out" in note for note in open_log(tmp_path).notes)
+    (tmp_path / "1.5.pcd").write_text(PCD.format(count=3, form="ascii") + "1 2 3\n" * 3)
+    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
+    assert note.startswith(f"{tmp_path}: only its .pcd files are read, left out are 2 .npy;")
+
+
+def test_a_folder_of_parts_of_a_log_says_which_other_files_it_left_out(tmp_path):
+    simulate("office", tmp_path / "part.mcap", duration_s=1.0)
+    np.save(tmp_path / "1.0.npy", swept(0))
+    (tmp_path / "notes.txt").touch()
+    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
+    assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .npy;")

@@ -223,6 +223,11 @@ def test_a_run_that_the_user_stops_is_whole_up_to_there_and_marked_partial(tmp_p
     assert {"graph.g2o", "map.ply", "metrics.json"} <= set(names(finished.path))
 
 
+def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office):
+    text = run(job(office, tmp_path / "a"), _record, Watcher(20)).summary
+    assert "(wheels /odom; lidar at" in text and "not used" not in text
+
+
 def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_path, office):
     with pytest.raises(
         PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then"

@@ -5,19 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from hashlib import sha256 as hashed
 from pathlib import Path
 from threading import Event
 from typing import Protocol
+
+import msgspec
 
 from pipeline.batch.attempt import attempt
 from pipeline.batch.table import write_table
 from pipeline.batch.task import Row, State, Task, finished_row, key_of, unfinished_row
 from pipeline.errors import InputError
+from pipeline.logs.sizes import misspelled, spelled
 from pipeline.memory import available_mib
 from pipeline.runs.provenance import identity_of
 from pipeline.settings import Override
-from pipeline.source import Source
+from pipeline.source import Source, source_of
+from pipeline.words import counted
 
+_SHA256_OF_NOTHING = hashed().hexdigest()  # of an empty file, and of an empty folder
 _SHARE = 0.75  # of the memory that is free, for all workers together
 
 Work = Callable[[Sequence[Task]], Iterator[Row]]
@@ -101,12 +107,16 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
         for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
             row.write(missing[row.key].row_file)
             rows[row.key] = row
-            progress.say(f"{row.log}: {row.state}{row.reason and f': {row.reason}'}")
+            progress.say(f"{row.log}: {row.state}{row.reason and f': {row.reason}'}{_damage(row)}")
             progress.count(kept + done, len(tasks))
     except KeyboardInterrupt:
         progress.say("stopped")
     table = tuple(_row_of(task, rows) for task in tasks)
     return Batched(table, kept, write_table(batch.out, table))
+
+
+def _damage(row: Row) -> str:
+    return f", {counted(row.warnings, 'warning')}" if row.warnings else ""
 
 
 def _tasks(batch: Batch) -> list[Task]:
@@ -115,12 +125,14 @@ def _tasks(batch: Batch) -> list[Task]:
         memory_mib = _SHARE * available_mib() / batch.workers
     tasks = []
     for log in batch.logs:
-        sha256 = identity_of(log)
+        sha256 = "" if misspelled(log) else identity_of(log)
+        path = str(log.absolute()) if isinstance(log, Path) else log.url
+        is_told_by_contents = sha256 not in ("", _SHA256_OF_NOTHING)
         tasks.append(
             Task(
-                log=str(log.absolute()) if isinstance(log, Path) else log.url,
+                log=path,
                 sha256=sha256,
-                key=key_of(sha256 or str(log), batch.config_file, batch.overrides),
+                key=key_of(sha256 if is_told_by_contents else spelled(path), batch.config_file, batch.overrides),
                 out=str(batch.out),
                 arguments=batch.arguments,
                 time_s=batch.time_s,
@@ -135,7 +147,11 @@ def _row_of(task: Task, rows: dict[str, Row]) -> Row:
     """The row of a task: its own, that of a log with the same contents, or why there is none."""
     if task.key in rows:
         row = rows[task.key]
+        if row.log != task.name and not row.state.has_result:
+            row = msgspec.structs.replace(row, reason=f"has the contents of {row.log}: {row.reason}")
         return Row(task.name, *(getattr(row, name) for name in row.__struct_fields__[1:]))
+    if complaint := misspelled(source_of(task.log)):
+        return unfinished_row(task, State.FAILED, complaint)
     if not task.sha256:
         return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} says why")
     return unfinished_row(task, State.NOT_RUN, "stopped by the user")

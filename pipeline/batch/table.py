@@ -36,11 +36,17 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
     schema = pa.schema(
         [(name, pa.string()) for name in ("log", "sha256", "key", "run", "state", "reason")]
-        + [("tries", pa.int64()), ("duration_s", pa.float64()), ("peak_mib", pa.float64())]
+        + [
+            ("warnings", pa.int64()),
+            ("tries", pa.int64()),
+            ("duration_s", pa.float64()),
+            ("peak_mib", pa.float64()),
+        ]
         + [(name, pa.int64()) for name in _NUMBERS]
         + [(name, pa.float64()) for name in (*_FIGURES, *_ERRORS, "odometry_ate_rmse_m")]
     )
     notes = {
+        "warnings": "lines in the run's metrics.json on what was lost, left out or is wrong",
         "run": "directory of the result, beside this file; empty where there is none",
         "duration_s, peak_mib": "of the whole process of the last try",
         "ate_*, kitti_*": "against the ground truth in the log, after optimisation; null without any",
@@ -55,9 +61,10 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """How many ended how, what all results amount to, and each log without one."""
+    """How many ended how, what all results amount to, each log without one, and each with warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
     lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
+    lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
     return "\n".join(lines) + "\n"
 
 
@@ -66,7 +73,14 @@ def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
     counts = Counter(row.state for row in rows)
     ended = ", ".join(f"{counts[state]:,} {state}" for state in State if counts[state])
     results = [row.metrics for row in rows if row.metrics is not None]
-    return [("logs", f"{len(rows):,}: {ended}"), *(_amounts(results) if results else ())]
+    warned = sum(bool(row.warnings) for row in rows)
+    warnings = [("warnings", f"in {counted(warned, 'log')}, listed in summary.txt")] if warned else []
+    return [("logs", f"{len(rows):,}: {ended}"), *warnings, *(_amounts(results) if results else ())]
+
+
+def _first_warning(row: Row) -> str:
+    first = "" if row.metrics is None else row.metrics.warnings[0]
+    return first + (f" (and {row.warnings - 1:,} more)" if row.warnings > 1 else "")
 
 
 def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
@@ -90,7 +104,8 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
 def _cells(row: Row) -> dict[str, object]:
     metrics = row.metrics
     cells: dict[str, object] = {
-        name: getattr(row, name) for name in ("log", "sha256", "key", "run", "reason", "tries", "duration_s")
+        name: getattr(row, name)
+        for name in ("log", "sha256", "key", "run", "reason", "warnings", "tries", "duration_s")
     }
     cells |= {"state": str(row.state), "peak_mib": row.peak_mib}
     if metrics is None:

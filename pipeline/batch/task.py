@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from pipeline.logs.sizes import spelled
 from pipeline.runs.metrics import Metrics
 from pipeline.runs.provenance import package_version
 from pipeline.settings import Override, dump, load_settings
@@ -58,8 +59,8 @@ class Task(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The log as it is called in what is written: an address without the keys in it."""
-        return str(source_of(self.log))
+        """The log as it is called in what is written: an address without the keys in it, spelled as text."""
+        return spelled(str(source_of(self.log)))
 
     @property
     def run(self) -> Path:
@@ -90,6 +91,11 @@ class Row(Struct, frozen=True):
     duration_s: float
     peak_mib: float
     metrics: Metrics | None
+
+    @property
+    def warnings(self) -> int:
+        """How many lines its run says of what was lost, left out or is wrong."""
+        return 0 if self.metrics is None else len(self.metrics.warnings)
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""

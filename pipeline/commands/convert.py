@@ -20,11 +20,18 @@ _KEYS = tuple(f"log.{name}" for name in ("rate_hz", "topic", "start_s", "end_s",
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
 @click.option("--rate", metavar="HZ", help="Short for --log.rate_hz.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic, to keep one of several lidars.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def convert(
-    ctx: click.Context, source: Source, destination: Path, rate: str | None, force: bool, as_json: bool
+    ctx: click.Context,
+    source: Source,
+    destination: Path,
+    rate: str | None,
+    topic: str | None,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Write a log of another format as MCAP. The other commands take all of these as they are, too.
 
@@ -40,7 +47,7 @@ def convert(
       a folder of clouds  PCD, PLY, .npy or .bin of rows x y z (intensity ...), named by their stamps, or with
                           --log.rate_hz
 
-    Messages stay as they are. Keys that choose some: --log.topic (one of several lidars), --log.start_s,
+    Messages stay as they are. Keys that choose some: --topic (one of several lidars), --log.start_s,
     --log.end_s, --log.every.
 
     \b
@@ -51,7 +58,7 @@ def convert(
       scanchain convert drive.bag minute.mcap --log.start_s 60 --log.end_s 120
       scanchain convert drive.bag drive.mcap --json
     """
-    chosen = overrides(ctx, alias("log.rate_hz", rate, "--rate"))
+    chosen = overrides(ctx, [*alias("log.rate_hz", rate, "--rate"), *alias("log.topic", topic, "--topic")])
     for override in chosen:
         if override.key not in _KEYS:
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, overrides
+from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.settings import load_settings
 from pipeline.source import Source
 from pipeline.words import counted
@@ -21,21 +21,23 @@ if TYPE_CHECKING:
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
+def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
     """Print what is in a log: topics, types, rates, and what a run with the same flags would use.
 
     \b
     Examples:
       scanchain info log.mcap
       scanchain info part_0.mcap part_1.mcap --json
-      scanchain info drive.bag --log.topic /lidar_front/points
+      scanchain info drive.bag --topic /lidar_front/points
       scanchain info https://host/log.mcap
     """
     from pipeline.logs.info import describe
 
-    description = describe(logs, load_settings(overrides=overrides(ctx)).config.log)
+    chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
+    description = describe(logs, load_settings(overrides=chosen).config.log)
     click.echo(json.dumps(asdict(description), indent=2) if as_json else _text(description))
 
 

@@ -66,7 +66,7 @@ class Log:
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
     odometry_topic : whose poses the scans carry, empty where there is none
-    scans_with_wheels : how many scans had a reading of the wheels near; counted once ``scans`` is through
+    scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     damage : what could not be read; complete once ``scans`` is through
     """
@@ -137,6 +137,7 @@ class Log:
             Tally(self.topic, self.odometry_topic),
         )
         times = PointTimes(self.config)
+        self.scans_with_wheels = 0
         count, index, asked = 0, 0, working_s()
         for message, beside in self._with_poses(poses, times):
             count += 1
@@ -149,11 +150,11 @@ class Log:
                 continue
             scan = self._scan(index, message, beside, waited_s=working_s() - asked)
             tally.take(scan)
+            self.scans_with_wheels += scan.T_odom_base is not None
             yield scan
             index += 1
             asked = working_s()
         self._truth = poses.ground_truth()
-        self.scans_with_wheels = index - tally.without_wheels
         self.damage += [*tally.losses(), *poses.complaints()]
         self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:

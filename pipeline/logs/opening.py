@@ -12,11 +12,12 @@ from pipeline.logs.formats.carmen import index_carmen
 from pipeline.logs.formats.cloud_file import SUFFIXES
 from pipeline.logs.formats.cloud_folder import index_clouds
 from pipeline.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
-from pipeline.logs.formats.made import natural_order
+from pipeline.logs.formats.made import left_out, natural_order
 from pipeline.logs.index import index_file
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.remote import RemoteFile
 from pipeline.logs.remote_index import index_by_summary
+from pipeline.logs.sizes import misspelled
 from pipeline.logs.whole import fetch_whole
 from pipeline.source import Source
 
@@ -39,9 +40,13 @@ def index_files(sources: Sequence[Source], rate_hz: float = 0.0) -> list[FileInd
     if not sources:
         raise InputError("no log was named; give at least one file or folder")
     files = [part for source in sources for part in _parts(source)]
+    for each in files:
+        if complaint := misspelled(each):
+            raise InputError(complaint)
     indexes = [_index(source, number, rate_hz) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
+    indexes[0].notes += [note for source in sources for note in _other_parts(source)]
     return indexes
 
 
@@ -75,6 +80,14 @@ def _parts(source: Source) -> Sequence[Source]:
         if parts:
             return parts
     return [path]
+
+
+def _other_parts(source: Source) -> list[str]:
+    """A note on what lies beside the parts of a log and is none."""
+    parts = _parts(source)
+    if not isinstance(source, Path) or source in parts or (source / "metadata.yaml").is_file():
+        return []
+    return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))
 
 
 def _indexer(path: Path, rate_hz: float) -> Indexer:

@@ -122,7 +122,7 @@ def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
     try:
         for file in files_of(path):
             if path.is_dir():
-                digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+                digest.update(os.fsencode(file.relative_to(path).as_posix()) + b"\0")
             with file.open("rb") as stream:
                 while block := stream.read(_BLOCK):
                     if cancelled is not None and cancelled.is_set():

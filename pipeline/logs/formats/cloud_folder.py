@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.logs.formats.cloud_file import SUFFIXES, raw_point, read_cloud_file
-from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
+from pipeline.logs.formats.made import left_out, made_block, made_channel, made_index, natural_order
 from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import LATEST_NS, pack_cloud
 from pipeline.logs.records import Block, Contents, FileIndex, Message
@@ -32,7 +32,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
     index = made_index(folder, number)
     index.takes_rate = True
     raw = _raw_point(folder, files)
-    index.notes += _found(folder, files, raw)
+    index.notes += [*_found(folder, files, raw), *left_out(folder, files[0].suffix.lower(), SUFFIXES)]
     channel = made_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
         made_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})

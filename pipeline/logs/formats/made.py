@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,3 +40,12 @@ def made_index(path: Path, number: int) -> FileIndex:
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
     """Sorts log_2 before log_10."""
     return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name
+
+
+def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
+    """A note on the files of a folder that hold scans, too, but are of other kinds than those taken."""
+    counts = Counter(file.suffix.lower() for file in folder.iterdir() if file.is_file())
+    others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != taken)
+    if not others:
+        return []
+    return [f"{folder}: only its {taken} files are read, left out are {others}; give those a folder of their own"]
