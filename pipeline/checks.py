@@ -1,7 +1,7 @@
 """Arguments of public functions, checked where they enter: converted where nothing is lost, else one clear error.
 
 Each function returns its argument as the kernels take it, C-contiguous, writeable and of one dtype (another layout
-would be compiled for anew), or raises an InputError that names the argument, what came and what is wanted.
+would be compiled separately), or raises an InputError that names the argument, what came and what is wanted.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def _is_ready(value: object, dtype: DTypeLike) -> bool:
 
 
 def _remedy(array: NDArray[Any], name: str, d: int) -> str:
-    """What would make an array of another shape fit."""
+    """Hint for an array of another shape, empty where there is none."""
     if array.ndim == 2 and array.shape[1] > d and array.shape[0] != d:
         return f"; of more columns, as with intensity, pass {name}[:, :{d}]"
     if array.ndim == 2 and array.shape[0] == d:

@@ -75,6 +75,8 @@ def _warnings(table: Table) -> Iterator[str]:
     for row in table.rows:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
+        if row.doubt:
+            yield f"{row.name} is unreliable: {row.doubt}"
 
 
 def _figures(table: Table, courses: Sequence[Course]) -> Iterator[Section]:

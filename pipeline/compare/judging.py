@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.compare.figures import Figures
 from pipeline.compare.outcome import STEPS_FILE, Outcome
-from pipeline.data import Matrix, Pose, Trajectory
+from pipeline.data import Matrix, Pose, State, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate import (
     RelationError,
@@ -27,6 +28,7 @@ from pipeline.evaluate import (
     relative_error_over_time,
 )
 from pipeline.runs.consistency import COLUMNS, nees_of_steps
+from pipeline.runs.metrics import unreliable
 
 Answer = TypeVar("Answer")
 
@@ -88,6 +90,15 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
     if not path.exists():
         return np.empty(0)
     return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
+
+
+def doubt(outcome: Outcome) -> str:
+    """Why a method of ours is not reliable by its own account; empty where it is, or where it does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return ""
+    table = pq.read_table(path, columns=["state", "scan_points"])
+    return unreliable(Counter(map(State, table["state"].to_pylist())), table["scan_points"].to_pylist())
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.baselines import BASELINES
 from pipeline.compare.evidence import Evidence
 from pipeline.compare.figures import Figures
-from pipeline.compare.judging import representative
+from pipeline.compare.judging import doubt, representative
 from pipeline.compare.maps import sharpness_of
 from pipeline.compare.methods import Method
 from pipeline.compare.outcome import EndReport, Status
@@ -66,6 +66,7 @@ def _row(evidence: Evidence, method: Method, sharp: Sharpness | None, apart_m: n
         status=end.status,
         reason=end.reason,
         description=representative(outcomes).report.description,
+        doubt=doubt(representative(outcomes)),
         settings=method.settings,
         figures=figures,
         definitions=list(judged.definitions),

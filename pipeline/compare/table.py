@@ -26,6 +26,7 @@ class Row(Struct, frozen=True):
     status, reason : of the first run that did not end well, else ok
     settings : whole, as a TOML file for --settings would hold them
     definitions : what its errors are, in words
+    doubt : why it is not reliable by its own account, as most of its scans are degenerate; empty else
     """
 
     name: str
@@ -36,6 +37,7 @@ class Row(Struct, frozen=True):
     settings: dict[str, Any]
     figures: Figures
     definitions: list[str]
+    doubt: str = ""
 
 
 class Table(Struct, frozen=True):
@@ -120,6 +122,7 @@ def text(table: Table) -> str:
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
+    endings += [f"{row.name}: UNRELIABLE: {row.doubt}" for row in table.rows if row.doubt]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"

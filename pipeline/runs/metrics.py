@@ -173,13 +173,13 @@ def measure(
         median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
-        unreliable=_unreliable(states, [row.points for row in steps.rows]),
+        unreliable=unreliable(states, [row.points for row in steps.rows]),
         warnings=tuple(warnings),
         compile_s=compile_s,
     )
 
 
-def _unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
+def unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
     """Why a run is not reliable: most of its scans are degenerate or lost; empty where they are not."""
     degenerate, lost = states[State.DEGENERATE], states[State.LOST]
     if 2 * (degenerate + lost) <= len(points):
