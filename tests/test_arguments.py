@@ -95,7 +95,7 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: scan(np.zeros((2, 3)), times_s=[0.0, np.nan]), "times_s"),
         (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
         (lambda: open_log(3), "a log is 3; wanted a path"),
-        (lambda: open_log([]), r"a log is \[\]; wanted a path"),
+        (lambda: open_log([]), "no log was given; wanted a path"),
         (lambda: open_log([None]), r"a log is \[None\]; wanted a path"),
         (lambda: scan(np.zeros((2, 2)), T_odom_base=I4), r"T_odom_base has the shape \(4, 4\); wanted a \(3, 3\)"),
         (lambda: replace(scan(I3), stamp_ns=1.7e9), "stamp_ns is 1700000000.0; wanted nanoseconds as int"),

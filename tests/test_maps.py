@@ -9,6 +9,7 @@ from ruamel.yaml import YAML
 from scenes import kitti_scans, shared_data
 
 from pipeline import lie
+from pipeline.baselines.open3d_pairs import Open3dPairs
 from pipeline.config import MapsConfig
 from pipeline.errors import InputError
 from pipeline.logs.formats.pcd import read_pcd
@@ -331,7 +332,7 @@ def test_pcd_and_laz_of_no_points_are_read_as_empty(tmp_path):
 
 
 def test_open3d_reads_our_pcd(tmp_path):
-    library = pytest.importorskip("open3d")
+    library = Open3dPairs("point-to-point").open3d  # with the libusb that slim machines lack
     points = np.random.default_rng(0).normal(size=(100, 3))
     write_pcd(tmp_path / "a.pcd", points)
     read = np.asarray(library.io.read_point_cloud(str(tmp_path / "a.pcd")).points)

@@ -50,8 +50,10 @@ def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig =
     """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
     named = [sources] if isinstance(sources, Source | str) else sources
     is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
-    if not is_named or not named:
+    if not is_named:
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
+    if not named:
+        raise InputError("no log was given; wanted a path, an address or a list of them")
     return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 
