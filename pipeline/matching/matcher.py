@@ -163,7 +163,10 @@ def _chance(answer: Answer, points: int, target: VoxelMap) -> str:
             "degrees of freedom"
         )
     if len(target) < 2 * _REDUNDANCY * freedom:
-        return f"the map has {len(target)} voxels, fewer than {2 * _REDUNDANCY} for each degree of freedom"
+        return (
+            f"the map has {len(target)} voxels, fewer than {2 * _REDUNDANCY} for each degree of freedom: "
+            f"lower local_map.voxel_size_m ({voxel_m:g})"
+        )
     if answer.range_m < _SPAN_VOXELS * voxel_m:
         return (
             f"the points spread over {answer.range_m:.2g} m, less than {_SPAN_VOXELS:g} voxels: lower "
