@@ -6,10 +6,12 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 import psutil
 import pytest
+import rerun as rr
 import rerun.blueprint as rrb
 from killing import same_recording
 from rerun.chunk import RrdReader
@@ -24,6 +26,7 @@ from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
 from viz.blueprint import blueprint
 from viz.recording import Recording
+from viz.sinks import file_sink, open_stream
 
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
@@ -419,6 +422,22 @@ def run_script(script, path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_the_file_has_its_name_only_once_it_can_be_read(tmp_path, monkeypatch):
+    written = []
+
+    def set_sinks(stream, *sinks, **options):
+        real(stream, *sinks, **options)
+        written.extend(path.name for path in tmp_path.iterdir())
+
+    real = rr.RecordingStream.set_sinks
+    monkeypatch.setattr(rr.RecordingStream, "set_sinks", set_sinks)
+    sink = file_sink(tmp_path / "a.rrd", open_stream("t", 2, uuid4()), blueprint(2))
+    assert written == ["a.rrd.new"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
+    assert list(RrdReader(tmp_path / "a.rrd").stream())
+    sink.close()
+
+
 def test_a_killed_run_leaves_a_file_that_reads_up_to_the_last_batch(tmp_path):
     script = """
 import os, signal, sys, time

@@ -158,10 +158,16 @@ def open_stream(name: str, dimension: int, recording_id: UUID) -> rr.RecordingSt
 
 
 def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
-    """A .rrd file; it can be read up to the last batch even if the run is killed."""
+    """A .rrd file; it can be read up to the last batch even if the run is killed.
+
+    It has its name only once it can be read: rerun writes the head in parts.
+    """
+    unnamed = path.with_name(f"{path.name}.new")
     try:
-        stream.set_sinks(rr.FileSink(path), default_blueprint=blueprint)
-    except RuntimeError as error:
+        stream.set_sinks(rr.FileSink(unnamed), default_blueprint=blueprint)
+        stream.flush(timeout_sec=_FILE_PATIENCE_S)
+        unnamed.replace(path)
+    except (RuntimeError, OSError) as error:
         raise InputError(
             f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
         ) from error
