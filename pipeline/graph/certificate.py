@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from pipeline.graph.minorant import Minorants, minorise
-from pipeline.graph.observability import FreePose, free_text
 from pipeline.graph.soundness import is_connected
 from pipeline.kernels.graph_dual import scatter_dual
 
@@ -61,7 +59,7 @@ def certify(
     problem: BetweenProblem,
     poses: Matrix,
     weights: NDArray[np.float64],
-    free: Sequence[FreePose],
+    undetermined: str,
     names: NDArray[np.int64],
 ) -> Certificate:
     """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
@@ -72,16 +70,16 @@ def certify(
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorisation goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function are bounded by zero instead: their χ² is part of the gap. Where poses are
-    ``free``, nothing is certified. ``names`` (K,) are what the poses are called.
+    measurements for such a function are bounded by zero instead: their χ² is part of the gap. What leaves
+    poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,) are what the poses are called.
     """
     begin = working_s()
     kept = weights > 0.0
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
     is_zero = chi2 <= _NOTHING * min(float(problem.information.max(initial=0.0)), 1.0)
-    if free:
-        return Certificate(False, chi2, chi2, free_text(free), working_s() - begin, is_zero)
+    if undetermined:
+        return Certificate(False, chi2, chi2, undetermined, working_s() - begin, is_zero)
     if is_zero:
         return Certificate(True, chi2, chi2, "", working_s() - begin, is_zero)
     if len(poses) - len(problem.free) > 1:

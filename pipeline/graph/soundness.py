@@ -93,5 +93,7 @@ def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.i
 
 
 def listed(names: NDArray[np.int64]) -> str:
-    """The first of these names, for people."""
-    return ", ".join(map(str, names[:8].tolist())) + (", ..." if len(names) > 8 else "")
+    """These names, ascending, for people: "3, 5 to 9"; the first eight where they are scattered."""
+    runs = np.split(names, 1 + np.flatnonzero(np.diff(names) != 1))
+    shown = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run.tolist())) for run in runs[:8]]
+    return ", ".join(shown) + (", ..." if len(runs) > 8 else "")
