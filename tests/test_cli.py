@@ -956,7 +956,28 @@ def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path
     tree = json.loads(call("optimize", ring, "--graph.robust", "truncated", "--json")[1])
     assert tree["rejected"] == [[1, 3]] and tree["certificate"]["chi2"] < 1.0
     assert tree["chi2_after"] == pytest.approx(tree["certificate"]["chi2"]) and tree["degrees_of_freedom"] == 6
-    says(output, "over 6 degrees of freedom")
+    before = trusting["chi2_before"]
+    says(
+        output,
+        f"chi2           {before:.6g} before, over 9 degrees of freedom; ",
+        " after, over 6 degrees of freedom",
+    )
+    assert tree["chi2_before"] == pytest.approx(before) and tree["degrees_of_freedom_before"] == 9
+    assert tree["warnings"] == [] and "warning" not in output
+
+
+@pytest.mark.parametrize("robust", ["truncated", "huber"])
+def test_an_answer_that_rests_on_a_minority_of_the_suspected_edges_says_so_first(call, ring, robust):
+    ring.write_text(ring.read_text() + "".join(f"EDGE_SE2 {i} 3 9 {i} 1 100 0 0 100 0 1000\n" for i in (0, 1, 1)))
+    output = call("optimize", ring, "--robust", robust)[1]
+    assert re.match(r"warning        \d of 5 suspected edges are rejected or count less than half", output)
+    says(output, "not for the choice of them", "certificate    globally optimal")
+
+
+def test_optimize_writes_graphs_of_the_known_formats_alone(call, refused, tmp_path, ring):
+    says(refused("optimize", ring, "--out", tmp_path / "zz.txt"), "zz.txt: name a file", ".g2o or .graph or .toro")
+    for suffix in ("g2o", "graph", "toro"):
+        assert call("optimize", ring, "--out", tmp_path / f"done.{suffix}")[0] == 0
 
 
 @pytest.mark.parametrize("robust", ["truncated", "geman-mcclure", "tukey", "cauchy", "huber"])
@@ -993,7 +1014,7 @@ def test_optimize_names_the_poses_that_are_free_before_it_certifies_anything(cal
         tree["free"] == [{"name": 17, "axes": ["yaw"], "followers": []}] and not tree["certificate"]["certified"]
     )
     ring.write_text("\n".join([*lines, "EDGE_SE2 3 17 1 0 0 1e-7 0 0 1e-7 0 1e-6"]) + "\n")
-    says(call("optimize", ring)[1], "weakly joined  by edges of less than a millionth", "1 poses, 17")
+    says(call("optimize", ring)[1], "weakly joined  pose 17 by edges of less than a millionth")
 
 
 def test_optimize_says_loudly_that_it_projects_indefinite_information(call, refused, ring):
@@ -1021,7 +1042,8 @@ def test_a_chain_has_no_loops_to_check(call, ring):
 def test_loops_that_leave_no_degrees_of_freedom_have_a_chi2_all_the_same(call, ring):
     lines = [f"EDGE_SE2 {i} {i + 1} 1 0 0 100 0 0 100 0 1000" for i in range(2)]
     ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
-    says(call("optimize", ring)[1], "chi2           100 before, 33.333333 after, over 1 degrees of freedom")
+    chi2 = "chi2           100 before, over 1 degree of freedom; 33.333333 after, over 1 degree of freedom\n"
+    says(call("optimize", ring)[1], chi2)
     lines[0] = "EDGE_SE2 0 1 1 0 0 100 0 0 100 0 0"
     ring.write_text("\n".join([*lines, "EDGE_SE2 0 2 3 0 0 100 0 0 0 0 0"]) + "\n")
     code, output, _ = call("optimize", ring)

@@ -195,7 +195,7 @@ class PoseGraph:
         """
         begin = working_s()
         problem = self._prepared()
-        chi2_before = problem.chi2(problem.errors(self.poses))
+        chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
             solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
         except SingularMatrixError as error:
@@ -206,7 +206,7 @@ class PoseGraph:
         self._factor_is_now = False
         return Optimisation(
             state=self.state(),
-            chi2_before=self._in_force(chi2_before),
+            chi2_before=chi2_before,
             chi2_after=self._in_force(minimum.estimate.chi2),
             cost_after=minimum.estimate.cost,
             iterations=minimum.iterations,
