@@ -66,8 +66,8 @@ class Answer:
         if 2 * doubted <= len(weight):
             return []
         return [
-            f"{doubted:,} of {len(weight):,} suspected edges are rejected or count less than half: if these are the "
-            "right ones, all below is wrong; the certificate is for the edges in force, not for the choice of them"
+            f"{doubted:,} of {len(weight):,} suspected edges are rejected or count less than half: if they are "
+            "right, all below is wrong; the certificate is for the edges in force, not for the choice of them"
         ]
 
     @property

@@ -162,13 +162,8 @@ class Outputs:
             with _written(self.picture):
                 viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
-            new = self.recording.with_name(f"{self.recording.name}.new")
             with _written(self.recording):
-                try:
-                    viewing.record_graph(answer.change, new)
-                    new.replace(self.recording)
-                finally:
-                    new.unlink(missing_ok=True)
+                viewing.record_graph(answer.change, self.recording)
         return written
 
 
@@ -178,7 +173,6 @@ def _written(path: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        error.filename = str(path)
         if told(error):
             raise
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
