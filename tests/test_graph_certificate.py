@@ -357,3 +357,17 @@ def test_edges_of_position_alone_may_have_any_rotation_in_their_measurement():
     other.add_edges(graph.edges, measurements, graph.information, graph.is_loop)
     assert other.optimise(PLAIN).chi2_after == pytest.approx(graph.optimise(PLAIN).chi2_after, rel=1e-9)
     assert other.certify().certified
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("information", [1e-300, 1e-50, 1e50])
+def test_no_information_that_is_taken_overflows(dimension, information):
+    graph = PoseGraph(dimension)
+    for index in range(4):
+        graph.add_pose(lie.identity(dimension), index)
+    rng, k = np.random.default_rng(0), (3, 6)[dimension - 2]
+    for i, j in [(0, 1), (1, 2), (2, 3), (3, 0)]:
+        graph.add_edge(i, j, lie.exp(0.3 * rng.normal(size=k)), np.diag([information, *[1.0] * (k - 1)]))
+    with np.errstate(all="raise", under="ignore"):
+        graph.optimise(PLAIN)
+        graph.certify()

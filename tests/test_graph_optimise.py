@@ -334,6 +334,7 @@ def test_a_pose_that_nothing_joins_is_named():
             np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
             "not symmetric positive semidefinite",
         ),
+        (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give metres"),
         (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
     ],
 )

@@ -32,7 +32,7 @@ def draw_graph(change: GraphChange, path: Path) -> None:
     panels = figure.subplots(1, 2)
     for axes, state, when in zip(panels, (change.before, change.after), ("before", "after"), strict=True):
         _draw_state(axes, state)
-        axes.set_title(f"{change.name} {when}\n{fit(state, 'edges')}", loc="left", fontsize=11)
+        axes.set_title(f"{change.name} {when}\n{fit(state)}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     picture = BytesIO()

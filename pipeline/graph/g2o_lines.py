@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError, shown
+from pipeline.graph.soundness import LARGEST
 from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
 
 VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
@@ -128,6 +129,12 @@ def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, r
         raise InputError(f"{path}:{number}: {words[0]}: {error}") from error
     if not np.isfinite(values).all():
         raise InputError(f"{path}:{number}: {words[0]} has a value that is not finite; remove or mend the line")
+    for value in values:
+        if abs(value) > LARGEST:
+            raise InputError(
+                f"{path}:{number}: {' '.join(words[: 1 + ids])} has the value {value:g}, over {LARGEST:g}; "
+                "write metres and radians, and an inverse covariance of these"
+            )
     rows.numbers.append(values)
     rows.lines.append(number)
 

@@ -21,10 +21,10 @@ class GraphChange:
     after: GraphState
 
 
-def fit(state: GraphState, noun: str = "closures") -> str:
+def fit(state: GraphState) -> str:
     """How well its edges in force agree, in words."""
     rejected = int(state.is_rejected.sum())
-    return fit_text(state.chi2, state.degrees_of_freedom, rejected, noun, has_loops=has_loops(state))
+    return fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=has_loops(state))
 
 
 def has_loops(state: GraphState) -> bool:
