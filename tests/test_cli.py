@@ -828,7 +828,7 @@ def test_evaluate_measures_relations_alone_and_beside_the_truth(call, tmp_path):
     (tmp_path / "set.relations").write_text(f"103.0 104.0 {x} {y} 0 0 0 {step}\n")
     code, output, _ = call("evaluate", truth, "--relations", tmp_path / "set.relations")
     assert code == 0 and "ATE" not in output
-    says(output, "relations", "Kümmerle", "1 relations, 0 missing")
+    says(output, "relations", "Kümmerle", "1 relation, 0 missing")
     tree = json.loads(call("evaluate", truth, truth, "--relations", tmp_path / "set.relations", "--json")[1])
     assert tree["relations"]["translation_m"]["mean"] == pytest.approx(0.05, abs=1e-9)
     assert tree["relations"]["rotation_rad"]["mean"] < 1e-9 and "ate" in tree
@@ -1093,7 +1093,7 @@ def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, 
     words = ["optimize", ring, "--graph.max_iterations", "1", "--out", tmp_path / "done.g2o", "--force"]
     code, output, errors = call(*words)
     assert (code, errors) == (1, "") and (tmp_path / "done.g2o").exists()
-    says(output, "iterations     1 in", "; DID NOT CONVERGE: 1 iterations reached")
+    says(output, "iterations     1 in", "; DID NOT CONVERGE: 1 iteration reached")
     code, output, _ = call(*words, "--json")
     assert code == 1 and json.loads(output)["converged"] is False
 

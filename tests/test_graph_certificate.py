@@ -295,7 +295,7 @@ def test_what_the_bound_cannot_do_is_said():
     graph = closed_ring(2, 4, 0)
     graph.add_edge(0, 2, lie.pose_2d(0.0, 0.0, 3.0), 1e-6 * np.eye(3))
     graph.optimise(PLAIN)
-    assert graph.certify().reason == "1 edges are too far from their measurements to be bounded, first 0-2"
+    assert graph.certify().reason == "1 edge too far from what was measured to be bounded, first 0-2"
 
 
 def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():

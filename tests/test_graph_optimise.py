@@ -213,7 +213,7 @@ def test_the_same_optimisation_twice_is_equal_to_the_bit():
 
 
 def test_every_reason_to_stop_is_reported():
-    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iterations reached"
+    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iteration reached"
     assert "χ² change" in read("intel").optimise(PLAIN).reason
     graph, _ = ring(2, noise=0.05)
     graph.optimise(GraphConfig(robust="none", tolerance=1e-10))

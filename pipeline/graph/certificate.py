@@ -14,6 +14,7 @@ from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, 
 from pipeline.graph.minorant import Minorants, minorise
 from pipeline.graph.soundness import is_connected
 from pipeline.kernels.graph_dual import scatter_dual
+from pipeline.words import counted
 
 _NOTHING = 1e-9  # χ² that is zero but for rounding; this share of the largest information where that is below 1
 _SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
@@ -93,7 +94,7 @@ def certify(
     rest = problem.edges[kept & ~loose]
     if loose.any() and (given_up > _SHARES[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
         i, j = names[problem.edges[loose][0]]
-        reason = f"{loose.sum()} edges are too far from their measurements to be bounded, first {i}-{j}"
+        reason = f"{counted(int(loose.sum()), 'edge')} too far from what was measured to be bounded, first {i}-{j}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     gap = _gap(problem, minorants, kept & ~loose, chi2)
     if gap is None:

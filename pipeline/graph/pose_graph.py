@@ -29,6 +29,7 @@ from pipeline.graph.observability import (
 from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.solve import solve
 from pipeline.graph.soundness import check_connected, check_edges, ranks
+from pipeline.words import counted
 
 
 class PoseGraph:
@@ -152,8 +153,9 @@ class PoseGraph:
         is_loop = np.asarray(is_loop, np.bool_)
         if len(measurements) != len(edges) or is_loop.shape != (len(edges),):
             raise InputError(
-                f"measurements has {len(measurements)} entries, is_loop the shape {is_loop.shape}; wanted one for "
-                f"each of the {len(edges)} edges"
+                f"measurements has {counted(len(measurements), 'entry', 'entries')}, "
+                f"is_loop the shape {is_loop.shape}; wanted one for "
+                f"each of {counted(len(edges), 'edge')}"
             )
         self._add_edges(edges, measurements, information, is_loop)
 
@@ -182,7 +184,9 @@ class PoseGraph:
         """Hold this pose where it is, instead of pose 0."""
         index = checks.integer(index, "index", "the index of a pose")
         if not 0 <= index < len(self):
-            raise InputError(f"pose {index} cannot be fixed: the graph has {len(self)} poses; add it first")
+            raise InputError(
+                f"pose {index} cannot be fixed: the graph has {counted(len(self), 'pose')}; add it first"
+            )
         self._changed()
         self._fixed.add(index)
 
