@@ -102,7 +102,8 @@ def certify(
         borrowing = kept & ((minorants.tau < 0.0) | (minorants.kappa < 0.0))
         if borrowing.any():
             i, j = names[problem.edges[borrowing][0]]
-            reason += f", or where Ω says little of some direction, first at {i}-{j} of {borrowing.sum():,} edges"
+            edges = counted(int(borrowing.sum()), "edge")
+            reason += f", or where Ω says little of some direction, first at {i}-{j} of {edges}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 
