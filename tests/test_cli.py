@@ -966,6 +966,16 @@ def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path
     assert tree["warnings"] == [] and "warning" not in output
 
 
+def test_the_picture_names_the_fit_of_the_edges_in_force_at_either_time(call, monkeypatch, tmp_path, ring):
+    ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
+    titles = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_title", lambda _, text, **how: titles.append(text))
+    assert call("optimize", ring, "--robust", "truncated", "--png", tmp_path / "a.png")[0] == 0
+    before, after = titles
+    assert "over 9 degrees of freedom" in before and "rejected" not in before
+    assert "over 6 degrees of freedom, 1 edge rejected" in after
+
+
 @pytest.mark.parametrize("robust", ["truncated", "huber"])
 def test_an_answer_that_rests_on_a_minority_of_the_suspected_edges_says_so_first(call, ring, robust):
     ring.write_text(ring.read_text() + "".join(f"EDGE_SE2 {i} 3 9 {i} 1 100 0 0 100 0 1000\n" for i in (0, 1, 1)))
