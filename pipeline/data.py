@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.point_store import StoredPoints
+from pipeline.words import FREEDOM, counted
 
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
@@ -258,11 +259,11 @@ def fit_text(
 
     Loops that measure too little to leave degrees of freedom have a χ² all the same: ``has_loops`` tells of them.
     """
-    left_out = f", {rejected:,} {noun if rejected != 1 else noun.removesuffix('s')} rejected" if rejected else ""
+    left_out = f", {counted(rejected, noun.removesuffix('s'))} rejected" if rejected else ""
     if degrees_of_freedom == 0 and not has_loops:
         return f"no loops {'in force ' if rejected else ''}to check{left_out}"
     shown = f"{chi2:,.0f}" if 100.0 <= chi2 < 1e7 else f"{chi2:.3g}"
-    return f"χ² {shown} over {degrees_of_freedom:,} degrees of freedom{left_out}"
+    return f"χ² {shown} over {counted(degrees_of_freedom, *FREEDOM)}{left_out}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline import lie
 from pipeline.data import Matrix, Trajectory
 from pipeline.errors import InputError
+from pipeline.words import counted
 
 _NS_PER_S = 1_000_000_000
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
@@ -27,7 +28,7 @@ def read_tum(path: Path | str) -> Trajectory:
     rows: list[list[float]] = []
     for place, words in text_lines(path):
         if len(words) != 8:
-            raise InputError(f"{place} has {len(words)} fields, a TUM line has 8: {_TUM_FIELDS}")
+            raise InputError(f"{place} has {counted(len(words), 'field')}, a TUM line has 8: {_TUM_FIELDS}")
         stamps_ns.append(parse_stamp_ns(words[0], place))
         row = numbers(words[1:], place)
         if sum(value * value for value in row[3:]) < 1e-6:
@@ -61,7 +62,7 @@ def read_kitti(path: Path | str) -> Trajectory:
     rows: list[list[float]] = []
     for place, words in text_lines(path):
         if len(words) != 12:
-            raise InputError(f"{place} has {len(words)} fields, a KITTI line has 12: {_KITTI_FIELDS}")
+            raise InputError(f"{place} has {counted(len(words), 'field')}, a KITTI line has 12: {_KITTI_FIELDS}")
         row = numbers(words, place)
         R = np.array(row).reshape(3, 4)[:, :3]
         if np.abs(R.T @ R - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0.0:

@@ -89,7 +89,7 @@ def test_of_24_logs_two_are_poison_and_22_have_results_and_a_second_call_runs_on
     assert errors == f"error: 2 of 24 logs have no result; {out}/summary.txt says why\n"
 
     assert main(words) == 1  # only the two are tried again
-    assert made(out) == first and "22 results were there before" in capfd.readouterr()[0]
+    assert made(out) == first and "22 results from before" in capfd.readouterr()[0]
 
 
 def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(drawers, tmp_path, capfd):
@@ -105,7 +105,7 @@ def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(dra
     assert len(made(out)) == 2
     log.write_bytes((drawers / "log_01.mcap").read_bytes())
     assert main(words) == 0
-    assert len(made(out)) == 3 and "0 results were there before" in capfd.readouterr()[0].splitlines()[-1]
+    assert len(made(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
 def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
@@ -124,7 +124,7 @@ def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run
     assert errors == f"error: of 1 most scans are degenerate or lost; {out}/summary.txt says why\n"
     assert f"{radar} is unreliable" in (out / "report.html").read_text()
     assert main(words) == 1
-    assert made(out) == first and "2 results were there before" in capfd.readouterr()[0]
+    assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
 
 
 def test_a_result_that_was_thrown_away_is_missing(drawers, tmp_path):
@@ -252,7 +252,7 @@ def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, ca
     assert main(["batch", str(log), "--out", str(out)]) == 0
     (row,) = table(out).values()
     assert (row["state"], row["scans"], row["ate_share_of_path"]) == ("done", 20, None)
-    assert "1 results were there before" in capfd.readouterr()[0].splitlines()[-1]
+    assert "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
 def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):

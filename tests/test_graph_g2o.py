@@ -181,6 +181,8 @@ EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", r":1: EDGE_SE2 has 10 values, needs 11"),
         (f"{EDGE}\nEDGE_SE2 1 two 1 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2: vertex id 'two' is not a whole number"),
         (f"{EDGE}\nEDGE_SE2 1 2 1 0 zero 1 0 0 1 0 1\n", r":2: EDGE_SE2: could not convert"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 0 1e300 0 0 1 0 1\n", r":2: EDGE_SE2 1 2 has the value 1e\+300, over 1e\+50"),
+        (f"{EDGE}\nEDGE_SE2 1 2 -2e50 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2 1 2 has the value -2e\+50, over 1e\+50"),
         (f"{EDGE}\nEDGE_SE2 1 2 1 0 nan 1 0 0 1 0 1\n", r":2: EDGE_SE2 has a value that is not finite"),
         (f"VERTEX_SE2 0 0 0 0\n{EDGE}\n", r":2: vertex 1 is not in the file"),
         (f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nVERTEX_SE2 0 1 0 0\n{EDGE}\n", r":3: vertex 0 stands .* twice"),

@@ -78,6 +78,35 @@ def test_poses_that_hang_on_next_to_no_information_are_named(dimension):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("share", [1e-30, 1e-18, 1e-12, 1e-9, 1e-7])
+@pytest.mark.parametrize("axes", [slice(None), slice(0, 1), slice(-1, None)])
+@pytest.mark.parametrize("far_m", [0.0, 5e6])
+def test_a_group_on_next_to_no_information_is_named_whole_by_certificate_and_covariances(
+    dimension, share, axes, far_m
+):
+    """The certificate called it globally optimal while the covariances refused, and named one pose of the five."""
+    rng, k, graph = np.random.default_rng(4), (3, 6)[dimension - 2], PoseGraph(dimension)
+    true = np.tile(lie.identity(dimension), (10, 1, 1))
+    true[:, 0, -1] = far_m
+    for index in range(1, 10):
+        true[index] = true[index - 1] @ lie.exp(rng.normal(size=k))
+    for index, pose in enumerate(true):
+        graph.add_pose(pose, index)
+    for i, j in [*((i, i + 1) for i in range(9)), (0, 4), (5, 9), (0, 2), (6, 8)]:
+        information = np.full(k, 100.0)
+        information[axes] *= share if (i, j) == (4, 5) else 1.0
+        noise = lie.exp(0.01 * rng.normal(size=k))
+        graph.add_edge(i, j, lie.inverse(true[i]) @ true[j] @ noise, np.diag(information))
+    assert graph.optimise(PLAIN).converged
+    certificate, refusal = graph.certify(), ""
+    try:
+        assert np.isfinite(graph.covariances()).all()
+    except InputError as error:
+        refusal = str(error)
+    assert certificate.reason in refusal and ("5 to 9 (" in refusal) == (share < 1e-10) != certificate.certified
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_what_moves_together_is_named_together(dimension):
     """The middle of a chain is free along x: whatever follows goes with it."""
     graph = chain(dimension)
@@ -89,7 +118,7 @@ def test_what_moves_together_is_named_together(dimension):
     free.add_edges(graph.edges, graph.measurements, information, graph.is_loop)
     [body] = free.free_poses()
     assert (body.name, body.axes, body.followers) == (3, ("x",), (4, 5))
-    with pytest.raises(InputError, match=r"leave 3 poses free: 3 \(x\) and 2 that move with it"):
+    with pytest.raises(InputError, match=r"leave 3 poses free: 3 to 5 \(x\) as one body"):
         free.optimise(GraphConfig(robust="none", optimiser="gauss-newton"))
 
 

@@ -213,7 +213,7 @@ def test_the_same_optimisation_twice_is_equal_to_the_bit():
 
 
 def test_every_reason_to_stop_is_reported():
-    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iterations reached"
+    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iteration reached"
     assert "χ² change" in read("intel").optimise(PLAIN).reason
     graph, _ = ring(2, noise=0.05)
     graph.optimise(GraphConfig(robust="none", tolerance=1e-10))
@@ -334,6 +334,7 @@ def test_a_pose_that_nothing_joins_is_named():
             np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
             "not symmetric positive semidefinite",
         ),
+        (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give metres"),
         (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
     ],
 )

@@ -151,7 +151,7 @@ def test_a_packed_log_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
 
 def test_a_text_that_is_no_carmen_log_says_so(tmp_path):
     (tmp_path / "a.log").write_text("# a comment\nHELLO world\n")
-    with pytest.raises(InputError, match="no line of FLASER"):
+    with pytest.raises(InputError, match="without a line of FLASER"):
         open_log(tmp_path / "a.log")
     (tmp_path / "b.bz2").write_bytes(b"BZh9 and no more")
     with pytest.raises(InputError, match=r"b\.bz2"):

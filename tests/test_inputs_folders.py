@@ -119,7 +119,7 @@ def test_a_part_of_a_kitti_sequence_opens_only_its_own_files(tmp_path, monkeypat
 def test_a_kitti_folder_whose_parts_do_not_fit_says_so(tmp_path):
     sequence = kitti_odometry(tmp_path, recorders.clouds())
     (sequence / "times.txt").write_text("0.0\n")
-    with pytest.raises(InputError, match="does not fit the 1 timestamps"):
+    with pytest.raises(InputError, match="does not fit the 1 timestamp;"):
         read(sequence)
     (sequence / "times.txt").write_text("noon\n")
     with pytest.raises(InputError, match=r"times\.txt: is no table of numbers"):
@@ -296,7 +296,7 @@ def test_raw_rows_of_three_numbers_are_not_taken_for_six_where_they_are_flat(tmp
     cloud[7] = hole
     cloud.tofile(tmp_path / "1.0.bin")
     log, (scan,) = read(tmp_path)
-    assert scan.points.shape == (299, 2) and "files of x y z, float32" in log.notes[0]
+    assert scan.points.shape == (299, 2) and "1 .bin file of x y z, float32" in log.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])

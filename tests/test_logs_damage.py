@@ -1,6 +1,7 @@
 """Bad input: one line that says what, where and what to do; damage: recovered, counted and told."""
 
 import cProfile
+import gzip
 import pstats
 import re
 import struct
@@ -61,6 +62,23 @@ def test_an_empty_file(tmp_path):
 def test_a_file_that_is_no_log(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
     says(complaint(tmp_path / "a.mcap"), "is no log that is known", repr(content[:8]), "give MCAP")
+
+
+@pytest.mark.parametrize("name", ["README.md", "a.log", "a.log.gz"])
+def test_a_text_that_is_no_log_is_not_called_a_carmen_log(tmp_path, name):
+    text = b"# A title\n\nSome words.\n"
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    says(
+        complaint(tmp_path / name), f"{name}: is no log that is known (text without a line of FLASER", "give MCAP"
+    )
+
+
+@pytest.mark.parametrize(
+    "first", ["VERTEX_SE2 0 0 0 0", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "EDGE2 0 1 1 0 0", "FIX 0"]
+)
+def test_a_pose_graph_is_sent_to_optimize(tmp_path, first):
+    (tmp_path / "a.g2o").write_text(f"{first}\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    says(complaint(tmp_path / "a.g2o"), "a.g2o: is a pose graph, no log; give it to scanchain optimize")
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import errno
 import os
 import signal
 import socket
@@ -25,8 +26,9 @@ from pipeline.runs.step_table import StepTable
 from pipeline.runs.verdicts import final_verdicts
 from viz import entities, shapes, viewer
 from viz.blueprint import blueprint
+from viz.messages import Message
 from viz.recording import Recording
-from viz.sinks import file_sink, open_stream
+from viz.sinks import file_sink, open_stream, write_recording
 
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
@@ -357,11 +359,14 @@ def test_a_viewer_that_stops_reading_does_not_stop_the_run(tmp_path):
     script = """
 import sys, time, os, signal
 from pathlib import Path
+from uuid import uuid4
 from test_recording import drive, free_port
 from pipeline.config import RecordingConfig
 from viz import sinks, viewer
 from viz.blueprint import blueprint
+from viz.messages import Message
 from viz.recording import Recording
+from viz.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
 server = viewer.start_web(port, free_port())
@@ -442,10 +447,13 @@ def test_a_killed_run_leaves_a_file_that_reads_up_to_the_last_batch(tmp_path):
     script = """
 import os, signal, sys, time
 from pathlib import Path
+from uuid import uuid4
 from test_recording import drive
 from pipeline.config import RecordingConfig
 from viz.blueprint import blueprint
+from viz.messages import Message
 from viz.recording import Recording
+from viz.sinks import open_stream, write_recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
 recording.__enter__()
@@ -467,6 +475,7 @@ def test_a_full_disk_is_a_warning_and_the_run_goes_on(tmp_path):
     script = """
 import resource, signal, sys
 from pathlib import Path
+from uuid import uuid4
 from test_recording import drive, record
 from viz import sinks
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -477,6 +486,27 @@ print(record(Path(sys.argv[1]), drive(300, 3, points=8000), 3).warnings)
     answer = run_script(script, tmp_path / "a.rrd")
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.count("is incomplete, the run goes on without it") == 1
+
+
+def test_what_is_recorded_at_once_is_written_whole_or_not_at_all(tmp_path, monkeypatch, capfd):
+    """rerun printed lines of its own, and half a file was left."""
+    path, up = tmp_path / "a.rrd", [Message("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
+
+    def write():
+        write_recording(path, open_stream("a", 2, uuid4()), blueprint(2), up)
+
+    write()
+    assert RrdReader(str(path)).blueprints()
+    before = path.read_bytes()
+
+    def fill_up(_, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fill_up)
+    with pytest.raises(OSError, match=r"a\.rrd") as full:
+        write()
+    assert full.value.filename == str(path) and capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == before
 
 
 def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):

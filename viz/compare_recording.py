@@ -20,6 +20,7 @@ from viz.blueprint import eye, time_panel, up_to_now, whole_log
 from viz.compared_courses import read_courses
 from viz.courses import Course
 from viz.messages import Message, Times
+from viz.sinks import write_recording
 
 RECORDING_FILE = "compare.rrd"
 _MAP_POINTS = 60_000
@@ -28,17 +29,13 @@ _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 
 def record_comparison(directory: Path) -> None:
-    """Write compare.rrd into a comparison's directory."""
+    """Write compare.rrd into a comparison's directory. Raises OSError."""
     table, courses = read_table(directory), read_courses(directory)
     stream = rr.RecordingStream(f"scanchain comparison {table.dimension}D")
     stream.set_log_time_enabled(False)
-    stream.set_sinks(rr.FileSink(directory / RECORDING_FILE), default_blueprint=_blueprint(courses, table))
     stream.send_recording_name(Path(table.log.split(", ")[0]).name)
-    stamps_ns = _stamps(directory)
-    for message in _messages(directory, courses, stamps_ns):
-        message.send(stream)
-    stream.flush(timeout_sec=60.0)
-    stream.disconnect()
+    messages = _messages(directory, courses, _stamps(directory))
+    write_recording(directory / RECORDING_FILE, stream, _blueprint(courses, table), messages)
 
 
 def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray) -> list[Message]:

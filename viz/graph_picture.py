@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState, fit_text
-from pipeline.graph.optimisation import GraphChange
+from pipeline.data import GraphState
+from pipeline.graph.optimisation import GraphChange, fit
 from pipeline.runs.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -32,9 +32,7 @@ def draw_graph(change: GraphChange, path: Path) -> None:
     panels = figure.subplots(1, 2)
     for axes, state, when in zip(panels, (change.before, change.after), ("before", "after"), strict=True):
         _draw_state(axes, state)
-        rejected = int(state.is_rejected.sum())
-        fit = fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=change.has_loops)
-        axes.set_title(f"{change.name} {when}\n{fit}", loc="left", fontsize=11)
+        axes.set_title(f"{change.name} {when}\n{fit(state)}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     picture = BytesIO()

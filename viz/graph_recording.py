@@ -11,15 +11,17 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from pipeline.data import GraphState
-from pipeline.errors import InputError
 from pipeline.graph.optimisation import GraphChange
 from viz import entities, shapes
 from viz.messages import Message, Times
-from viz.sinks import file_sink, open_stream
+from viz.sinks import open_stream, write_recording
 
 
 def record_graph(change: GraphChange, path: Path) -> None:
-    """Write a .rrd file: the timeline ``scan`` is 0 before and 1 after, edges are coloured by verdict."""
+    """Write a .rrd file: the timeline ``scan`` is 0 before and 1 after, edges are coloured by verdict.
+
+    Raises OSError.
+    """
     stream = open_stream(change.name, change.after.poses.shape[-1] - 1, uuid4())
     layout = rrb.Blueprint(
         rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=rrb.LineGrid3D(visible=False)),
@@ -27,12 +29,8 @@ def record_graph(change: GraphChange, path: Path) -> None:
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
-    sink = file_sink(path, stream, layout)
-    sink.send([Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)])
-    sink.send([*_messages(change.before, 0), *_messages(change.after, 1)])
-    sink.close()
-    for warning in sink.warnings:
-        raise InputError(f"{path}: {warning}")
+    up = Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    write_recording(path, stream, layout, [up, *_messages(change.before, 0), *_messages(change.after, 1)])
 
 
 def _messages(state: GraphState, when: int) -> list[Message]:

@@ -12,12 +12,11 @@ import rerun.blueprint as rrb
 
 from pipeline import lie
 from pipeline.data import Matrix
-from pipeline.errors import InputError
 from pipeline.landmarks.study import Estimate, Study
 from pipeline.landmarks.write import file_stem
 from viz import entities, shapes
 from viz.messages import Message, Times
-from viz.sinks import file_sink, open_stream
+from viz.sinks import open_stream, write_recording
 
 _DEVIATIONS = 2.4477  # that hold 95 % of a Gaussian in the plane
 _FLAT_M = 1e-4  # height of an ellipse
@@ -27,19 +26,18 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
     """Write a .rrd file with a view of each problem: the timeline ``scan`` is 0 before and 1 after.
 
     All is in the frame of the truth where there is one; landmarks after it carry their 95 % ellipses.
+    Raises OSError.
     """
     stream = open_stream(", ".join(study.name for study in studies), 2, uuid4())
     views = [rrb.Spatial3DView(origin=_root(study), name=study.name) for study in studies]
     layout = rrb.Blueprint(
         rrb.Grid(*views), rrb.TimePanel(timeline="scan", state="collapsed"), collapse_panels=True
     )
-    sink = file_sink(path, stream, layout)
+    messages: list[Message] = []
     for study in studies:
-        sink.send([Message(_root(study), rr.ViewCoordinates.RIGHT_HAND_Z_UP), *_truth(study)])
-        sink.send([*_state(study, study.before, 0), *_state(study, study.after, 1), _ellipses(study)])
-    sink.close()
-    for warning in sink.warnings:
-        raise InputError(f"{path}: {warning}")
+        messages += [Message(_root(study), rr.ViewCoordinates.RIGHT_HAND_Z_UP), *_truth(study)]
+        messages += [*_state(study, study.before, 0), *_state(study, study.after, 1), _ellipses(study)]
+    write_recording(path, stream, layout, messages)
 
 
 def _root(study: Study) -> str:

@@ -73,7 +73,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
         "matching",
         f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
     )
-    yield "map", f"{m.map_points:,} points"
+    yield "map", counted(m.map_points, "point")
     yield "configuration", made.configuration
     yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"

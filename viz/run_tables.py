@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.runs.metrics import Accuracy, GroundTruth, Metrics
 from pipeline.runs.step_table import STAGES
+from pipeline.words import counted
 from viz.report import Cell, Grid, Head, Row, Section
 
 
@@ -27,7 +28,9 @@ def accuracy_section(truth: GroundTruth) -> Section:
         Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
     )  # fmt: skip
     missing = f", {truth.optimised.missing}" if truth.optimised.missing else ""
-    text = f"Against {truth.source}, {truth.path_length_m:.1f} m: {truth.optimised.pairs:,} scans{missing}."
+    text = (
+        f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimised.pairs, 'scan')}{missing}."
+    )
     return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimised.definition,)))
 
 

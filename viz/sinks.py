@@ -12,7 +12,7 @@ import ctypes
 import queue
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
 from uuid import UUID
@@ -23,6 +23,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from pipeline.errors import InputError
+from pipeline.runs.whole_file import write_whole
 from pipeline.words import counted
 from viz.messages import Message
 
@@ -172,6 +173,17 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
             f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
         ) from error
     return Sink(f"{path}", stream, lambda: None, patience_s=_FILE_PATIENCE_S, is_lossless=True)
+
+
+def write_recording(
+    path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint, messages: Sequence[Message]
+) -> None:
+    """Write a .rrd file of what is all known by now, whole or not at all. Raises OSError."""
+    memory = stream.memory_recording()
+    stream.send_blueprint(blueprint, make_active=False)
+    for message in messages:
+        message.send(stream)
+    write_whole(path, memory.drain_as_bytes())
 
 
 def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:

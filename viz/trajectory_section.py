@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.data import Points, State, Verdict
+from pipeline.words import counted
 from viz import course_figures as figures
 from viz.courses import Course, Floats, PathLine
 from viz.map_figures import map_picture, path_over_map, surroundings
@@ -77,7 +78,7 @@ def _lines(path: Floats, told: Told, truth: Floats | None) -> Iterator[tuple[Pat
         count = int((marks == list(_COLORS).index(state)).sum())
         if count:
             line = PathLine(_stretches(path, marks, list(_COLORS).index(state)), color, 2.6)
-            yield line, Chip(f"{state}: {count:,} scans", color)
+            yield line, Chip(f"{state}: {counted(count, 'scan')}", color)
     if truth is not None:
         yield PathLine(truth, "", 0.9, is_dashed=True), Chip("ground truth", "var(--ink)", is_dashed=True)
 

@@ -17,6 +17,7 @@ from pipeline.commands.run import aliases
 from pipeline.errors import InputError, ScanchainError
 from pipeline.settings import Override
 from pipeline.source import Source
+from pipeline.words import counted
 
 if TYPE_CHECKING:
     from pipeline.runs.recorder import Viewing
@@ -115,7 +116,7 @@ def batch(
     viewing: Viewing = ctx.obj
     viewing.present_batch(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
-    click.echo(f"written        {out}: {files}; {batched.kept:,} results were there before")
+    click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")
     if batched.failures:
         raise ScanchainError(f"{batched.failures}; {out}/summary.txt says why")
 

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.data import fit_text
-from pipeline.words import counted
+from pipeline.words import FREEDOM, counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
     from pipeline.graph.g2o import G2oFile
     from pipeline.graph.observability import FreePose
     from pipeline.graph.optimisation import GraphChange, Optimisation
+
+_HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +40,13 @@ class Answer:
             guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
         size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
         lines = [
+            *(f"warning        {warning}" for warning in self._warnings),
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
             *self._projected,
             f"first guess    {guess}",
             f"chi2           {self._chi2}",
-            f"iterations     {done.iterations} in {1e3 * done.time_s:.0f} ms; {self._ending}",
+            f"iterations     {done.iterations:,} in {1e3 * done.time_s:.0f} ms; {self._ending}",
         ]
         if graph.is_loop.any():
             rest = "; they do not count" if done.rejected.any() else ""
@@ -55,6 +57,18 @@ class Answer:
         held = ", the robust weights held" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
+
+    @property
+    def _warnings(self) -> list[str]:
+        """What to know before the rest is read."""
+        weight = self.file.graph.weight[self.file.graph.is_loop]
+        doubted = int((weight < _HALF).sum())
+        if 2 * doubted <= len(weight):
+            return []
+        return [
+            f"{doubted:,} of {len(weight):,} suspected edges are rejected or count less than half: if they are "
+            "right, all below is wrong; the certificate is for the edges in force, not for the choice of them"
+        ]
 
     @property
     def _free(self) -> list[str]:
@@ -78,16 +92,21 @@ class Answer:
 
     @property
     def _chi2(self) -> str:
-        """Of the edges in force, with how many degrees of freedom."""
-        done, degrees = self.optimisation, self.optimisation.state.degrees_of_freedom
-        if degrees == 0 and not self.change.has_loops:
-            return fit_text(done.chi2_after, degrees, 0)
-        return f"{done.chi2_before:.6g} before, {done.chi2_after:.8g} after, over {degrees:,} degrees of freedom"
+        """Of the edges in force before and after, with how many degrees of freedom."""
+        from pipeline.graph.optimisation import fit, has_loops
+
+        before, after = self.change.before, self.change.after
+        first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"
+        second = f"{after.chi2:.8g} after, over {counted(after.degrees_of_freedom, *FREEDOM)}"
+        if has_loops(after):
+            return f"{first}; {second}"
+        return f"{first}; after, {fit(after)}" if has_loops(before) else fit(after)
 
     def json(self, written: list[Path]) -> str:
         """The same, and every rejected edge, by vertex ids."""
         graph, done = self.file.graph, self.optimisation
         tree = {
+            "warnings": self._warnings,
             "graph": self.change.name,
             "dimension": graph.dimension,
             "poses": len(graph),
@@ -98,6 +117,7 @@ class Answer:
             "kept_lines": dict(self.file.other_tags),
             "chi2_before": done.chi2_before,
             "chi2_after": done.chi2_after,
+            "degrees_of_freedom_before": self.change.before.degrees_of_freedom,
             "degrees_of_freedom": done.state.degrees_of_freedom,
             "cost_after": done.cost_after,
             "iterations": done.iterations,

@@ -114,7 +114,7 @@ def landmarks(
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
     viewing: Viewing = ctx.obj
     if recording is not None:
-        check_output(recording, force=force, ending=".rrd")
+        check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with telling_of_compilation(terminal):
             studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -29,7 +29,9 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
 @click.argument("source", metavar="GRAPH.g2o", type=_PATH)
-@click.option("--out", metavar="FILE", type=_PATH, help="Write the optimised graph: .g2o, or TORO's .graph.")
+@click.option(
+    "--out", metavar="FILE", type=_PATH, help="Write the optimised graph: .g2o, or TORO's .graph or .toro."
+)
 @click.option("--optimiser", metavar="NAME", help="Short for --graph.optimiser.")
 @click.option(
     "--initialise",
@@ -130,9 +132,11 @@ class Outputs:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        endings = {self.picture: ".png", self.recording: ".rrd"}
+        from pipeline.graph.g2o_write import GRAPH_SUFFIXES
+
+        endings = {self.graph: GRAPH_SUFFIXES, self.picture: (".png",), self.recording: (".rrd",)}
         for path in (*self.paths, *filter(None, [self.rejected])):
-            check_output(path, force=force, ending=endings.get(path, ""))
+            check_output(path, force=force, endings=endings.get(path, ()))
 
     def write(self, answer: Answer, viewing: Viewing) -> list[Path]:
         """Write them all; which those are."""
@@ -158,13 +162,8 @@ class Outputs:
             with _written(self.picture):
                 viewing.draw_graph(answer.change, self.picture)
         if self.recording is not None:
-            new = self.recording.with_name(f"{self.recording.name}.new")
             with _written(self.recording):
-                try:
-                    viewing.record_graph(answer.change, new)
-                    new.replace(self.recording)
-                finally:
-                    new.unlink(missing_ok=True)
+                viewing.record_graph(answer.change, self.recording)
         return written
 
 
@@ -174,7 +173,6 @@ def _written(path: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        error.filename = str(path)
         if told(error):
             raise
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
@@ -212,7 +210,6 @@ def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialis
 
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)
-    before = replace(before, chi2=done.chi2_before, degrees_of_freedom=done.state.degrees_of_freedom)
     change = GraphChange(name, before, done.state)
     free, weak = file.graph.free_poses(), file.graph.weakly_joined()
     return Answer(file, change, done, free, weak, file.graph.certify())

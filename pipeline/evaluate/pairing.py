@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline import lie
 from pipeline.data import Matrix, Trajectory
 from pipeline.errors import InputError
+from pipeline.words import counted
 
 _WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
 _INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
@@ -66,7 +67,7 @@ class Pairs:
         exact = len(self) - self.interpolated
         return (
             f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
-            f"the reference (of {self.reference_count:,} poses) at its stamp: {exact:,} as they are, "
+            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp: {exact:,} as they are, "
             f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to "
             f"{self.gap_s:.3g} s), none extrapolated" + (f"; {self.missing}" if self.missing else "")
         )

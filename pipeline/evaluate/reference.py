@@ -12,6 +12,7 @@ from pipeline.data import Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate.pairing import span
 from pipeline.trajectory import read_kitti, read_tum, text_lines
+from pipeline.words import counted
 
 _KITTI_FIELDS = 12
 _SLACK_NS = 1_000_000_000  # by which the stamps to expect of a log's scans may be wrong
@@ -52,8 +53,8 @@ class TruthFile:
     def _check_rows(self, scans: int) -> None:
         if len(self.poses) != scans:
             raise InputError(
-                f"{self.path}: has {len(self.poses):,} lines for {scans:,} scans; a KITTI file has one line "
-                "a scan that is read, or give a TUM file, which has stamps"
+                f"{self.path}: has {counted(len(self.poses), 'line')} for {counted(scans, 'scan')}; "
+                "a KITTI file has one line a scan that is read, or give a TUM file, which has stamps"
             )
 
 

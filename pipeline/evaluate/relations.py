@@ -15,6 +15,7 @@ from pipeline.errors import InputError
 from pipeline.evaluate.pairing import nearest
 from pipeline.evaluate.statistics import Statistics
 from pipeline.trajectory import numbers, parse_stamp_ns, text_lines
+from pipeline.words import counted
 
 RELATION_LIMIT_S = 1e-3
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"
@@ -64,7 +65,7 @@ class RelationError:
             f"relations: translation {self.translation_m.mean:.4f} ± {self.translation_m.std:.4f} m, squared "
             f"{self.translation_squared_m2.mean:.4f} ± {self.translation_squared_m2.std:.4f} m²; rotation "
             f"{rotation.mean:.3f} ± {rotation.std:.3f} deg, squared {squared.mean:.3f} ± {squared.std:.3f} deg²; "
-            f"{self.translation_m.count} relations, {self.missing} missing"
+            f"{counted(self.translation_m.count, 'relation')}, {self.missing} missing"
         )
 
 
@@ -74,7 +75,7 @@ def read_relations(path: Path | str) -> Relations:
     rows: list[list[float]] = []
     for place, words in text_lines(path):
         if len(words) != 8:
-            raise InputError(f"{place} has {len(words)} fields, a relation has 8: {_FIELDS}")
+            raise InputError(f"{place} has {counted(len(words), 'field')}, a relation has 8: {_FIELDS}")
         stamps_ns.append([parse_stamp_ns(word, place) for word in words[:2]])
         rows.append(numbers(words[2:], place))
     if not rows:

@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.evaluate.absolute import path_length
 from pipeline.evaluate.pairing import Pairs
 from pipeline.evaluate.statistics import Statistics
+from pipeline.words import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class RelativeError:
         return (
             f"RPE rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
             f"max {self.translation_m.maximum:.4f}), rotation rmse {rotation.rmse:.4f} deg "
-            f"over {self.translation_m.count} stretches"
+            f"over {counted(self.translation_m.count, 'stretch', 'stretches')}"
         )
 
 
@@ -86,14 +87,16 @@ def motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> Matrix:
 def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> RelativeError:
     start = np.flatnonzero(end < len(pairs))
     if not len(start):
-        raise InputError(f"no stretch of {size} fits into {len(pairs)} paired poses; take a shorter one")
+        raise InputError(
+            f"no stretch of {size} fits into {counted(len(pairs), 'paired pose')}; take a shorter one"
+        )
     stretches = np.stack([start, end[start]], axis=1)
     error = motion_errors(pairs, stretches)
     errors_m, errors_rad = np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
     return RelativeError(
         definition=(
             f"RPE: translation and angle of (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) over {size}, from every start, "
-            f"{len(stretches)} stretches; {pairs.description}"
+            f"{counted(len(stretches), 'stretch', 'stretches')}; {pairs.description}"
         ),
         translation_m=Statistics.of(errors_m),
         rotation_rad=Statistics.of(errors_rad),

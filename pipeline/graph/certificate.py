@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +12,9 @@ from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from pipeline.graph.minorant import Minorants, minorise
-from pipeline.graph.observability import FreePose, free_text
 from pipeline.graph.soundness import is_connected
 from pipeline.kernels.graph_dual import scatter_dual
+from pipeline.words import counted
 
 _NOTHING = 1e-9  # χ² that is zero but for rounding; this share of the largest information where that is below 1
 _SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
@@ -61,7 +60,7 @@ def certify(
     problem: BetweenProblem,
     poses: Matrix,
     weights: NDArray[np.float64],
-    free: Sequence[FreePose],
+    undetermined: str,
     names: NDArray[np.int64],
 ) -> Certificate:
     """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
@@ -72,16 +71,16 @@ def certify(
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorisation goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function are bounded by zero instead: their χ² is part of the gap. Where poses are
-    ``free``, nothing is certified. ``names`` (K,) are what the poses are called.
+    measurements for such a function are bounded by zero instead: their χ² is part of the gap. What leaves
+    poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,) are what the poses are called.
     """
     begin = working_s()
     kept = weights > 0.0
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
     is_zero = chi2 <= _NOTHING * min(float(problem.information.max(initial=0.0)), 1.0)
-    if free:
-        return Certificate(False, chi2, chi2, free_text(free), working_s() - begin, is_zero)
+    if undetermined:
+        return Certificate(False, chi2, chi2, undetermined, working_s() - begin, is_zero)
     if is_zero:
         return Certificate(True, chi2, chi2, "", working_s() - begin, is_zero)
     if len(poses) - len(problem.free) > 1:
@@ -95,7 +94,7 @@ def certify(
     rest = problem.edges[kept & ~loose]
     if loose.any() and (given_up > _SHARES[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
         i, j = names[problem.edges[loose][0]]
-        reason = f"{loose.sum()} edges are too far from their measurements to be bounded, first {i}-{j}"
+        reason = f"{counted(int(loose.sum()), 'edge')} too far from what was measured to be bounded, first {i}-{j}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     gap = _gap(problem, minorants, kept & ~loose, chi2)
     if gap is None:
@@ -103,7 +102,8 @@ def certify(
         borrowing = kept & ((minorants.tau < 0.0) | (minorants.kappa < 0.0))
         if borrowing.any():
             i, j = names[problem.edges[borrowing][0]]
-            reason += f", or where Ω says little of some direction, first at {i}-{j} of {borrowing.sum():,} edges"
+            edges = counted(int(borrowing.sum()), "edge")
+            reason += f", or where Ω says little of some direction, first at {i}-{j} of {edges}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 

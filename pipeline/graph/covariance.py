@@ -9,17 +9,15 @@ from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 
 
-def own_covariances(problem: BetweenProblem, poses: Matrix) -> Matrix:
+def own_covariances(problem: BetweenProblem) -> Matrix:
     """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ); the fixed ones zero, a point's 2 × 2.
 
-    By the selected inverse of H, which the problem's solver has factored. Twists are (translation, rotation), so
-    the units are m², m rad, rad².
+    By the selected inverse of H over such twists, which the problem's solver has factored. Twists are
+    (translation, rotation), so the units are m², m rad, rad².
     """
     k = problem.freedom
-    result = np.zeros((len(poses), k, k))
-    of_left_twists = problem.packing.blocks(problem.cholesky.inverse_blocks())[: len(problem.free)]
-    adjoint = lie.adjoint(lie.inverse(poses[problem.free]))
-    result[problem.free] = adjoint @ of_left_twists @ np.swapaxes(adjoint, 1, 2)
+    result = np.zeros((len(problem.variable), k, k))
+    result[problem.free] = problem.packing.blocks(problem.cholesky.inverse_blocks())[: len(problem.free)]
     return result
 
 

@@ -8,6 +8,7 @@ from typing import Generic, Protocol
 import numpy as np
 
 from pipeline.graph.steps import E, LocalModel, StepRule, Vector
+from pipeline.words import counted
 
 
 class Landscape(Protocol[E]):
@@ -53,4 +54,4 @@ def descend(landscape: Landscape[E], now: E, rule: StepRule, max_iterations: int
             return Descent(now, iteration + 1, True, "χ² change below the tolerance")
         if np.abs(move.step).max(initial=0.0) <= tolerance:
             return Descent(now, iteration + 1, True, "step below the tolerance")
-    return Descent(now, max_iterations, False, f"{max_iterations} iterations reached")
+    return Descent(now, max_iterations, False, f"{counted(max_iterations, 'iteration')} reached")

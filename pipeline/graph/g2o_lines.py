@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError, shown
+from pipeline.graph.soundness import LARGEST
 from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
+from pipeline.words import counted
 
 VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
@@ -120,7 +122,9 @@ def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2o
 def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, rows: Rows) -> None:
     """Add a line's ids and numbers, each checked."""
     if len(words) != 1 + ids + numbers:
-        raise InputError(f"{path}:{number}: {words[0]} has {len(words) - 1} values, needs {ids + numbers}")
+        raise InputError(
+            f"{path}:{number}: {words[0]} has {counted(len(words) - 1, 'value')}, needs {ids + numbers}"
+        )
     try:
         rows.ids.append([_vertex_id(word) for word in words[1 : 1 + ids]])
         values = [float(word) for word in words[1 + ids :]]
@@ -128,6 +132,12 @@ def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, r
         raise InputError(f"{path}:{number}: {words[0]}: {error}") from error
     if not np.isfinite(values).all():
         raise InputError(f"{path}:{number}: {words[0]} has a value that is not finite; remove or mend the line")
+    for value in values:
+        if abs(value) > LARGEST:
+            raise InputError(
+                f"{path}:{number}: {' '.join(words[: 1 + ids])} has the value {value:g}, over {LARGEST:g}; "
+                "write metres and radians, and an inverse covariance of these"
+            )
     rows.numbers.append(values)
     rows.lines.append(number)
 

@@ -18,6 +18,7 @@ from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_to
 from pipeline.runs.whole_file import write_whole
 
 TORO_SUFFIXES = (".graph", ".toro")
+GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)
 
 
 Chosen = Literal["in force", "rejected"]

@@ -13,13 +13,16 @@ from pipeline.data import Matrix
 from pipeline.graph.between import BetweenProblem
 from pipeline.graph.cholesky import SingularMatrixError
 from pipeline.graph.soundness import is_connected, listed, loose
+from pipeline.words import counted
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # directions of the null space that are looked for
 _MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
 _NAMED = 1e-2  # component of a direction from which its axis is named
 _NOTHING = 1e-20  # share of the largest entry of its kind up to which a diagonal entry is rounding noise
+_FREE = 1e-18  # share of what a twist changes pose by pose up to which it changes nothing edge by edge
 _WEAK = 1e-6  # share of the median information up to which an edge is a weak one
+_LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +41,15 @@ class FreePose:
     followers: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        more = f" and {len(self.followers):,} that move with it" if self.followers else ""
-        return f"{self.name} ({', '.join(self.axes)}){more}"
+        names = listed(np.array([self.name, *self.followers]))
+        return f"{names} ({', '.join(self.axes)}){' as one body' if self.followers else ''}"
 
 
 def free_text(free: Sequence[FreePose]) -> str:
     """One line for people: how many poses are free, and which in what."""
     shown = ", ".join(map(str, free[:8])) + (", ..." if len(free) > 8 else "")
     count = sum(1 + len(pose.followers) for pose in free)
-    return f"the edges leave {count:,} pose{'s' * (count != 1)} free: {shown}"
+    return f"the edges leave {counted(count, 'pose')} free: {shown}"
 
 
 def free_poses(
@@ -58,17 +61,21 @@ def free_poses(
 ) -> tuple[FreePose, ...]:
     """Poses with directions of their own frames in which no edge holds them, at these poses and weights (E,).
 
-    ranks (E,) are those of the information matrices. Where edges of full rank join every pose to a fixed one,
-    nothing is free. Else the normal equations are factored, and every pivot that vanishes gets a prior: with
-    H' = H + Σ h e eᵀ over these, the null space of H is spanned by the columns of H'⁻¹ e.
+    ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
+    to a fixed one, nothing is free. Else the normal equations, without the axes along which an edge says next to
+    nothing, are factored, and every pivot that vanishes gets a prior: with H' = H + Σ h e eᵀ over
+    these, the null space of H is spanned by the columns of H'⁻¹ e.
     """
     fixed = problem.variable < 0
     kept = weights > 0.0
-    is_full = kept & (ranks == problem.freedom)
-    if is_connected(problem.edges[is_full], fixed):
+    shares = _shares(problem.information)
+    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > _WEAK)
+    if is_connected(problem.edges[is_strong], fixed):
         return ()
     apart = loose(problem.edges[kept & (ranks > 0)], fixed)
-    null = _null_space(problem, poses, weights * kept, problem.variable[apart])
+    measured = np.where(shares > _LOST, np.sqrt(weights * kept)[:, None], 0.0)
+    information = measured[:, :, None] * problem.information * measured[:, None, :]
+    null = _null_space(problem, poses, information, problem.variable[apart])
     bodies = _bodies(problem, poses, null)
     axes = {body[0]: _axes(null[problem.variable[body[0]]]) for body in bodies}
     axes |= {pose: _AXES[problem.freedom][: 2 if problem.is_point[pose] else None] for pose in apart}
@@ -99,26 +106,50 @@ def _axes(null: Matrix) -> tuple[str, ...]:
 
 def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Poses that hang on edges of less than a millionth of the median information of positions and rotations."""
-    d = 2 if information.shape[-1] == 3 else 3
-    diagonal = np.einsum("eaa->ea", information)
-    share = np.zeros(len(edges))
-    for part in (diagonal[:, :d].sum(axis=1), diagonal[:, d:].sum(axis=1)):
-        if (part > 0.0).any():
-            share = np.maximum(share, part / np.median(part[part > 0.0]))
-    return loose(edges[share > _WEAK], fixed)
+    return _hanging(edges, information, fixed, _WEAK)
+
+
+def lost(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Those of them whose edges say so little that nothing can be computed of where they are."""
+    return _hanging(edges, information, fixed, _LOST)
 
 
 def weak_text(names: NDArray[np.int64]) -> str:
     """One line for people."""
-    return f"by edges of less than a millionth of the usual information: {len(names):,} poses, {listed(names)}"
+    return f"{_group(names)} by edges of less than a millionth of the usual information"
 
 
-def _null_space(
-    problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64], apart: NDArray[np.int64]
-) -> Matrix:
+def lost_text(names: NDArray[np.int64]) -> str:
+    """One line for people."""
+    hang = "hangs" if len(names) == 1 else "hang"
+    return f"{_group(names)} {hang} on edges of next to no information, {_LOST:.0e} of the usual or less"
+
+
+def _group(names: NDArray[np.int64]) -> str:
+    return f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
+
+
+def _hanging(
+    edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
+) -> NDArray[np.int64]:
+    """Poses that no edges of more than this share of the usual information join to a fixed one."""
+    return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
+
+
+def _shares(information: Matrix) -> Matrix:
+    """Diagonals of information matrices (E, k), over the medians of what is known of positions and rotations."""
+    d = 2 if information.shape[-1] == 3 else 3
+    result = np.einsum("eaa->ea", information).copy()
+    for part in (result[:, :d], result[:, d:]):
+        known = part[part > 0.0]
+        part /= np.median(known) if len(known) else 1.0
+    return result
+
+
+def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
     """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are held."""
     pattern, k = problem.pattern, problem.freedom
-    values = problem.packing.values(_own_blocks(problem, poses, weights))
+    values = own_equations(problem, poses, information)
     is_turn = (np.arange(k) >= poses.shape[-1] - 1).astype(np.float64)
     is_rotation = problem.packing.rows(np.tile(is_turn, (len(problem.free), 1))) > 0.0
     diagonal = values[pattern.diagonal]
@@ -128,18 +159,21 @@ def _null_space(
     prior = np.where(is_nothing, np.maximum(largest, 1.0), diagonal)
     is_apart = np.zeros(len(problem.free), np.bool_)
     is_apart[apart] = True
-    values[pattern.diagonal] += np.where(np.repeat(is_apart, pattern.sizes), prior, 0.0)
-    vanished: list[int] = []
-    while len(vanished) < _MOST:
+    held = np.where(np.repeat(is_apart, pattern.sizes), prior, 0.0)
+    bare, vanished = values.copy(), list[int]()
+    while len(vanished) <= _MOST:
+        values[pattern.diagonal] = bare[pattern.diagonal] + held
         try:
             problem.cholesky.factorise(values)
-            break
+            scalar = _overlooked(problem, poses, information, held, prior)
         except SingularMatrixError as error:
-            vanished.append(error.scalar)
-            values[pattern.diagonal[error.scalar]] += prior[error.scalar]
-    else:
-        values[pattern.diagonal] += prior
-        problem.cholesky.factorise(values)
+            scalar = error.scalar
+        if scalar is None:
+            break
+        vanished.append(scalar)
+        held = held + (
+            prior if len(vanished) == _MOST else np.where(np.arange(pattern.scalars) == scalar, prior, 0.0)
+        )
     if not vanished:
         return np.zeros((len(problem.free), k, 0))
     ends = np.zeros((pattern.scalars, len(vanished)))
@@ -148,17 +182,48 @@ def _null_space(
     return null / np.abs(null).max(axis=(0, 1))
 
 
-def _own_blocks(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Matrix:
-    """Blocks of H = Σ w JᵀΩJ over twists of every pose in its own frame, T exp(ξ)."""
-    k, (i, j) = problem.freedom, problem.edges.T
-    jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
-    J_i, J_j = -jacobian @ adjoint[i], jacobian @ adjoint[j]
-    weighed = weights[:, None, None] * problem.information
+def _overlooked(
+    problem: BetweenProblem,
+    poses: Matrix,
+    information: Matrix,
+    held: NDArray[np.float64],
+    prior: NDArray[np.float64],
+) -> int | None:
+    """The scalar that moves most in a direction that is free though no pivot vanished, from rounding; or none.
+
+    The direction is the one that inverse iteration finds. What it changes is summed up edge by edge, where a free
+    one leaves but the square of the rounding.
+    """
+    z = np.random.default_rng(0).normal(size=len(prior)) * np.sqrt(prior)
+    for _ in range(3):
+        z = problem.cholesky.solve(z / np.abs(z).max())
+    blocks = np.concatenate([problem.packing.spread_rows(z), np.zeros((1, problem.freedom))])  # last: a fixed pose
+    moved = [
+        (J @ blocks[problem.variable[end], :, None])[..., 0]
+        for J, end in zip(_own_jacobians(problem, poses), problem.edges.T, strict=True)
+    ]
+    change = np.einsum("ea,eab,eb->", sum(moved), information, sum(moved)) + (held * z**2).sum()
+    if change > _FREE * (prior * z**2).sum():
+        return None
+    return int(np.argmax(prior * z**2))
+
+
+def own_equations(problem: BetweenProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
+    """Block values of H = Σ JᵀΩJ, with Ω (E, k, k), over twists of every pose in its own frame, T exp(ξ)."""
+    k = problem.freedom
+    J_i, J_j = _own_jacobians(problem, poses)
     blocks = np.zeros((len(problem.pattern.rows), k, k))
     slot_i, slot_j, pair = problem.slots.T
     for slot, J in ((slot_i, J_i), (slot_j, J_j)):
-        np.add.at(blocks, slot[slot >= 0], (np.swapaxes(J, 1, 2) @ weighed @ J)[slot >= 0])
-    coupling = np.swapaxes(J_i, 1, 2) @ weighed @ J_j
+        np.add.at(blocks, slot[slot >= 0], (np.swapaxes(J, 1, 2) @ information @ J)[slot >= 0])
+    coupling = np.swapaxes(J_i, 1, 2) @ information @ J_j
     coupling = np.where((slot_i > slot_j)[:, None, None], coupling, np.swapaxes(coupling, 1, 2))
     np.add.at(blocks, pair[pair >= 0], coupling[pair >= 0])
-    return blocks
+    return problem.packing.values(blocks)
+
+
+def _own_jacobians(problem: BetweenProblem, poses: Matrix) -> tuple[Matrix, Matrix]:
+    """Of the errors of all edges, (E, k, k), by own-frame twists of pose i and of pose j."""
+    jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
+    i, j = problem.edges.T
+    return -jacobian @ adjoint[i], jacobian @ adjoint[j]

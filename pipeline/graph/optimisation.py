@@ -7,23 +7,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState
+from pipeline.data import GraphState, fit_text
 from pipeline.graph.initialise import Initialisation
 from pipeline.graph.soundness import has_loop
 
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
-    """A graph before and after, for those who show it; χ² of both is that of the edges in force after."""
+    """A graph before and after, for those who show it, each with the edges that were in force then."""
 
     name: str
     before: GraphState
     after: GraphState
 
-    @property
-    def has_loops(self) -> bool:
-        """Whether an edge in force joins poses that the others join already."""
-        return has_loop(self.after.edges[~self.after.is_rejected], len(self.after.poses))
+
+def fit(state: GraphState) -> str:
+    """How well its edges in force agree, in words."""
+    rejected = int(state.is_rejected.sum())
+    return fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=has_loops(state))
+
+
+def has_loops(state: GraphState) -> bool:
+    """Whether an edge in force joins poses that the others join already."""
+    return has_loop(state.edges[~state.is_rejected], len(state.poses))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +39,7 @@ class Optimisation:
     Attributes
     ----------
     state : the graph as it is now
-    chi2_before, chi2_after : Σ w eᵀΩe over the edges in force in the end, at the poses before and of the answer
+    chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, at the poses of then
     cost_after : what was minimised: Σ eᵀΩe of all edges, with the robust loss of the loop edges
     iterations : linear solves
     converged, reason : whether and why the iteration stopped

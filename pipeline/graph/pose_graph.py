@@ -17,10 +17,19 @@ from pipeline.graph.covariance import own_covariances, relative_covariance
 from pipeline.graph.graduation import Judgement
 from pipeline.graph.growing_array import GrowingArray
 from pipeline.graph.initialise import Initialisation
-from pipeline.graph.observability import FreePose, free_poses, free_text, weakly_joined
+from pipeline.graph.observability import (
+    FreePose,
+    free_poses,
+    free_text,
+    lost,
+    lost_text,
+    own_equations,
+    weakly_joined,
+)
 from pipeline.graph.optimisation import Optimisation
 from pipeline.graph.solve import solve
 from pipeline.graph.soundness import check_connected, check_edges, ranks
+from pipeline.words import counted
 
 
 class PoseGraph:
@@ -144,8 +153,9 @@ class PoseGraph:
         is_loop = np.asarray(is_loop, np.bool_)
         if len(measurements) != len(edges) or is_loop.shape != (len(edges),):
             raise InputError(
-                f"measurements has {len(measurements)} entries, is_loop the shape {is_loop.shape}; wanted one for "
-                f"each of the {len(edges)} edges"
+                f"measurements has {counted(len(measurements), 'entry', 'entries')}, "
+                f"is_loop the shape {is_loop.shape}; wanted one for "
+                f"each of {counted(len(edges), 'edge')}"
             )
         self._add_edges(edges, measurements, information, is_loop)
 
@@ -174,7 +184,9 @@ class PoseGraph:
         """Hold this pose where it is, instead of pose 0."""
         index = checks.integer(index, "index", "the index of a pose")
         if not 0 <= index < len(self):
-            raise InputError(f"pose {index} cannot be fixed: the graph has {len(self)} poses; add it first")
+            raise InputError(
+                f"pose {index} cannot be fixed: the graph has {counted(len(self), 'pose')}; add it first"
+            )
         self._changed()
         self._fixed.add(index)
 
@@ -187,18 +199,18 @@ class PoseGraph:
         """
         begin = working_s()
         problem = self._prepared()
-        chi2_before = problem.chi2(problem.errors(self.poses))
+        chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
             solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
         except SingularMatrixError as error:
-            raise self._undetermined(error, problem) from error
+            raise self._singular(error, problem) from error
         minimum = solved.minimum
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         return Optimisation(
             state=self.state(),
-            chi2_before=self._in_force(chi2_before),
+            chi2_before=chi2_before,
             chi2_after=self._in_force(minimum.estimate.chi2),
             cost_after=minimum.estimate.cost,
             iterations=minimum.iterations,
@@ -210,19 +222,16 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
-        free = self.free_poses()
-        return certify(self._prepared(), self.poses, self.weight * ~self.is_rejected, free, self.names)
+        return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
 
     def free_poses(self) -> tuple[FreePose, ...]:
         """Poses that the edges in force leave free in some direction, at the poses of now."""
         self._factor_is_now = False
-        weight = self.weight * ~self.is_rejected
-        return free_poses(self._prepared(), self.poses, weight, self._rank.rows, self.names)
+        return free_poses(self._prepared(), self.poses, self._weight_in_force, self._rank.rows, self.names)
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
-        kept = ~self.is_rejected
-        return self.names[weakly_joined(self.edges[kept], self.information[kept], self.fixed)]
+        return self.names[weakly_joined(*self._edges_in_force, self.fixed)]
 
     def state(self) -> GraphState:
         """The graph as it is, for those who show or write it; odometry edges first."""
@@ -247,8 +256,20 @@ class PoseGraph:
         return relative_covariance(self._factored(), self.poses, i, j)
 
     def covariances(self) -> Matrix:
-        """Covariance (K, k, k) of every pose's twist in its own frame, given all edges at the poses of now."""
-        return own_covariances(self._factored(), self.poses)
+        """Covariance (K, k, k) of every pose's twist in its own frame, at the poses of now, of the edges in force.
+
+        Raises InputError where these leave poses free, or as good as free.
+        """
+        problem, undetermined = self._prepared(), self._undetermined()
+        if undetermined:
+            raise _refused(undetermined)
+        self._factor_is_now = False
+        try:
+            information = self._weight_in_force[:, None, None] * self.information
+            problem.cholesky.factorise(own_equations(problem, self.poses, information))
+        except SingularMatrixError as error:
+            raise self._singular(error, problem) from error
+        return own_covariances(problem)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")
@@ -265,7 +286,7 @@ class PoseGraph:
             try:
                 problem.cholesky.factorise(equations.values)
             except SingularMatrixError as error:
-                raise self._undetermined(error, problem) from error
+                raise self._singular(error, problem) from error
             self._factor_is_now = True
         return problem
 
@@ -277,14 +298,26 @@ class PoseGraph:
             self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
         return self._problem
 
-    def _undetermined(self, error: SingularMatrixError, problem: BetweenProblem) -> InputError:
+    def _undetermined(self) -> str:
+        """What the edges in force leave open, of which nothing can be computed; empty where they leave nothing."""
+        names = self.names[lost(*self._edges_in_force, self.fixed)]
+        free = () if len(names) else self.free_poses()
+        return lost_text(names) if len(names) else free_text(free) if free else ""
+
+    def _singular(self, error: SingularMatrixError, problem: BetweenProblem) -> InputError:
         """The error for poses that their edges leave free, or as good as free."""
-        pose = int(problem.free[error.variable])
-        free = self.free_poses() or (FreePose(int(self.names[pose]), ("next to no information",)),)
-        return InputError(
-            f"pose graph: {free_text(free)};"
-            " give their edges full information matrices, fix them or leave them out"
-        )
+        name = int(self.names[problem.free[error.variable]])
+        return _refused(self._undetermined() or free_text([FreePose(name, ("next to no information",))]))
+
+    @property
+    def _weight_in_force(self) -> NDArray[np.float64]:
+        return self.weight * ~self.is_rejected
+
+    @property
+    def _edges_in_force(self) -> tuple[NDArray[np.int64], Matrix]:
+        """Edges in force (E', 2), and w Ω of them."""
+        kept = ~self.is_rejected
+        return self.edges[kept], self.weight[kept, None, None] * self.information[kept]
 
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
         """The sum of w χ² over the edges in force, of χ² (E,)."""
@@ -299,3 +332,9 @@ class PoseGraph:
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
+
+
+def _refused(undetermined: str) -> InputError:
+    return InputError(
+        f"pose graph: {undetermined}; give their edges full information matrices, fix them or leave them out"
+    )

@@ -13,6 +13,7 @@ from pipeline.kernels.graph_soundness import judge_matrices
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
+LARGEST = 1e50  # number in a graph: products of a few such are still numbers
 
 
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
@@ -24,6 +25,14 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
     for index in np.flatnonzero(edges[:, 0] == edges[:, 1])[:1]:
         i, j = edges[index]
         raise InputError(f"edge {i}-{j} joins a pose to itself; remove it")
+    for numbers, what in ((measurements, "measurement"), (information, "information")):
+        largest = np.abs(numbers).max(axis=(1, 2), initial=0.0)
+        for index in np.flatnonzero(np.isfinite(largest) & (largest > LARGEST))[:1]:
+            i, j = edges[index]
+            raise InputError(
+                f"edge {i}-{j}: {what} of {largest[index]:g}, over {LARGEST:g}; give metres and radians, "
+                "and an inverse covariance of these"
+            )
     for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
         i, j = edges[index]
         raise InputError(
@@ -93,5 +102,7 @@ def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.i
 
 
 def listed(names: NDArray[np.int64]) -> str:
-    """The first of these names, for people."""
-    return ", ".join(map(str, names[:8].tolist())) + (", ..." if len(names) > 8 else "")
+    """These names, ascending, for people: "3, 5 to 9"; the first eight where they are scattered."""
+    runs = np.split(names, 1 + np.flatnonzero(np.diff(names) != 1))
+    shown = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run.tolist())) for run in runs[:8]]
+    return ", ".join(shown) + (", ..." if len(runs) > 8 else "")

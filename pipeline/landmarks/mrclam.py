@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from pipeline.errors import InputError
+from pipeline.words import counted
 
 _ROBOTS = 5  # subjects 1 to 5 are robots, the others landmarks (Leung et al. 2011)
 
@@ -103,7 +104,7 @@ def _table(path: Path, columns: int) -> Matrix:
     if not table.size:
         raise InputError(f"{path}: is empty; it must have {columns} numbers a line")
     if table.shape[1] != columns:
-        raise InputError(f"{path}: has {table.shape[1]} numbers a line; it must have {columns}")
+        raise InputError(f"{path}: has {counted(table.shape[1], 'number')} a line; it must have {columns}")
     if not np.isfinite(table).all():
         row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
         raise InputError(f"{path}: row {row + 1} is not finite; correct or remove it")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.data import Matrix
 from pipeline.errors import InputError
 from pipeline.landmarks.problem import Kind, LandmarkData
+from pipeline.words import counted
 
 _SHAPES = {
     "gt_traj": "(poses, 2)",
@@ -34,7 +35,8 @@ def read_landmark_data(path: Path) -> LandmarkData:
     )
     if len(odometry) != len(poses) - 1:
         raise InputError(
-            f"{path}: odom has {len(odometry)} steps between {len(poses)} poses of gt_traj; it must have one less"
+            f"{path}: odom has {counted(len(odometry), 'step')} "
+            f"between {counted(len(poses), 'pose')} of gt_traj; it must have one less"
         )
     observed = _indices(path, table, len(poses), len(landmarks))
     return LandmarkData(

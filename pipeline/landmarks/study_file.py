@@ -22,7 +22,7 @@ from pipeline.landmarks.relative_position import linear_system, state_of
 from pipeline.landmarks.solvers import create_solver, methods_for
 from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
 from pipeline.landmarks.system import LinearSystem
-from pipeline.words import counted
+from pipeline.words import FREEDOM, counted
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 
@@ -94,7 +94,7 @@ def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
         if 0.5 <= chi2 / freedom <= 2.0
         else "the noise model does not fit, or a poor minimum"
     )
-    return Fact("χ²", f"{chi2:.4f} over {freedom} degrees of freedom: {chi2 / freedom:.3f}; {verdict}")
+    return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
 
 
 def _guess(problem: BearingRangeProblem, guess: Guess) -> State:

@@ -70,7 +70,8 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     ended = "converged" if solution.converged else "DID NOT CONVERGE"
     count = len(log.seen_s)
     worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
-    seen = f"{count:,} of {len(solution.landmarks)} landmarks from {len(solution.nodes_s):,} poses; they {worth}"
+    nodes = counted(len(solution.nodes_s), "pose")
+    seen = f"{count:,} of {len(solution.landmarks)} landmarks from {nodes}; they {worth}"
     left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
     noise = solution.odometry_noise
     wheels = (

@@ -14,6 +14,7 @@ from pipeline.landmarks.accuracy import Accuracy
 from pipeline.landmarks.compare import MethodResult
 from pipeline.landmarks.study import Study
 from pipeline.trajectory import write_tum
+from pipeline.words import counted
 
 _HEADINGS = (
     "method",
@@ -69,7 +70,8 @@ def text_of(study: Study) -> str:
 def size_of(study: Study) -> str:
     """A in words."""
     return (
-        f"{study.rows:,} rows, {study.columns:,} columns, {study.entries:,} entries,"
+        f"{counted(study.rows, 'row')}, {counted(study.columns, 'column')}, "
+        f"{counted(study.entries, 'entry', 'entries')},"
         f" put together in {1e3 * study.build_s:.1f} ms"
     )
 

@@ -24,6 +24,7 @@ from pipeline.logs.records import (
     FileIndex,
     Message,
 )
+from pipeline.words import counted
 
 
 class DamagedBlockError(Exception):
@@ -59,7 +60,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     told = sum(entry.messages for entry in block.entries)
     if strangers:
         return Contents(
-            messages, f"{_name(index, block)}: {strangers} messages name a channel that nothing defines"
+            messages, f"{_name(index, block)}: {counted(strangers, 'message')} of a channel that nothing defines"
         )
     return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
 

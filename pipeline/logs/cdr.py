@@ -8,6 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.words import counted
+
 
 class MalformedMessageError(Exception):
     """A message that is not what its schema says; the text says where it ends too early."""
@@ -79,7 +81,9 @@ class CdrReader:
         return seconds * 1_000_000_000 + nanoseconds, self.string()
 
     def _complain(self, end: int) -> None:
-        raise MalformedMessageError(f"it has {len(self.data)} bytes, but its fields reach to byte {end}")
+        raise MalformedMessageError(
+            f"it has {counted(len(self.data), 'byte')}, but its fields reach to byte {end}"
+        )
 
 
 @cache

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from pipeline.logs.records import FileIndex
+from pipeline.words import counted
 
 
 def check_claims(index: FileIndex, chunks_told: int, private: Sequence[int]) -> None:
@@ -22,11 +23,11 @@ def check_claims(index: FileIndex, chunks_told: int, private: Sequence[int]) -> 
     is_indexed = all(block.entries for block in index.blocks)
     if index.is_counted and not index.is_trusted and (is_indexed or chunks != chunks_told):
         index.damage.append(
-            f"{index.path}: its {chunks} chunks and {totals.total()} indexed messages are not the "
-            f"{chunks_told} and {sum(told.values())} of its statistics"
+            f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
+            f"are not the {chunks_told} and {sum(told.values())} of its statistics"
         )
     if private and not index.is_counted:  # nothing tells whether one of them was a chunk
         index.damage.append(
-            f"{index.path}: {len(private)} records of unknown kinds were passed over, "
+            f"{index.path}: passed over {counted(len(private), 'record')} of unknown kinds, "
             f"the first at byte {private[0]}"
         )

@@ -12,7 +12,7 @@ from pipeline.logs.formats.carmen import index_carmen
 from pipeline.logs.formats.cloud_file import SUFFIXES
 from pipeline.logs.formats.cloud_folder import index_clouds
 from pipeline.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
-from pipeline.logs.formats.made import left_out, natural_order
+from pipeline.logs.formats.made import KNOWN, left_out, natural_order, unknown
 from pipeline.logs.index import index_file
 from pipeline.logs.records import MAGIC, FileIndex
 from pipeline.logs.remote import RemoteFile
@@ -24,10 +24,6 @@ from pipeline.source import Source
 Indexer = Callable[[Path, int], FileIndex]
 
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
-_KNOWN = (
-    "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "
-    "of KITTI raw or odometry, or of PCD, PLY, .npy or .bin files"
-)
 
 
 def index_files(sources: Sequence[Source], rate_hz: float = 0.0) -> list[FileIndex]:
@@ -101,7 +97,7 @@ def _file_indexer(path: Path) -> Indexer:
     if head.startswith((b"BZh", b"\x1f\x8b")) or _looks_like_carmen(head):
         return index_carmen
     if head and not head.startswith(MAGIC):
-        raise InputError(f"{path}: is no log that is known (starts with {head[:8]!r}); give {_KNOWN}")
+        raise unknown(path, head, f"starts with {head[:8]!r}")
     return index_file
 
 
@@ -114,7 +110,7 @@ def _folder_indexer(path: Path, rate_hz: float) -> Indexer:
         return index_kitti_odometry
     if any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir()):
         return lambda folder, number: index_clouds(folder, number, rate_hz)
-    raise InputError(f"{path}: is a folder of no log that is known; give {_KNOWN}")
+    raise InputError(f"{path}: is a folder of no log that is known; give {KNOWN}")
 
 
 def _looks_like_carmen(head: bytes) -> bool:

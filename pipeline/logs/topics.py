@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pipeline.errors import InputError
 from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
 from pipeline.logs.records import Channel, FileIndex
+from pipeline.words import counted
 
 _MOST_LISTED = 8
 _IMU = ("sensor_msgs/Imu",)
@@ -118,7 +119,7 @@ def is_lidar(channel: Channel) -> bool:
 def _damage(indexes: Sequence[FileIndex]) -> str:
     """What may be why a topic is not there."""
     damage = [line for index in indexes for line in index.damage]
-    return f"; it is damaged in {len(damage)} places, the first: {damage[0]}" if damage else ""
+    return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
 
 
 def _listed(channels: Iterable[Channel]) -> str:

@@ -15,6 +15,7 @@ from pipeline.kernels.estimate import Terms
 from pipeline.kernels.matching import Answer, Expectation, match
 from pipeline.kernels.validity import largest_magnitude
 from pipeline.matching.voxel_map import VoxelMap
+from pipeline.words import counted
 
 OPTIMISERS = {
     "gradient-descent": GRADIENT_DESCENT,
@@ -164,8 +165,8 @@ def _chance(answer: Answer, points: int, target: VoxelMap) -> str:
         )
     if len(target) < 2 * _REDUNDANCY * freedom:
         return (
-            f"the map has {len(target)} voxels, fewer than {2 * _REDUNDANCY} for each degree of freedom: "
-            f"lower local_map.voxel_size_m ({voxel_m:g})"
+            f"the map has {counted(len(target), 'voxel')}, fewer than {2 * _REDUNDANCY} for each degree of "
+            f"freedom: lower local_map.voxel_size_m ({voxel_m:g})"
         )
     if answer.range_m < _SPAN_VOXELS * voxel_m:
         return (

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pipeline import checks
 from pipeline.data import Points, Pose
 from pipeline.errors import InputError, ScanchainError
+from pipeline.words import counted
 
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
 _ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise
@@ -32,7 +33,9 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] 
     source = checks.points(source, "source", d)
     target = checks.points(target, "target", d)
     if len(target) != len(source):
-        raise InputError(f"target has {len(target)} points, source {len(source)}; wanted pairs, row by row")
+        raise InputError(
+            f"target has {counted(len(target), 'point')}, source {len(source)}; wanted pairs, row by row"
+        )
     weight = np.ones(len(source)) if weight is None else checks.weights(weight, "weight", len(source))
     total = weight.sum()
     if len(source) < d or total <= 0.0:

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
-from pipeline.errors import InputError
 from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
-from pipeline.logs.formats.made import made_block, made_channel, made_index
+from pipeline.logs.formats.made import made_block, made_channel, made_index, unknown
 from pipeline.logs.formats.packed_text import read_text
 from pipeline.logs.pack import Link, pack_transforms
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
@@ -31,8 +30,8 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     index = made_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
-        raise InputError(
-            f"{path}: has no line of {', '.join(kind.decode() for kind in KINDS)}; is it a CARMEN log?"
+        raise unknown(
+            path, text, damage.removeprefix(f"{path}: ") or f"text without a line of {b', '.join(KINDS).decode()}"
         )
     return index
 

@@ -15,6 +15,7 @@ from pipeline.logs.formats.made import left_out, made_block, made_channel, made_
 from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import LATEST_NS, pack_cloud
 from pipeline.logs.records import Block, Contents, FileIndex, Message
+from pipeline.words import counted
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
 _FIRST_FILES = 3
@@ -70,8 +71,8 @@ def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[
         names = " ".join(points.dtype.names or ())
         suffix = file.suffix.lower()
         guess = " (as their numbers suggest)" if suffix == ".bin" else ""
-        held = f"{names}, {kinds}{guess}; {len(points):,} points in {file.name}"
-        return [f"{folder}: {len(files):,} {suffix} files of {held}"]
+        held = f"{names}, {kinds}{guess}; {counted(len(points), 'point')} in {file.name}"
+        return [f"{folder}: {counted(len(files), f'{suffix} file')} of {held}"]
     return []
 
 

@@ -25,6 +25,7 @@ from pipeline.logs.formats.made import made_block, made_channel, made_index, nat
 from pipeline.logs.formats.point_rows import CloudFileError
 from pipeline.logs.pack import pack_cloud, pack_odometry, place
 from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
+from pipeline.words import counted
 
 _TRUTH = -1  # the block of the ground truth
 _POSE_BYTES = 720
@@ -60,7 +61,10 @@ def _raw_truth(index: FileIndex, folder: Path) -> Told:
     times_ns = read_times(folder / "oxts" / "timestamps.txt")
     poses = read_oxts(folder / "oxts" / "data", read_calibration(calibration))
     if len(poses) != len(times_ns):
-        raise InputError(f"{folder / 'oxts'}: has {len(poses)} readings and {len(times_ns)} times; fetch it again")
+        raise InputError(
+            f"{folder / 'oxts'}: has {counted(len(poses), 'reading')} and {counted(len(times_ns), 'time')}; "
+            "fetch it again"
+        )
     return list(zip(times_ns, poses, strict=True))
 
 
@@ -94,7 +98,7 @@ def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], tol
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
         raise InputError(
-            f"{files[-1]}: does not fit the {len(times_ns)} timestamps; names must be numbers from 0 up"
+            f"{files[-1]}: does not fit the {counted(len(times_ns), 'timestamp')}; names must be numbers from 0 up"
         )
     lidar = made_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
     for entry, file in enumerate(files):

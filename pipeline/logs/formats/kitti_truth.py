@@ -11,6 +11,7 @@ from pipeline import lie
 from pipeline.data import Matrix, Pose
 from pipeline.errors import InputError
 from pipeline.logs.pack import LATEST_NS
+from pipeline.words import counted
 
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
@@ -106,7 +107,8 @@ def _table(file: Path, columns: int) -> Matrix:
     few = next((number for number, row in enumerate(words, start=1) if len(row) < columns), 0)
     if few:
         raise InputError(
-            f"{file}: line {few} has {len(words[few - 1])} columns, {columns} are needed; fetch it again"
+            f"{file}: line {few} has {counted(len(words[few - 1]), 'column')}, {columns} are needed; "
+            "fetch it again"
         )
     try:
         rows = np.array([row[:columns] for row in words], np.float64).reshape(-1, columns)

@@ -34,6 +34,7 @@ from pipeline.logs.formats.ros1_bag_records import (
 )
 from pipeline.logs.records import Block, Channel, Contents, Entry, FileIndex, Message
 from pipeline.logs.walk import is_believable
+from pipeline.words import counted
 
 _INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
 
@@ -117,7 +118,9 @@ class _Bag:
         except struct.error:
             damage = f"{name}: a record in it is malformed; what follows was left out"
             return Contents(messages, "" if block.is_cut else damage)
-        return Contents(messages, f"{name}: {strangers} messages name no known connection" if strangers else "")
+        return Contents(
+            messages, f"{name}: {counted(strangers, 'message')} of no known connection" if strangers else ""
+        )
 
     def _is_known(self, block: Block) -> bool:
         """Whether it is known what a chunk holds, and all its connections are."""
