@@ -25,7 +25,7 @@ def test_ways_are_drawn_in_their_colours_on_white(tmp_path):
         tmp_path / "a.png", title="t", optimised=circle(10.0), odometry=circle(12.0), ground_truth=circle(8.0)
     )
     pixels = image.imread(tmp_path / "a.png")
-    for colour in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.10, 0.10, 0.10)):
+    for colour in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)):
         assert share_of(pixels, colour) > 0.001
     assert share_of(pixels, (1.0, 1.0, 1.0)) > 0.8
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.data import GraphState, fit_text
 from pipeline.graph.optimisation import GraphChange
 from pipeline.runs.whole_file import write_whole
+from pipeline.words import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,8 +33,9 @@ def draw_graph(change: GraphChange, path: Path) -> None:
     panels = figure.subplots(1, 2)
     for axes, state, when in zip(panels, (change.before, change.after), ("before", "after"), strict=True):
         _draw_state(axes, state)
-        rejected = int(state.is_rejected.sum())
-        fit = fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=change.has_loops)
+        count = int(state.is_rejected.sum())
+        rejected = f"{counted(count, 'edge')} rejected" if count else ""
+        fit = fit_text(state.chi2, state.degrees_of_freedom, rejected, has_loops=change.has_loops)
         axes.set_title(f"{change.name} {when}\n{fit}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)

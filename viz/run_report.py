@@ -68,7 +68,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "pose graph", m.fit
-    yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
+    yield "loop closures", m.closures
     yield (
         "matching",
         f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",

@@ -21,8 +21,10 @@ _NUMBERS = (
     "lost",
     "keyframes",
     "closures_tried",
+    "closures_rejected_by_verification",
+    "closures_verified",
+    "closures_rejected_by_back_end",
     "closures_accepted",
-    "closures_rejected",
     "degrees_of_freedom",
 )
 _FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "travelled_m", "chi2", "median_residual_m")

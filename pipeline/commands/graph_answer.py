@@ -81,7 +81,7 @@ class Answer:
         """Of the edges in force, with how many degrees of freedom."""
         done, degrees = self.optimisation, self.optimisation.state.degrees_of_freedom
         if degrees == 0 and not self.change.has_loops:
-            return fit_text(done.chi2_after, degrees, 0)
+            return fit_text(done.chi2_after, degrees, "", has_loops=False)
         return f"{done.chi2_before:.6g} before, {done.chi2_after:.8g} after, over {degrees:,} degrees of freedom"
 
     def json(self, written: list[Path]) -> str:

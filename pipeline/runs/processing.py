@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -67,6 +67,7 @@ def process(
             config=config.recording,
         ) as recording,
         journal,
+        closing(scans),  # what it left out is counted then, also if the run was stopped
     ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
@@ -96,7 +97,7 @@ def process(
 
 def _begin(
     job: Job, log: Log, config: Config, folder: Path, left: Left | None
-) -> tuple[Slam, Iterator[Scan], Checkpoints]:
+) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
     """The chain, new or as it was left, the scans that it has not seen, and what writes it down."""
     if left is None:
         slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)

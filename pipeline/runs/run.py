@@ -97,7 +97,7 @@ def run(
                 warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.judged,
-                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings,
+                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
                 metrics.write(folder / "metrics.json")
