@@ -622,6 +622,12 @@ def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_pat
     assert errors.startswith(f"warning: no accuracy against {tmp_path / 'ends.tum'}: ")
     says((tmp_path / "a" / "summary.txt").read_text(), "no accuracy against", "--max-gap")
     assert metrics(tmp_path / "a")["ground_truth"] is None
+    words = ["run", office, "--rerun", "off", "--gt", tmp_path / "ends.tum", "--max-gap", "100"]
+    code, _, errors = call(*words, "--out", tmp_path / "b")
+    assert code == 0 and "s apart, and the path between them is taken as straight" in errors
+    assert metrics(tmp_path / "b")["ground_truth"]["max_gap_s"] == 100.0
+    assert "Accuracy" in (tmp_path / "b" / "report.html").read_text()
+    assert call("view", tmp_path / "b", "--png", tmp_path / "b.png")[0] == 0
 
 
 def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, office):
@@ -799,7 +805,8 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tmp_path):
     estimate, truth = quarter(tmp_path / "est.tum", 1.1), quarter(tmp_path / "gt.tum")
     code, output, errors = call("evaluate", estimate, truth)
     assert (code, errors) == (0, "")
-    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE rmse", "over 10 m along the reference", "KITTI: translation")
+    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE over 10 m along the reference: rmse ", "KITTI: translation")
+    assert output.count("40 of 40 estimated poses") == 1 and "gaps up to" not in output
     tree = json.loads(call("evaluate", estimate, truth, "--align", "first", "--json")[1])
     assert set(tree) == {"ate", "rpe_1_pose", "rpe_1_s", "rpe_10_m", "rpe_100_m", "kitti"}
     assert tree["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class GridPicture:
 
 
 def draw_map(
-    path: Path,
+    file: Path | BinaryIO,
     *,
     title: str,
     optimised: Matrix,
@@ -68,7 +68,7 @@ def draw_map(
     axes.set_title(title, loc="left", fontsize=11)
     if len(ways):
         axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    figure.savefig(path, dpi=150, facecolor="white")
+    figure.savefig(file, dpi=150, facecolor="white", format="png")
 
 
 def _frame(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from io import BytesIO
 from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.evaluate import on_the_estimate
 from pipeline.maps import read_map, read_ply
 from pipeline.runs.directory import TRUTH_FILE
+from pipeline.runs.whole_file import write_whole
 from pipeline.trajectory import read_tum
 from viz.plots import GridPicture, draw_map
 
@@ -15,10 +18,8 @@ from viz.plots import GridPicture, draw_map
 def draw_run(directory: Path, picture: Path) -> None:
     """Draw trajectories, ground truth and map of a run to a PNG: the occupancy grid in 2D, the cloud in 3D.
 
-    Raises InputError where the directory is no run's, or the picture does not end in .png or cannot be written.
+    Raises InputError where the directory is no run's, or the picture cannot be written.
     """
-    if picture.suffix != ".png":
-        raise InputError(f"{picture}: is no .png; name a file that ends in .png")
     if not (directory / "trajectory.tum").exists():
         raise InputError(f"{directory}: holds no trajectory.tum; give the directory of a finished run")
     points = read_ply(directory / "map.ply")
@@ -26,16 +27,21 @@ def draw_run(directory: Path, picture: Path) -> None:
     cells, resolution_m, origin_m = read_map(directory)
     optimised, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
     truth_file = directory / TRUTH_FILE
-    truth = on_the_estimate(optimised, read_tum(truth_file)) if truth_file.exists() else None
+    truth = None
+    if truth_file.exists():
+        judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
+        truth = on_the_estimate(optimised, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
+    drawn = BytesIO()
+    draw_map(
+        drawn,
+        title=directory.resolve().name,
+        optimised=optimised.poses,
+        odometry=odometry.poses,
+        ground_truth=None if truth is None else truth.poses,
+        points=None if is_planar else points,
+        grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
+    )
     try:
-        draw_map(
-            picture,
-            title=directory.resolve().name,
-            optimised=optimised.poses,
-            odometry=odometry.poses,
-            ground_truth=None if truth is None else truth.poses,
-            points=None if is_planar else points,
-            grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
-        )
+        write_whole(picture, drawn.getvalue())
     except OSError as error:
         raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error

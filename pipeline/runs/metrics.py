@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from pipeline.data import State, Trajectory, fit_text
 from pipeline.errors import InputError
-from pipeline.evaluate import absolute_error_on_any_course, kitti_error_on_any_course, pair
+from pipeline.evaluate import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
 from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
@@ -45,12 +45,16 @@ class Accuracy(Struct, frozen=True):
 
 
 class GroundTruth(Struct, frozen=True):
-    """How good the run is: after optimisation and before."""
+    """How good the run is: after optimisation and before.
+
+    ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
+    """
 
     source: str
     path_length_m: float
     optimised: Accuracy
     odometry: Accuracy
+    max_gap_s: float | None = None
 
     @property
     def complaint(self) -> str:
@@ -214,11 +218,14 @@ def unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
     return f"{line}: the surroundings leave it open there, or the log is at fault (scanchain doctor)"
 
 
-def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth:
-    """Both trajectories of a result against the ground truth."""
-    optimised, length_m = _accuracy(result.trajectory, reference)
-    odometry, _ = _accuracy(result.odometry, reference)
-    return GroundTruth(source, length_m, optimised, odometry)
+def judge(
+    result: SlamResult, reference: Trajectory, source: str, gap_s: float | None
+) -> tuple[GroundTruth, list[str]]:
+    """Both trajectories of a result against the ground truth, and why that may mislead, a line each."""
+    pairs = pair(result.trajectory, reference, gap_s=gap_s)
+    optimised, length_m = _accuracy(pairs)
+    odometry, _ = _accuracy(pair(result.odometry, reference, gap_s=gap_s))
+    return GroundTruth(source, length_m, optimised, odometry, gap_s), pairs.warnings
 
 
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
@@ -250,8 +257,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
 
 
-def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, float]:
-    pairs = pair(trajectory, reference)
+def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
     ate = absolute_error_on_any_course(pairs)
     try:
         kitti = kitti_error_on_any_course(pairs)
@@ -267,7 +273,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
-        definition=ate.definition,
+        definition=f"{ate.definition}, over {ate.pairing}",
     )
     return accuracy, ate.path_length_m
 

@@ -86,7 +86,7 @@ def process(
             cloud = write_results(folder, result, judged, config, recording)
             write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
             steps.write(folder / "steps.parquet", result.trajectory)
-            _show_truth(true_poses, result, recording)
+            _show_truth(true_poses, job.max_gap_s, result, recording)
             if config.outputs.mcap:
                 write_results_mcap(folder, log, steps, result)
         slam.points.close()
@@ -110,12 +110,13 @@ def _begin(
     return checkpoint.slam, scans, checkpoints
 
 
-def _show_truth(true_poses: TruePoses, result: SlamResult, recording: Recorder) -> None:
+def _show_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:
     """Ground truth into the recording, moved onto the trajectory; one that does not fit is warned of elsewhere."""
     with suppress(InputError):
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is not None:
-            recording.log_ground_truth(on_the_estimate(result.trajectory, reference).poses)
+            moved = on_the_estimate(result.trajectory, reference, gap_s=gap_s)
+            recording.log_ground_truth(moved.poses)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:
