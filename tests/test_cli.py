@@ -616,7 +616,7 @@ def test_a_topic_of_true_poses_that_keeps_another_clock_is_refused_before_the_wo
 
 def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_path, office):
     ends = read_tum(office.with_suffix(".tum")).stamps_ns[[0, -1]] / 1e9 + np.array([-1.0, 1.0])
-    (tmp_path / "ends.tum").write_text("".join(f"{stamp:.9f} {stamp} 0 0 0 0 0 1\n" for stamp in ends))
+    (tmp_path / "ends.tum").write_text("".join(f"{stamp:.9f} {k} 0 0 0 0 0 1\n" for k, stamp in enumerate(ends)))
     code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "ends.tum")
     assert code == 0 and errors.count("\n") == 1
     assert errors.startswith(f"warning: no accuracy against {tmp_path / 'ends.tum'}: ")
@@ -627,7 +627,14 @@ def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_pat
     assert code == 0 and "s apart, and the path between them is taken as straight" in errors
     assert metrics(tmp_path / "b")["ground_truth"]["max_gap_s"] == 100.0
     assert "Accuracy" in (tmp_path / "b" / "report.html").read_text()
-    assert call("view", tmp_path / "b", "--png", tmp_path / "b.png")[0] == 0
+    picture = tmp_path / "b.png"
+    assert call("view", tmp_path / "b", "--png", picture)[0] == 0
+    before = picture.read_bytes()
+    picture.write_bytes(b"mine")
+    code, _, errors = call("view", tmp_path / "b", "--png", picture)
+    assert code == 2 and "--force" in errors and picture.read_bytes() == b"mine"
+    assert call("view", tmp_path / "b", "--png", picture, "--force")[0] == 0
+    assert picture.read_bytes() == before
 
 
 def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, office):

@@ -155,6 +155,13 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         pytest.fail("it was made")
 
 
+def test_a_run_is_not_written_into_another(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "run.json").write_text('{"versions": {"scanchain": "1"}}')
+    with pytest.raises(InputError, match=r"lies in the run directory .*a; choose another --out"):
+        RunDirectory(tmp_path / "a" / "b" / "c", force=True)
+
+
 # whole runs
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
 from viz.courses import TRUTH
+from viz.figure_file import write_figure
 from viz.map_figures import extent
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class GridPicture:
 
 
 def draw_map(
-    file: Path | BinaryIO,
+    path: Path,
     *,
     title: str,
     optimised: Matrix,
@@ -68,7 +69,7 @@ def draw_map(
     axes.set_title(title, loc="left", fontsize=11)
     if len(ways):
         axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    figure.savefig(file, dpi=150, facecolor="white", format="png")
+    write_figure(path, figure, dpi=150)
 
 
 def _frame(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from io import BytesIO
 from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.evaluate import on_the_estimate
 from pipeline.maps import read_map, read_ply
 from pipeline.runs.directory import TRUTH_FILE
-from pipeline.runs.whole_file import write_whole
 from pipeline.trajectory import read_tum
 from viz.plots import GridPicture, draw_map
 
@@ -31,17 +29,15 @@ def draw_run(directory: Path, picture: Path) -> None:
     if truth_file.exists():
         judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
         truth = on_the_estimate(optimised, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
-    drawn = BytesIO()
-    draw_map(
-        drawn,
-        title=directory.resolve().name,
-        optimised=optimised.poses,
-        odometry=odometry.poses,
-        ground_truth=None if truth is None else truth.poses,
-        points=None if is_planar else points,
-        grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
-    )
     try:
-        write_whole(picture, drawn.getvalue())
+        draw_map(
+            picture,
+            title=directory.resolve().name,
+            optimised=optimised.poses,
+            odometry=odometry.poses,
+            ground_truth=None if truth is None else truth.poses,
+            points=None if is_planar else points,
+            grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
+        )
     except OSError as error:
         raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error
