@@ -112,7 +112,7 @@ def parse_stamp_ns(text: str, place: str) -> int:
         raise InputError(
             f"{place} has the stamp {text!r}; it must be a number of seconds (begin a line of column names with #)"
         ) from None
-    if not seconds.is_finite() or abs(seconds) > 9_000_000_000:
+    if not seconds.is_finite() or not -(2**63) <= seconds * _NS_PER_S < 2**63:
         raise InputError(
             f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds; give it in seconds"
         )

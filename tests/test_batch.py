@@ -23,6 +23,7 @@ from pipeline.logs.write import LogWriter
 from pipeline.memory import resident_mib
 from pipeline.simulate import simulate
 from pipeline.source import Address
+from viz.batch_report import names_of
 
 POISON = """
 import sys
@@ -236,6 +237,11 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
         collect([], [])
     with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
         collect([], [tmp_path / "none.txt"])
+
+
+def test_logs_of_the_same_name_are_told_apart_by_their_folders():
+    logs = ["/a/x/log.bag", "/b/x/log.bag", "/c/other.bag", "https://host/a/one.mcap"]
+    assert list(names_of(logs).values()) == ["a/x/log.bag", "b/x/log.bag", "other.bag", "one.mcap"]
 
 
 def test_a_batch_is_not_written_among_logs_nor_into_a_run(tmp_path, capsys):
