@@ -21,7 +21,7 @@ _MARGIN = 0.25
 _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
-_TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 1.5))}
+_TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 3))}
 _BLIND, _PLAIN = 0.01, 1000.0  # times the least that must be known; less and more are drawn as that
 _BAR_INCHES = 0.65  # of a colour bar and its numbers
 

@@ -48,7 +48,7 @@ def path_over_map(
     with Sheet.of_plan(name, low, high) as sheet:
         _draw_points(sheet, points, low, high, by_height=False)
         for line in lines:
-            style = (0, (1, 1.5)) if line.is_dashed else "-"
+            style = (0, (3, 3)) if line.is_dashed else "-"
             x, y = line.positions[:, :2].T
             sheet.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
         for place, marker in ((0, "o"), (-1, "s")):
