@@ -66,3 +66,15 @@ def test_a_3d_map_is_drawn_from_above(tmp_path):
 def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(tmp_path):
     draw_map(tmp_path / "a.png", title="t", optimised=np.empty((0, 3, 3)))
     assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch):
+    def fail(figure, file, **_):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "a.png").write_bytes(b"old")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
+    with pytest.raises(OSError, match="No space"):
+        draw_map(tmp_path / "a.png", title="t", optimised=circle(10.0))
+    assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
