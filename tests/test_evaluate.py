@@ -16,6 +16,7 @@ from pipeline.evaluate import (
     absolute_error,
     kitti_error,
     kitti_error_on_any_course,
+    on_the_estimate,
     pair,
     read_relations,
     read_truth,
@@ -24,6 +25,7 @@ from pipeline.evaluate import (
     relative_error_over_frames,
     relative_error_over_time,
 )
+from pipeline.evaluate.absolute import path_length
 from pipeline.evaluate.pairing import nearest
 from pipeline.logs import open_log
 from pipeline.odometry import Odometry
@@ -342,6 +344,18 @@ def test_truth_that_may_mislead_is_warned_of():
     assert few == "accuracy is that of 30 of 100 scans alone: 70 without a true pose: 70 after it ends"
     assert pair(drive(5), drive(5)).warnings == ["accuracy is that of 5 poses alone"]
     assert pair(every, drive(100)).warnings == []
+
+
+def test_noise_of_a_fast_truth_does_not_lengthen_the_path_that_is_shown():
+    estimate = at_rate(drive(200), 20)
+    poses = drive(200).poses.copy()
+    poses[:, :3, 3] += np.random.default_rng(0).normal(0.0, 0.5, (200, 3))
+    noisy = Trajectory(drive(200).stamps_ns, poses)
+    pairs = pair(estimate, noisy)
+    shown = on_the_estimate(estimate, noisy)
+    assert shown.stamps_ns.tolist() == estimate.stamps_ns.tolist()
+    assert path_length(shown.poses)[-1] == pytest.approx(absolute_error(pairs).path_length_m)
+    assert path_length(shown.poses)[-1] < 0.9 * path_length(noisy.poses)[-1]
 
 
 def test_truth_at_one_instant_is_told_from_that_of_another_clock():
