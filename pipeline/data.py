@@ -252,14 +252,13 @@ class GraphState:
         return self.weight < REJECTED_WEIGHT
 
 
-def fit_text(
-    chi2: float, degrees_of_freedom: int, rejected: int, noun: str = "closures", *, has_loops: bool = False
-) -> str:
+def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: bool) -> str:
     """How well the edges in force agree, in words: χ², its degrees of freedom, how many edges do not count.
 
+    rejected : how many edges are not in force, in words; empty for none
     Loops that measure too little to leave degrees of freedom have a χ² all the same: ``has_loops`` tells of them.
     """
-    left_out = f", {counted(rejected, noun.removesuffix('s'))} rejected" if rejected else ""
+    left_out = rejected and f", {rejected}"
     if degrees_of_freedom == 0 and not has_loops:
         return f"no loops {'in force ' if rejected else ''}to check{left_out}"
     shown = f"{chi2:,.0f}" if 100.0 <= chi2 < 1e7 else f"{chi2:.3g}"

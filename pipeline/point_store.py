@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import weakref
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -29,7 +30,7 @@ class PointStore:
         """Path : of the file; without one it has no name and goes with the process."""
         self.dimension = dimension
         self.rows = 0
-        self.file = _nameless() if path is None else path.open("w+b", buffering=0)
+        self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
         """Write points (N, d), metres. Raises OSError where the disk is full."""
@@ -59,11 +60,16 @@ class PointStore:
         if not path.is_file() or path.stat().st_size < size:
             raise InputError(f"{path}: is missing or too short; run without --resume")
         os.truncate(path, size)
-        self.file = path.open("r+b", buffering=0)
+        self._take(path.open("r+b", buffering=0))
 
     def close(self) -> None:
         """Let the file go; nothing can be read any more."""
         self.file.close()
+
+    def _take(self, file: FileIO) -> None:
+        """Go on with a file, which is closed with the store that nobody uses any more."""
+        self.file = file
+        weakref.finalize(self, file.close)
 
     @property
     def _row_bytes(self) -> int:

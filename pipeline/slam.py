@@ -89,13 +89,16 @@ class Slam:
         self.surprising = False
         self.lost_scans = 0
         self.optimised_at = 0
+        self.is_finished = False
 
     def process(self, scan: Scan) -> Step:
-        """Place one scan, and whatever it closes."""
+        """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
+        self._check_unfinished()
         return self.place(self.front_end.locate(scan))
 
     def place(self, located: Located) -> Step:
         """Place one scan that ``front_end`` located."""
+        self._check_unfinished()
         tracked = located.tracked
         scan = tracked.scan
         started = working_s()
@@ -125,9 +128,12 @@ class Slam:
         """Close what is left, optimize once more, spread the corrections over all scans and refine these.
 
         tell : told which of these stages begins
+        Raises InputError without a scan, and when called again.
         """
+        self._check_unfinished()
         if not self.keyframes:
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
+        self.is_finished = True
         if self.config.loops.enabled:
             tell("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
@@ -148,6 +154,10 @@ class Slam:
             graph=self.graph,
             state=state,
         )
+
+    def _check_unfinished(self) -> None:
+        if self.is_finished:
+            raise InputError("Slam.finish was called: its result is whole; begin another Slam for further scans")
 
     def _keyframe(self, located: Located) -> int:
         """Make a keyframe of a scan that moved far enough; its index, or −1."""

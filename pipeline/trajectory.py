@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -16,6 +17,9 @@ from pipeline.words import counted
 _NS_PER_S = 1_000_000_000
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
+_UNIT = 0.01  # how far the length of a quaternion, which may be written with two digits, may be from 1
+_NO_ROTATION = 1e-3  # a quaternion that is shorter stands for an unknown rotation
+_NO_COORDINATE_M, _DAY_S = 1e8, 86_400.0  # x above it, and within a day of the stamp, is a stamp
 _ORTHONORMAL = 1e-3  # how far RᵀR of a KITTI file, which is written with few digits, may be from identity
 
 
@@ -31,8 +35,7 @@ def read_tum(path: Path | str) -> Trajectory:
             raise InputError(f"{place} has {counted(len(words), 'field')}, a TUM line has 8: {_TUM_FIELDS}")
         stamps_ns.append(parse_stamp_ns(words[0], place))
         row = numbers(words[1:], place)
-        if sum(value * value for value in row[3:]) < 1e-6:
-            raise InputError(f"{place} has the quaternion 0 0 0 0, which is no rotation; write 0 0 0 1 for none")
+        _check_tum_row(stamps_ns[-1], row, place)
         rows.append(row)
     if not rows:
         raise InputError(f"{path} has no pose; a TUM file has one a line: {_TUM_FIELDS}")
@@ -42,6 +45,20 @@ def read_tum(path: Path | str) -> Trajectory:
     poses[:, :3, 3] = values[:, :3]
     poses[:, 3, 3] = 1.0
     return Trajectory(np.array(stamps_ns, np.int64), poses)
+
+
+def _check_tum_row(stamp_ns: int, row: list[float], place: str) -> None:
+    """Refuse a row that is no pose: a quaternion not of unit length, or a second stamp, as relations have."""
+    if row[0] > _NO_COORDINATE_M and abs(row[0] - 1e-9 * stamp_ns) < _DAY_S:
+        raise InputError(
+            f"{place} has two stamps, as a file of relations (stamp1 stamp2 x y z roll pitch yaw), not a TUM file "
+            f"({_TUM_FIELDS}); scanchain evaluate takes it with --relations"
+        )
+    norm = math.hypot(*row[3:])
+    if norm < _NO_ROTATION:
+        raise InputError(f"{place} has the quaternion 0 0 0 0, which is no rotation; write 0 0 0 1 for none")
+    if abs(norm - 1.0) > _UNIT:
+        raise InputError(f"{place} has a quaternion of length {norm:.3g}, not 1; a TUM line is {_TUM_FIELDS}")
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -96,7 +113,7 @@ def parse_stamp_ns(text: str, place: str) -> int:
         raise InputError(
             f"{place} has the stamp {text!r}; it must be a number of seconds (begin a line of column names with #)"
         ) from None
-    if not seconds.is_finite() or abs(seconds) > 9_000_000_000:
+    if not seconds.is_finite() or not -(2**63) <= seconds * _NS_PER_S < 2**63:
         raise InputError(
             f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds; give it in seconds"
         )

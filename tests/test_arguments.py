@@ -66,6 +66,14 @@ def scan(points, **changes):
     return Scan(index=0, stamp_ns=0, log_time_ns=0, dropped=0, points=points, **given)
 
 
+def finished():
+    """A chain that gave its result."""
+    slam = Slam(Config(), I4)
+    slam.process(scan(ROOM))
+    slam.finish()
+    return slam
+
+
 ROOM = place(3, 4000, np.random.default_rng(0))
 FLAT = place(2, 2000, np.random.default_rng(0))
 I3, I4 = np.eye(3), np.eye(4)
@@ -94,6 +102,8 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: scan(np.zeros((2, 3)), times_s=[0, 10**8]), "times_s: a point lies 1e.08 s from the stamp"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0.0, np.nan]), "times_s"),
         (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
+        (lambda: finished().finish(), "Slam.finish was called: .*; begin another Slam"),
+        (lambda: finished().process(scan(ROOM)), "Slam.finish was called: .*; begin another Slam"),
         (lambda: open_log(3), "a log is 3; wanted a path"),
         (lambda: open_log([]), "no log was given; wanted a path"),
         (lambda: open_log([None]), r"a log is \[None\]; wanted a path"),

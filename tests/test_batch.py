@@ -23,6 +23,7 @@ from pipeline.logs.write import LogWriter
 from pipeline.memory import resident_mib
 from pipeline.simulate import simulate
 from pipeline.source import Address
+from viz.batch_report import names_of
 
 POISON = """
 import sys
@@ -142,7 +143,7 @@ def test_logs_that_are_damaged_absent_or_slow_are_rows(drawers, tmp_path):
     out = tmp_path / "out"
     assert main(["batch", *map(str, logs), "--out", str(out), "--time-limit", "0.2"]) == 1
     rows = table(out)
-    assert rows["absent.mcap"]["state"] == "failed" and "cannot be read" in rows["absent.mcap"]["reason"]
+    assert rows["absent.mcap"]["state"] == "failed" and "no such file" in rows["absent.mcap"]["reason"]
     assert rows["log_03.mcap"]["reason"] == "took longer than --time-limit (0.2 s)"
     assert main(["batch", *map(str, logs), "--out", str(out)]) == 1
     rows = table(out)
@@ -236,6 +237,27 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
         collect([], [])
     with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
         collect([], [tmp_path / "none.txt"])
+
+
+def test_logs_of_the_same_name_are_told_apart_by_their_folders():
+    logs = ["/a/x/log.bag", "/b/x/log.bag", "/c/other.bag", "https://host/a/one.mcap"]
+    assert list(names_of(logs).values()) == ["a/x/log.bag", "b/x/log.bag", "other.bag", "one.mcap"]
+
+
+def test_a_batch_is_not_written_among_logs_nor_into_a_run(tmp_path, capsys):
+    logs, run = tmp_path / "logs", tmp_path / "run"
+    (logs / "folder").mkdir(parents=True)
+    (logs / "folder" / "0.pcd").write_bytes(b"x")
+    run.mkdir()
+    (run / "run.json").write_text('{"versions": {"scanchain": "1"}}')
+    for log, out, says in (
+        (logs / "a.mcap", logs, "is not empty and not a batch"),
+        (logs / "folder", logs / "folder" / "out", "lies in the log"),
+        (logs / "a.mcap", run / "deep" / "out", "lies in the run directory"),
+    ):
+        assert main(["batch", str(log), "--out", str(out)]) == 2
+        assert re.fullmatch(rf"error: {out}: {says}.*; choose another --out\n", capsys.readouterr().err)
+    assert not (logs / "rows").exists() and not (logs / "folder" / "out").exists()
 
 
 def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, capfd):

@@ -616,12 +616,25 @@ def test_a_topic_of_true_poses_that_keeps_another_clock_is_refused_before_the_wo
 
 def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_path, office):
     ends = read_tum(office.with_suffix(".tum")).stamps_ns[[0, -1]] / 1e9 + np.array([-1.0, 1.0])
-    (tmp_path / "ends.tum").write_text("".join(f"{stamp:.9f} {stamp} 0 0 0 0 0 1\n" for stamp in ends))
+    (tmp_path / "ends.tum").write_text("".join(f"{stamp:.9f} {k} 0 0 0 0 0 1\n" for k, stamp in enumerate(ends)))
     code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "ends.tum")
     assert code == 0 and errors.count("\n") == 1
     assert errors.startswith(f"warning: no accuracy against {tmp_path / 'ends.tum'}: ")
     says((tmp_path / "a" / "summary.txt").read_text(), "no accuracy against", "--max-gap")
     assert metrics(tmp_path / "a")["ground_truth"] is None
+    words = ["run", office, "--rerun", "off", "--gt", tmp_path / "ends.tum", "--max-gap", "100"]
+    code, _, errors = call(*words, "--out", tmp_path / "b")
+    assert code == 0 and "s apart, and the path between them is taken as straight" in errors
+    assert metrics(tmp_path / "b")["ground_truth"]["max_gap_s"] == 100.0
+    assert "Accuracy" in (tmp_path / "b" / "report.html").read_text()
+    picture = tmp_path / "b.png"
+    assert call("view", tmp_path / "b", "--png", picture)[0] == 0
+    before = picture.read_bytes()
+    picture.write_bytes(b"mine")
+    code, _, errors = call("view", tmp_path / "b", "--png", picture)
+    assert code == 2 and "--force" in errors and picture.read_bytes() == b"mine"
+    assert call("view", tmp_path / "b", "--png", picture, "--force")[0] == 0
+    assert picture.read_bytes() == before
 
 
 def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, office):
@@ -799,7 +812,8 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tmp_path):
     estimate, truth = quarter(tmp_path / "est.tum", 1.1), quarter(tmp_path / "gt.tum")
     code, output, errors = call("evaluate", estimate, truth)
     assert (code, errors) == (0, "")
-    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE rmse", "over 10 m along the reference", "KITTI: translation")
+    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE over 10 m along the reference: rmse ", "KITTI: translation")
+    assert output.count("40 of 40 estimated poses") == 1 and "gaps up to" not in output
     tree = json.loads(call("evaluate", estimate, truth, "--align", "first", "--json")[1])
     assert set(tree) == {"ate", "rpe_1_pose", "rpe_1_s", "rpe_10_m", "rpe_100_m", "kitti"}
     assert tree["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)

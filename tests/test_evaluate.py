@@ -16,6 +16,7 @@ from pipeline.evaluate import (
     absolute_error,
     kitti_error,
     kitti_error_on_any_course,
+    on_the_estimate,
     pair,
     read_relations,
     read_truth,
@@ -24,6 +25,7 @@ from pipeline.evaluate import (
     relative_error_over_frames,
     relative_error_over_time,
 )
+from pipeline.evaluate.absolute import path_length
 from pipeline.evaluate.pairing import nearest
 from pipeline.logs import open_log
 from pipeline.odometry import Odometry
@@ -194,6 +196,7 @@ def test_short_paths_are_judged_over_short_lengths(pairs):
     assert error == kitti_error(pairs)
     assert [part.length_m for part in error.by_length] == [100.0 * k for k in range(1, 9)]
     assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6
+    assert [part.translation_share is not None for part in error.by_length] == [True, True] + [False] * 6
 
 
 def test_metres_or_centimetres_same_judgement(pairs):
@@ -292,7 +295,7 @@ def test_scans_between_true_poses_are_judged_as_if_the_truth_had_their_stamps(ra
     truth_ns = 10**18 + np.round(np.arange(0.0, 9.0, 1.0 / rate_hz) * 1e9).astype(np.int64) + late_ns
     pairs = pair(Trajectory(scans_ns, poses(scans_ns)), Trajectory(truth_ns, poses(truth_ns)))
     error = absolute_error(pairs)
-    assert len(pairs) == 61 and pairs.missing == "" and "61 of 61" in error.definition
+    assert len(pairs) == 61 and pairs.missing == "" and "61 of 61" in error.pairing
     assert error.translation_m.maximum < 1e-3 and error.rotation_rad.maximum < 1e-6
 
 
@@ -316,7 +319,7 @@ def test_scans_without_truth_are_counted_with_the_reason():
     assert (pairs.early, pairs.late, pairs.in_gap) == (5, 0, 9)
     assert pairs.missing == ("14 without a true pose: 5 before the truth begins, 9 in gaps of it wider than 0.5 s")
     assert pairs.share == pytest.approx(0.86)
-    assert pairs.missing in absolute_error(pairs).definition and "86.0 %" in absolute_error(pairs).definition
+    assert pairs.missing in absolute_error(pairs).pairing and "86.0 %" in absolute_error(pairs).pairing
     assert len(pair(longer, holed, gap_s=1.0)) == 95
 
 
@@ -331,6 +334,49 @@ def test_truth_too_sparse_to_interpolate_says_so_and_how_to_allow_it():
     with pytest.raises(InputError, match=r"more than 0\.6 s apart.*--max-gap"):
         pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse)
     assert len(pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse, gap_s=2.0)) == 80
+
+
+def test_truth_that_may_mislead_is_warned_of():
+    every = at_rate(drive(100), 1, late_ns=50_000_000)
+    (sparse,) = pair(every, at_rate(drive(100), 20), gap_s=2.0).warnings
+    assert sparse == "true poses are up to 2 s apart, and the path between them is taken as straight"
+    (few,) = pair(drive(100), Trajectory(drive(100).stamps_ns[:30], drive(100).poses[:30])).warnings
+    assert few == "accuracy is that of 30 of 100 scans alone: 70 without a true pose: 70 after it ends"
+    assert pair(drive(5), drive(5)).warnings == ["accuracy is that of 5 poses alone"]
+    assert pair(every, drive(100)).warnings == []
+
+
+def test_noise_of_a_fast_truth_does_not_lengthen_the_path_that_is_shown():
+    estimate = at_rate(drive(200), 20)
+    poses = drive(200).poses.copy()
+    poses[:, :3, 3] += np.random.default_rng(0).normal(0.0, 0.5, (200, 3))
+    noisy = Trajectory(drive(200).stamps_ns, poses)
+    pairs = pair(estimate, noisy)
+    shown = on_the_estimate(estimate, noisy)
+    assert shown.stamps_ns.tolist() == estimate.stamps_ns.tolist()
+    assert path_length(shown.poses)[-1] == pytest.approx(absolute_error(pairs).path_length_m)
+    assert path_length(shown.poses)[-1] < 0.9 * path_length(noisy.poses)[-1]
+
+
+def test_truth_at_one_instant_is_told_from_that_of_another_clock():
+    one = Trajectory(drive(10).stamps_ns[:1], drive(10).poses[:1])
+    assert len(pair(drive(10), one)) == 1
+    with pytest.raises(InputError, match="poses at one instant alone"):
+        pair(Trajectory(drive(10).stamps_ns + 10_000_000, drive(10).poses), one)
+
+
+def test_a_stretch_across_a_gap_is_none_of_the_size_asked_for():
+    coarse = at_rate(drive(100), 50)  # a pose every 5 s
+    for measure in (
+        lambda: relative_error_over_time(pair(coarse, coarse), 1.0),
+        lambda: relative_error_over_distance(pair(coarse, coarse), 0.5),
+    ):
+        with pytest.raises(InputError, match="no stretch of"):
+            measure()
+    holed = np.delete(np.arange(100), range(40, 80))
+    pairs = pair(Trajectory(drive(100).stamps_ns[holed], drive(100).poses[holed]), drive(100))
+    found = relative_error_over_time(pairs, 1.0)
+    assert np.diff(pairs.stamps_ns[found.stretches], axis=1).max() == 10**9
 
 
 def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp_path):

@@ -2,7 +2,9 @@
 
 import json
 import re
+from collections import Counter
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -16,6 +18,7 @@ from pipeline.evaluate import absolute_error, pair
 from pipeline.graph.g2o import read_g2o
 from pipeline.logs import open_log
 from pipeline.runs.closure_table import write_closures
+from pipeline.runs.metrics import Metrics
 from pipeline.runs.verdicts import final_verdicts
 from pipeline.simulate import simulate
 from pipeline.slam import Slam
@@ -120,7 +123,7 @@ def by_gtsam(path):
 
 def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(forced):
     metrics = json.loads((forced / "metrics.json").read_bytes())
-    assert metrics["closures_rejected"] >= 5
+    assert metrics["closures_rejected_by_back_end"] >= 5
     graph = read_g2o(forced / "graph.g2o").graph
     before = graph.poses
     answer = graph.optimise(GraphConfig())
@@ -137,7 +140,7 @@ def test_rejected_loops_stand_in_a_file_of_their_own(forced):
     rejected = read_g2o(forced / "graph_rejected.g2o").graph
     table = pq.read_table(forced / "loops.parquet").to_pylist()
     named = [[row["target"], row["source"]] for row in table if "contradicts" in row["reason"]]
-    assert rejected.edges.tolist() == named and len(named) == metrics["closures_rejected"]
+    assert rejected.edges.tolist() == named and len(named) == metrics["closures_rejected_by_back_end"]
     kept = read_g2o(forced / "graph.g2o").graph
     assert np.array_equal(rejected.poses, kept.poses)
     kept.add_edges(rejected.edges, rejected.measurements, rejected.information, np.zeros(len(named), bool))
@@ -150,13 +153,46 @@ def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced):
     metrics = json.loads((forced / "metrics.json").read_bytes())
     assert metrics["chi2"] < 5.0 * metrics["degrees_of_freedom"]
     said = re.search(
-        r"χ² ([0-9.,]+) over ([0-9,]+) degrees of freedom, ([0-9]+) closures rejected",
+        r"χ² ([0-9.,]+) over ([0-9,]+) degrees of freedom, ([0-9]+) closures rejected by the back end",
         (forced / "summary.txt").read_text(encoding="utf-8"),
     )
     chi2, degrees, rejected = (float(word.replace(",", "")) for word in said.groups())
     assert chi2 == pytest.approx(metrics["chi2"], rel=0.01)
-    assert (degrees, rejected) == (metrics["degrees_of_freedom"], metrics["closures_rejected"])
+    assert (degrees, rejected) == (metrics["degrees_of_freedom"], metrics["closures_rejected_by_back_end"])
     assert said[0] in (forced / "report.html").read_text(encoding="utf-8")
+
+
+def test_closures_tried_are_those_rejected_by_verification_or_by_the_back_end_and_those_accepted(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    tried, by_verification, verified, by_back_end, accepted = (
+        metrics[f"closures_{name}"]
+        for name in ("tried", "rejected_by_verification", "verified", "rejected_by_back_end", "accepted")
+    )
+    assert min(by_verification, by_back_end, accepted) > 0
+    assert tried == by_verification + verified and verified == by_back_end + accepted
+    rows = pq.read_table(forced / "loops.parquet").to_pylist()
+    assert Counter(row["rejected_by"] for row in rows) == {
+        "verification": by_verification, "back end": by_back_end, "": accepted
+    }  # fmt: skip
+    assert all((row["verdict"] == "accepted") == (not row["rejected_by"]) for row in rows)
+    line = (
+        f"{tried:,} tried: {by_verification:,} rejected by verification, {by_back_end:,} by the back end, "
+        f"{accepted:,} accepted"
+    )
+    page = (forced / "report.html").read_text(encoding="utf-8")
+    assert f"loop closures  {line}\n" in (forced / "summary.txt").read_text(encoding="utf-8")
+    assert f"<dd>{line}</dd>" in page
+    legend = Counter(re.findall(r"</i>(?:closures )?((?:rejected by|accepted)[^:<]*: [\d,]+)", page))
+    assert legend == {
+        f"rejected by verification: {by_verification:,}": 2,  # trajectory, loop closures
+        f"rejected by the back end: {by_back_end:,}": 2,
+        f"accepted: {accepted:,}": 2,
+    }
+
+
+def test_loops_without_degrees_of_freedom_are_not_said_to_be_none(forced):
+    metrics = msgspec.json.decode((forced / "metrics.json").read_bytes(), type=Metrics)
+    assert msgspec.structs.replace(metrics, chi2=2.0, degrees_of_freedom=0).fit.startswith("χ² 2 over 0 degrees")
 
 
 def test_a_run_without_loops_has_none_to_check(tmp_path, log):

@@ -25,7 +25,7 @@ def test_ways_are_drawn_in_their_colours_on_white(tmp_path):
         tmp_path / "a.png", title="t", optimised=circle(10.0), odometry=circle(12.0), ground_truth=circle(8.0)
     )
     pixels = image.imread(tmp_path / "a.png")
-    for colour in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.10, 0.10, 0.10)):
+    for colour in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)):
         assert share_of(pixels, colour) > 0.001
     assert share_of(pixels, (1.0, 1.0, 1.0)) > 0.8
 
@@ -66,3 +66,15 @@ def test_a_3d_map_is_drawn_from_above(tmp_path):
 def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(tmp_path):
     draw_map(tmp_path / "a.png", title="t", optimised=np.empty((0, 3, 3)))
     assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch):
+    def fail(figure, file, **_):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "a.png").write_bytes(b"old")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
+    with pytest.raises(OSError, match="No space"):
+        draw_map(tmp_path / "a.png", title="t", optimised=circle(10.0))
+    assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1

@@ -1,5 +1,7 @@
 """Points kept in a file: what goes in comes out, and a state that was kept is gone on from."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,14 @@ def test_a_state_that_was_kept_goes_on_without_what_came_after_it(tmp_path):
     added = again.add(cloud(3, 3))
     assert np.array_equal(again.read(0, 13), np.vstack([cloud(10, 1), cloud(3, 3)]))
     assert (kept.count, added.first) == (10, 10)
+
+
+def test_the_file_of_a_store_that_nobody_uses_is_closed():
+    store = PointStore(3)
+    file = store.file
+    del store
+    gc.collect()
+    assert file.closed
 
 
 def test_a_file_that_lost_points_is_refused(tmp_path):

@@ -264,19 +264,20 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
     steps = pa.table({"state": states, "keyframe": keyframes})
     closures = pa.table(
         {
-            "target_scan": [0, 5, 0], "source_scan": [30, 35, 20], "verdict": ["accepted", "rejected", "rejected"],
-            "chi2_after": pa.array([1.0, 50.0, None], pa.float64()),
+            "target_scan": [0, 5, 0], "source_scan": [30, 35, 20], "rejected_by": ["", "back end", "verification"],
         }
     )  # fmt: skip
     positions = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
     section = trajectory_section(course(positions), Told(steps, closures), positions + 0.1, points, 0.2)
     assert [chip.name for chip in section.chips] == [
-        "trajectory", "closures rejected: 1", "closures contradicted: 1", "closures accepted: 1",
+        "trajectory",
+        "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
         "degenerate: 4 scans", "lost: 3 scans", "contradicted: 10 scans", "ground truth",
     ]  # fmt: skip
     told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
-    assert len(told["lines"]) == len(section.chips)
+    assert len(told["lines"]) == len(section.chips) == len({chip.colour for chip in section.chips})
+    assert [line["color"] for line in told["lines"]] == [chip.colour for chip in section.chips]
     assert all(chip.colour in section.drawings[0].svg for chip in section.chips)
 
 

@@ -155,6 +155,13 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         pytest.fail("it was made")
 
 
+def test_a_run_is_not_written_into_another(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "run.json").write_text('{"versions": {"scanchain": "1"}}')
+    with pytest.raises(InputError, match=r"lies in the run directory .*a; choose another --out"):
+        RunDirectory(tmp_path / "a" / "b" / "c", force=True)
+
+
 # whole runs
 
 
@@ -221,6 +228,18 @@ def test_a_run_that_the_user_stops_is_whole_up_to_there_and_marked_partial(tmp_p
     assert "PARTIAL" in (finished.path / "summary.txt").read_text().splitlines()[0]
     assert len(np.loadtxt(finished.path / "trajectory.tum")) == finished.metrics.scans == 50
     assert {"graph.g2o", "map.ply", "metrics.json"} <= set(names(finished.path))
+    metrics = json.loads((finished.path / "metrics.json").read_text())
+    assert metrics["stopped"] == said["stopped"]
+
+
+def test_a_run_that_the_user_stops_tells_of_the_scans_that_it_left_out(tmp_path):
+    ranges = [[1.0] * 9] * 3 + [[np.inf] * 9] + [[1.0] * 9] * 96
+    stamps_ns = range(STAMP_NS, STAMP_NS + len(ranges) * SECOND, SECOND)
+    said = [
+        scan_said(stamp_ns, laser_scan(stamp_ns, each)) for stamp_ns, each in zip(stamps_ns, ranges, strict=True)
+    ]
+    finished = run(job(write(tmp_path / "log.mcap", said), tmp_path / "a"), _record, Watcher(20))
+    assert finished.stopped and "of /scan was left out (the first: " in finished.metrics.warnings[0]
 
 
 def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office):
@@ -330,7 +349,7 @@ def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
 
 def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
     text = run(job(office, tmp_path / "a"), _record, Watcher(3)).summary
-    assert "1 keyframe;" in text and "PARTIAL: stopped by the user after 3 scans" in text
+    assert "1 keyframe\n" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 
 def test_a_file_named_twice_is_refused(tmp_path, office):

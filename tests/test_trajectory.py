@@ -64,7 +64,7 @@ def test_a_published_ground_truth_is_read_with_its_exact_stamps():
 
 def test_comments_and_empty_lines_are_passed_over(tmp_path):
     path = tmp_path / "a.tum"
-    path.write_text("# stamp x y z qx qy qz qw\n\n1.5 1 2 3 0 0 0 1\n   \n2.5 1 2 3 0 0 0 2\n")
+    path.write_text("# stamp x y z qx qy qz qw\n\n1.5 1 2 3 0 0 0 1\n   \n2.5 1 2 3 0 0 0 1\n")
     trajectory = read_tum(path)
     assert trajectory.stamps_ns.tolist() == [1500000000, 2500000000]
     np.testing.assert_allclose(trajectory.poses[1, :3, :3], np.eye(3))
@@ -92,6 +92,8 @@ def test_poses_may_be_separated_by_commas_or_semicolons(tmp_path, mark):
         ("1.0 1 2 x 0 0 0 1", "'x'"),
         ("1.0 1 2 inf 0 0 0 1", "finite"),
         ("1.0 1 2 3 0 0 0 0", "quaternion"),
+        ("1.0 1 2 3 0 0 0 3", "has a quaternion of length 3, not 1"),
+        ("976052905.167 976052911.885 -0.1 -0.1 0 0 0 -1.7", "has two stamps, as a file of relations"),
     ],
 )
 def test_a_bad_tum_line_is_named_with_its_number(tmp_path, line, says):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -23,6 +24,7 @@ from viz.sheet import Sheet
 
 _MOST_WAYS = 60
 _MAX_POINTS = 1500  # of a line
+_BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
     Head("log"),
@@ -44,7 +46,7 @@ _HEADS = (
 
 def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
     """Draw and write the page; runs are looked up in the directory."""
-    done = [row for row in rows if row.metrics is not None]
+    done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
     missing = len(rows) - len(done)
     unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
     page = Page(
@@ -54,23 +56,36 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
         + tuple(unreliable),
         notes=(),
-        sections=(_logs(directory, rows), *_spread(done), *_ways(directory, done)),
+        sections=(_logs(directory, rows, names), *_spread(done), *_ways(directory, done, names)),
         folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),
     )
     write_page(directory / REPORT_FILE, page)
 
 
-def _logs(directory: Path, rows: Sequence[Row]) -> Section:
+def names_of(logs: Sequence[str]) -> dict[str, str]:
+    """What each log is called: its file's name, with as many folders before it as tell it from the others."""
+    names = {log: source_of(log).name for log in logs}
+    for depth in range(2, max((len(Path(log).parts) for log in logs), default=0) + 1):
+        counts = Counter(names.values())
+        names = {
+            log: name if counts[name] == 1 else "/".join(Path(log).parts[-depth:]) for log, name in names.items()
+        }
+    return names
+
+
+def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Section:
     legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
     text = "A name leads to the report of its run, or to what was printed where there is none."
-    return Section("Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row) for row in rows), legend))
+    return Section(
+        "Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
+    )
 
 
-def _row(directory: Path, row: Row) -> report.Row:
+def _row(directory: Path, row: Row, name: str) -> report.Row:
     """The figures of a log, or why it has none."""
     m, link = row.metrics, _link(directory, row)
     if m is None:
-        return report.Row(_name(row), (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
+        return report.Row(name, (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
     truth = None if m.ground_truth is None else m.ground_truth.optimised
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
@@ -88,7 +103,7 @@ def _row(directory: Path, row: Row) -> report.Row:
         Cell(f"{row.duration_s:.1f}"),
         Cell(f"{row.peak_mib:,.0f}"),
     )
-    return report.Row(_name(row), cells, link=link)
+    return report.Row(name, cells, link=link)
 
 
 def _link(directory: Path, row: Row) -> str:
@@ -101,10 +116,6 @@ def _link(directory: Path, row: Row) -> str:
 
 def _figure(value: float | None, scale: float, digits: int) -> str:
     return "–" if value is None else f"{scale * value:.{digits}f}"
-
-
-def _name(row: Row) -> str:
-    return source_of(row.log).name
 
 
 def _paths(row: Row) -> str:
@@ -136,7 +147,7 @@ def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
     with Sheet(name) as sheet:
         share = 100.0 * (np.arange(len(values)) + 1) / len(values)
         sheet.axes.step(values, share, where="post", color=colour_of(0), marker="o", markersize=2.5)
-        sheet.axes.set_xlim(left=0.0)
+        sheet.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
         sheet.axes.set_ylim(0.0, 105.0)
         sheet.axes.set_xlabel(f"{name} [{unit}]")
         sheet.axes.set_ylabel("logs at most so [%]")
@@ -144,10 +155,10 @@ def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
         return sheet.svg()
 
 
-def _ways(directory: Path, done: Sequence[Row]) -> Iterator[Section]:
+def _ways(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
     """Every way from above, as far as a page can hold them."""
     drawings = [
-        Drawing(_name(row), f"{row.run}", _way(row.key, directory / row.run / "trajectory.tum"))
+        Drawing(names[row.log], f"{row.run}", _way(row.key, directory / row.run / "trajectory.tum"))
         for row in done[:_MOST_WAYS]
     ]
     text = f"The first {_MOST_WAYS} of {len(done):,}." if len(done) > _MOST_WAYS else ""

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.special import gammaincinv
 
-from viz.courses import Course, Floats
+from viz.courses import TRUTH, Course, Floats
 from viz.sheet import INK, Sheet
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _MARGIN = 0.25
 _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
+_TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 3))}
 _BLIND, _PLAIN = 0.01, 1000.0  # times the least that must be known; less and more are drawn as that
 _BAR_INCHES = 0.65  # of a colour bar and its numbers
 
@@ -30,7 +31,7 @@ def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats
     with Sheet.of_plan(name, low, high) as sheet:
         _each(sheet.axes, courses, lambda course: (course.positions[:, 0], course.positions[:, 1]))
         if truth is not None:
-            sheet.axes.plot(*_thinned(truth)[:, :2].T, **_DOTTED)
+            sheet.axes.plot(*_thinned(truth)[:, :2].T, **_TRUTH)
         sheet.axes.grid(visible=True)
         return sheet.svg()
 
@@ -43,7 +44,7 @@ def height(name: str, courses: Sequence[Course], truth: Floats | None, low: Floa
             steps_m = np.linalg.norm(np.diff(truth, axis=0), axis=1)
             way_m = np.append(0.0, np.cumsum(steps_m))
             rows = np.linspace(0, len(truth) - 1, min(len(truth), _MAX_POINTS)).astype(int)
-            sheet.axes.plot(way_m[rows], truth[rows, 2], **_DOTTED)
+            sheet.axes.plot(way_m[rows], truth[rows, 2], **_TRUTH)
         sheet.axes.set_ylim(low[2], high[2])
         longest_m = np.median([course.distance_m[-1] for course in courses if len(course.distance_m)])
         sheet.axes.set_xlim(0.0, 1.05 * max(float(longest_m), 1.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,11 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from viz import course_figures as figures
-from viz.courses import Course, Floats
+from viz.courses import CLOSURES, TRUTH, Course, Floats
 from viz.map_figures import loops_picture
 from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
-_DOTTED = "Dotted: the truth. "
+_TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _MEDIANS = "Of long logs, medians of neighbouring scans."
 _FIGURES = re.compile(
     r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
@@ -38,19 +38,12 @@ def way_section(
 ) -> Section:
     """Where they went; ``framing`` are those that must be seen whole."""
     corners = figures.frame(framing, truth)
-    dotted = _DOTTED if truth is not None else ""
-    drawings = [
-        Drawing("Plan", f"{dotted}Seen from above.", figures.plan("plan", courses, truth, *corners)),
-    ]
+    drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", courses, truth, *corners))]
     if not is_planar:
-        drawings.append(
-            Drawing(
-                "Height",
-                f"{dotted}Over the distance travelled.",
-                figures.height("height", courses, truth, *corners),
-            )
-        )
-    return Section("Trajectories", text, _legend(courses), tuple(drawings))
+        height = figures.height("height", courses, truth, *corners)
+        drawings.append(Drawing("Height", "Over the distance travelled.", height))
+    chips = _legend(courses) if truth is None else (*map(chip, courses), _TRUTH_CHIP)
+    return Section("Trajectories", text, chips, tuple(drawings))
 
 
 def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Section]:
@@ -146,14 +139,15 @@ def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
         yield Section(title, "None was tried: the way came back to no place that it had left.")
         return
     ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
-    is_accepted = np.array([verdict == "accepted" for verdict in table["verdict"].to_pylist()])
+    rejected_by = np.array(table["rejected_by"].to_pylist())
+    counts = Counter(rejected_by.tolist())
     low, high = figures.frame([course], None)
-    picture = loops_picture(f"loops {course.name}", course, course.positions[ends], is_accepted, low, high)
+    picture = loops_picture(f"loops {course.name}", course, course.positions[ends], rejected_by, low, high)
     yield Section(
         title,
-        f"{len(ends):,} tried, {is_accepted.sum():,} accepted; each is a row of loops.parquet.",
-        (),
-        (Drawing("On the way", "Green: accepted. Red: rejected.", picture),),
+        f"{len(ends):,} tried; each is a row of loops.parquet.",
+        tuple(Chip(f"{name}: {counts[by]:,}", color) for by, (name, color) in CLOSURES.items()),
+        (Drawing("On the way", "", picture),),
         _verdict_grid(table),
     )
 
@@ -161,10 +155,10 @@ def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
 def _verdict_grid(closures: pa.Table) -> Grid:
     """Closures by verdict and reason, the figures of each left out of it, most frequent first."""
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (verdict, reason) in enumerate(
-        zip(*(closures[key].to_pylist() for key in ("verdict", "reason")), strict=True)
+    for place, (by, reason) in enumerate(
+        zip(*(closures[key].to_pylist() for key in ("rejected_by", "reason")), strict=True)
     ):
-        groups[verdict, _FIGURES.sub("", reason, count=1)].append(place)
+        groups[CLOSURES[by][0], _FIGURES.sub("", reason, count=1)].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runs.verdicts import BACK_END, VERIFICATION
+
 Floats = NDArray[np.float64]
 
 # Told apart on white and on black, also by most who see colours differently.
@@ -15,6 +17,13 @@ _COLOURS = (
     "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
     "#b0413e", "#5f8f57",
 )  # fmt: skip
+
+TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never one of theirs
+CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what it is called and its line's color
+    VERIFICATION: ("rejected by verification", "#8a6d5b"),
+    BACK_END: ("rejected by the back end", "#0f9bb5"),
+    "": ("accepted", "#3f9b2f"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +62,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class PathLine:
-    """A line through positions (N, 3), broken where they are NaN; drawn as the page's text without a color."""
+    """A line through positions (N, 3), broken where they are NaN."""
 
     positions: Floats
     color: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import GraphState
 from pipeline.graph.optimisation import GraphChange, fit
-from pipeline.runs.whole_file import write_whole
+from viz.figure_file import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,9 +34,7 @@ def draw_graph(change: GraphChange, path: Path) -> None:
         axes.set_title(f"{change.name} {when}\n{fit(state)}", loc="left", fontsize=11)
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    picture = BytesIO()
-    figure.savefig(picture, dpi=150, facecolor="white", format="png")
-    write_whole(path, picture.getvalue())
+    write_figure(path, figure, dpi=150)
 
 
 def _draw_state(axes: Axes, state: GraphState) -> None:

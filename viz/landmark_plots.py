@@ -13,6 +13,7 @@ from pipeline import lie
 from pipeline.data import Matrix
 from pipeline.landmarks.compare import MethodResult
 from pipeline.landmarks.study import Estimate, Study
+from viz.figure_file import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +52,7 @@ def draw_estimate(path: Path, study: Study) -> None:
     _draw_ellipses(panels[1], study)
     panels[0].set_ylabel("y [m]", fontsize=9)
     _legend(figure)
-    figure.savefig(path, dpi=150, facecolor="white", bbox_inches="tight")
+    write_figure(path, figure, dpi=150, bbox_inches="tight")
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
@@ -75,7 +76,7 @@ def draw_factors(path: Path, studies: Sequence[Study]) -> None:
             _draw_factor(axes, method, study.name if len(studies) > 1 else "")
     for axes in panels[len(cells) :]:
         axes.set_axis_off()
-    figure.savefig(path, dpi=130, facecolor="white", bbox_inches="tight")
+    write_figure(path, figure, dpi=130, bbox_inches="tight")
 
 
 def _frame(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.landmarks.study import Study
 from pipeline.landmarks.write import accuracy_lines, file_stem, size_of, table_of
+from pipeline.runs.whole_file import write_whole
 from viz.landmark_plots import draw_estimate, draw_factors
 
 _PAGE = "report.html"
@@ -35,7 +36,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
             draw_factors(directory / "factors.png", studies)
             together = _inline(directory / "factors.png")
         page = environment.get_template("landmarks.html").render(problems=problems, together=together)
-        (directory / _PAGE).write_text(page, encoding="utf-8")
+        write_whole(directory / _PAGE, page.encode())
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 

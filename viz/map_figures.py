@@ -9,10 +9,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.data import Points
-from viz.courses import Course, Floats, PathLine
+from viz.courses import CLOSURES, Course, Floats, PathLine
 from viz.sheet import INK, Sheet
 
-_ACCEPTED, _REJECTED = "#1aa179", "#d6453d"
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
@@ -49,9 +48,9 @@ def path_over_map(
     with Sheet.of_plan(name, low, high) as sheet:
         _draw_points(sheet, points, low, high, by_height=False)
         for line in lines:
-            style = (0, (1, 1.5)) if line.is_dashed else "-"
+            style = (0, (3, 3)) if line.is_dashed else "-"
             x, y = line.positions[:, :2].T
-            sheet.axes.plot(x, y, color=line.color or INK, linewidth=line.width, linestyle=style)
+            sheet.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
         for place, marker in ((0, "o"), (-1, "s")):
             sheet.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
         return sheet.svg()
@@ -89,14 +88,15 @@ def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDA
 
 
 def loops_picture(
-    name: str, course: Course, edges: Floats, is_accepted: np.ndarray, low: Floats, high: Floats
+    name: str, course: Course, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
-    """The way (grey) with its closures, accepted and rejected; ``edges`` (E, 2, 3) from place to place."""
+    """The way (grey) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3) from place to place."""
     with Sheet.of_plan(name, low, high) as sheet:
         sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
-        for chosen, colour in ((~is_accepted, _REJECTED), (is_accepted, _ACCEPTED)):
-            gaps = np.full((int(chosen.sum()), 1, 2), np.nan)
-            lines = np.concatenate([edges[chosen][:, :, :2], gaps], axis=1).reshape(-1, 2)
-            sheet.axes.plot(lines[:, 0], lines[:, 1], color=colour, linewidth=0.9)
+        for by, (_, color) in CLOSURES.items():
+            chosen = edges[rejected_by == by][:, :, :2]
+            gaps = np.full((len(chosen), 1, 2), np.nan)
+            lines = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2)
+            sheet.axes.plot(lines[:, 0], lines[:, 1], color=color, linewidth=0.9)
         sheet.axes.plot(*course.positions[0, :2], marker="o", markersize=4, color=INK)
         return sheet.svg()

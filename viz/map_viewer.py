@@ -19,7 +19,7 @@ _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000
 _HIGHEST = 65_535.0
 _BULK = (3.0, 97.0)  # percentiles of the points: what is in view at first, and the ends of the color scale
-_INK, _WIDER = "#ffffff", 1.8  # on the dark ground of the canvas
+_WIDER = 1.8  # lines, on the canvas
 
 
 def map_scene(
@@ -58,7 +58,7 @@ def _line(line: PathLine, low: Floats, high: Floats) -> dict[str, object]:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_LINE_POINTS).astype(int)]
     return {
         "points": _packed(positions, low, high),
-        "color": line.color or _INK,
+        "color": line.color,
         "width": _WIDER * line.width,
         "dashed": line.is_dashed,
         "pairs": is_broken,

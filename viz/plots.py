@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Matrix
+from viz.courses import TRUTH
+from viz.figure_file import write_figure
 from viz.map_figures import extent
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 _WIDTH_INCHES = 8.0
 _MAX_POINTS = 400_000
-_ODOMETRY, _OPTIMISED, _GROUND_TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
+_ODOMETRY, _OPTIMISED = "#e07b00", "#1f5fd0"
 _POINTS = "#8a8f98"
 _FREE, _OCCUPIED = 35, 65  # percent; what is below is drawn white, above dark
 _UNKNOWN = 0.90
@@ -60,14 +62,14 @@ def draw_map(
         _draw_points(axes, points)
     _draw_way(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
     _draw_way(axes, optimised, "optimised", _OPTIMISED, "-", 1.8)
-    _draw_way(axes, ground_truth, "ground truth", _GROUND_TRUTH, (0, (4, 3)), 0.9)
+    _draw_way(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
     _mark_ends(axes, optimised)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_title(title, loc="left", fontsize=11)
     if len(ways):
         axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    figure.savefig(path, dpi=150, facecolor="white")
+    write_figure(path, figure, dpi=150)
 
 
 def _frame(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from pipeline.errors import InputError
@@ -15,10 +16,8 @@ from viz.plots import GridPicture, draw_map
 def draw_run(directory: Path, picture: Path) -> None:
     """Draw trajectories, ground truth and map of a run to a PNG: the occupancy grid in 2D, the cloud in 3D.
 
-    Raises InputError where the directory is no run's, or the picture does not end in .png or cannot be written.
+    Raises InputError where the directory is no run's, or the picture cannot be written.
     """
-    if picture.suffix != ".png":
-        raise InputError(f"{picture}: is no .png; name a file that ends in .png")
     if not (directory / "trajectory.tum").exists():
         raise InputError(f"{directory}: holds no trajectory.tum; give the directory of a finished run")
     points = read_ply(directory / "map.ply")
@@ -26,7 +25,10 @@ def draw_run(directory: Path, picture: Path) -> None:
     cells, resolution_m, origin_m = read_map(directory)
     optimised, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
     truth_file = directory / TRUTH_FILE
-    truth = on_the_estimate(optimised, read_tum(truth_file)) if truth_file.exists() else None
+    truth = None
+    if truth_file.exists():
+        judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
+        truth = on_the_estimate(optimised, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
     try:
         draw_map(
             picture,

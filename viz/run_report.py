@@ -68,7 +68,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "pose graph", m.fit
-    yield "loop closures", f"{m.closures_tried:,} tried, {m.closures_accepted:,} accepted"
+    yield "loop closures", m.closures
     yield (
         "matching",
         f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
@@ -93,16 +93,18 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
-    optimised, before = _against(trajectory, truth), _against(odometry, truth)
+    gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
+    optimised, before = (_against(each, truth, gap_s) for each in (trajectory, odometry))
+    nees = None if truth is None else nees_of_steps(steps, odometry, truth, gap_s=gap_s)
     T_world_truth = lie.inverse(optimised.T_truth_way)
     courses = [
-        _course("optimised", 0, trajectory, lie.identity(3), optimised, steps, truth),
-        _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, truth),
+        _course("optimised", 0, trajectory, lie.identity(3), optimised, steps, nees),
+        _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, None),
     ]
     if metrics.ground_truth is not None:
         yield accuracy_section(metrics.ground_truth)
     is_planar = metrics.dimension == 2
-    way = None if truth is None else (T_world_truth @ truth.poses)[:, :3, 3]
+    way = None if truth is None else lie.transform(T_world_truth, optimised.truth)
     loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
     grain_m = float(str(config["maps.voxel_size_m"]))
     yield trajectory_section(courses[0], Told.read(steps, loops_file), way, points, grain_m)
@@ -121,25 +123,29 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
 
 @dataclass(frozen=True, slots=True)
 class _Off:
-    """A way against the truth: how it was moved onto it, and (N,) metres off, NaN where nothing is known."""
+    """A way against the truth: how it was moved onto it, and (N,) metres off, NaN where nothing is known.
+
+    ``truth`` : (K, 3) true positions at the scans that have one; more would lengthen the path by their noise
+    """
 
     T_truth_way: Pose
     errors_m: Floats
+    truth: Floats
 
 
-def _against(trajectory: Trajectory, truth: Trajectory | None) -> _Off:
+def _against(trajectory: Trajectory, truth: Trajectory | None, gap_s: float | None) -> _Off:
     errors_m = np.full(len(trajectory), np.nan)
     if truth is None:
-        return _Off(np.eye(4), errors_m)
-    pairs = pair(trajectory, truth)
+        return _Off(np.eye(4), errors_m, np.empty((0, 3)))
+    pairs = pair(trajectory, truth, gap_s=gap_s)
     ate = absolute_error_on_any_course(pairs)
     errors_m[pairs.places] = ate.errors_m
-    return _Off(ate.T_reference_estimate, errors_m)
+    return _Off(ate.T_reference_estimate, errors_m, pairs.reference[:, :3, 3])
 
 
 def _course(
     name: str, place: int, trajectory: Trajectory, T_world_way: Pose, off: _Off, steps: pa.Table | None,
-    truth: Trajectory | None,
+    nees: Floats | None,
 ) -> Course:  # fmt: skip
     """One of the two ways in the frame of the map; what is known of the scans belongs to the first."""
     unknown = np.full(len(trajectory), np.nan)
@@ -153,7 +159,7 @@ def _course(
         error_m=off.errors_m,
         relation_error_m=np.empty(0),
         seconds=unknown if steps is None else _seconds(steps),
-        nees=unknown if steps is None or truth is None else _nees(steps, truth),
+        nees=unknown if nees is None else nees,
         observability=unknown if steps is None else steps["observability"].to_numpy(),
     )
 
@@ -170,7 +176,3 @@ def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
 def _seconds(steps: pa.Table) -> Floats:
     """All stages but reading."""
     return np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)
-
-
-def _nees(steps: pa.Table, truth: Trajectory) -> Floats:
-    return nees_of_steps(steps, _trajectory(steps, "odom_"), truth)

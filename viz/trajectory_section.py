@@ -8,20 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.data import Points, State, Verdict
+from pipeline.data import Points, State
+from pipeline.runs.verdicts import BACK_END
 from pipeline.words import counted
 from viz import course_figures as figures
-from viz.courses import Course, Floats, PathLine
+from viz.courses import CLOSURES, TRUTH, Course, Floats, PathLine
 from viz.map_figures import map_picture, path_over_map, surroundings
 from viz.map_viewer import map_scene
 from viz.report import Chip, Drawing, Section
 
 _CONTRADICTED = "contradicted"
 _COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6"}
-_ACCEPTED, _REJECTED = "#1aa179", "#d6457f"
 _MAX_PIECES = 3000  # of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # of a verdict
 
@@ -62,10 +63,8 @@ def trajectory_section(
             is_wide=not is_flat,
         ),
     )
-    joined = (
-        " Contradicted: scans joined by closures that were verified, but that the rest of the graph contradicts."
-    )
-    text = joined.strip() if any(chip.name.startswith(_CONTRADICTED) for chip in chips) else ""
+    joined = "Contradicted: scans joined by closures that the back end rejected because the rest contradicts them."
+    text = joined if any(chip.name.startswith(_CONTRADICTED) for chip in chips) else ""
     return Section("Trajectory and map", text, chips, drawings)
 
 
@@ -80,32 +79,22 @@ def _lines(path: Floats, told: Told, truth: Floats | None) -> Iterator[tuple[Pat
             line = PathLine(_stretches(path, marks, list(_COLORS).index(state)), color, 2.6)
             yield line, Chip(f"{state}: {counted(count, 'scan')}", color)
     if truth is not None:
-        yield PathLine(truth, "", 0.9, is_dashed=True), Chip("ground truth", "var(--ink)", is_dashed=True)
+        yield PathLine(truth, TRUTH, 0.9, is_dashed=True), Chip("ground truth", TRUTH, is_dashed=True)
 
 
 def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[PathLine, Chip]]:
     if closures is None or not closures.num_rows:
         return
     ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
-    is_accepted = np.array(closures["verdict"].to_pylist()) == str(Verdict.ACCEPTED)
-    is_contradicted = _contradicted(closures)
-    for name, chosen, color in (
-        ("closures rejected", ~is_accepted & ~is_contradicted, _REJECTED),
-        ("closures contradicted", is_contradicted, _COLORS[_CONTRADICTED]),
-        ("closures accepted", is_accepted, _ACCEPTED),
-    ):
+    rejected_by = np.array(closures["rejected_by"].to_pylist())
+    for by, (name, color) in CLOSURES.items():
+        chosen = rejected_by == by
         count = int(chosen.sum())
         if count:
             pairs = path[ends[chosen][:: max(1, -(-count // _MAX_CLOSURES))]]
             gaps = np.full((len(pairs), 1, 3), np.nan)
             line = np.concatenate([pairs, gaps], axis=1).reshape(-1, 3)
-            yield PathLine(line, color, 0.9), Chip(f"{name}: {count:,}", color)
-
-
-def _contradicted(closures: pa.Table) -> NDArray[np.bool_]:
-    """Closures that matching verified and the back end rejected: they became edges, and lost."""
-    entered = np.isfinite(closures["chi2_after"].to_numpy(zero_copy_only=False).astype(np.float64))
-    return entered & (np.array(closures["verdict"].to_pylist()) == str(Verdict.REJECTED))
+            yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
 def _states(told: Told) -> NDArray[np.int64]:
@@ -116,7 +105,7 @@ def _states(told: Told) -> NDArray[np.int64]:
     if told.closures is None or not told.closures.num_rows:
         return marks
     keyframes = np.append(np.flatnonzero(told.steps["keyframe"].to_numpy() >= 0), len(marks))
-    chosen = told.closures.filter(pa.array(_contradicted(told.closures)))
+    chosen = told.closures.filter(pc.field("rejected_by") == BACK_END)
     for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
         end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
         stretch = marks[scan:end]

@@ -14,10 +14,11 @@ import msgspec
 
 from pipeline.batch.attempt import attempt
 from pipeline.batch.table import write_table
-from pipeline.batch.task import Row, State, Task, finished_row, key_of, unfinished_row
+from pipeline.batch.task import ROWS_FOLDER, Row, State, Task, finished_row, key_of, unfinished_row
 from pipeline.errors import InputError
 from pipeline.logs.sizes import misspelled, spelled
 from pipeline.memory import available_mib
+from pipeline.runs.directory import check_outside_runs
 from pipeline.runs.provenance import identity_of
 from pipeline.settings import Override
 from pipeline.source import Source, source_of
@@ -89,11 +90,12 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
 
     work : where the tasks are run; None for processes on this machine
     On Ctrl-C what runs is killed, and the table says what was not run. Raises InputError for a directory that
-    cannot be made and a configuration that is wrong.
+    cannot be made or is another's, and a configuration that is wrong.
     """
+    _check_out(batch)
     key_of("", batch.config_file, batch.overrides)  # what is wrong with it is wrong for every log
     try:
-        (batch.out / "rows").mkdir(parents=True, exist_ok=True)
+        (batch.out / ROWS_FOLDER).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{batch.out}: cannot be made ({error.strerror}); choose another --out") from error
     tasks = _tasks(batch)
@@ -113,6 +115,19 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
         progress.say("stopped")
     table = tuple(_row_of(task, rows) for task in tasks)
     return Batched(table, kept, write_table(batch.out, table))
+
+
+def _check_out(batch: Batch) -> None:
+    """Refuse a directory that holds something else than a batch, or lies in a run or in a log that is a folder."""
+    check_outside_runs(batch.out)
+    out = batch.out.resolve()
+    for log in batch.logs:
+        if isinstance(log, Path) and log.resolve() in (out, *out.parents):
+            raise InputError(f"{batch.out}: lies in the log {log}; choose another --out")
+    if out.is_dir() and any(out.iterdir()) and not (out / ROWS_FOLDER).is_dir():
+        raise InputError(
+            f"{batch.out}: is not empty and not a batch ({ROWS_FOLDER} is missing); choose another --out"
+        )
 
 
 def _damage(row: Row) -> str:
@@ -150,9 +165,12 @@ def _row_of(task: Task, rows: dict[str, Row]) -> Row:
         if row.log != task.name and not row.state.has_result:
             row = msgspec.structs.replace(row, reason=f"has the contents of {row.log}: {row.reason}")
         return Row(task.name, *(getattr(row, name) for name in row.__struct_fields__[1:]))
-    if complaint := misspelled(source_of(task.log)):
+    source = source_of(task.log)
+    if complaint := misspelled(source):
         return unfinished_row(task, State.FAILED, complaint)
     if not task.sha256:
+        if isinstance(source, Path) and not source.exists():
+            return unfinished_row(task, State.FAILED, "no such file; check the path")
         return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} says why")
     return unfinished_row(task, State.NOT_RUN, "stopped by the user")
 

@@ -21,8 +21,10 @@ _NUMBERS = (
     "lost",
     "keyframes",
     "closures_tried",
+    "closures_rejected_by_verification",
+    "closures_verified",
+    "closures_rejected_by_back_end",
     "closures_accepted",
-    "closures_rejected",
     "degrees_of_freedom",
 )
 _FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "travelled_m", "chi2", "median_residual_m")
@@ -87,10 +89,10 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     scans, degenerate, lost = (
         sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
     )
-    way_km = 1e-3 * sum(each.travelled_m for each in results)
-    hours = sum(each.log_span_s for each in results) / 3600.0
+    way = _distance(sum(each.travelled_m for each in results))
+    time = _duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
-    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {way_km:.2f} km and {hours:.2f} h"
+    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {way} and {time}"
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimised.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:
@@ -99,6 +101,17 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
             f"rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
             f"{counted(len(errors_m), 'log')} with ground truth",
         )
+
+
+def _distance(length_m: float) -> str:
+    return f"{length_m:.1f} m" if length_m < 1000.0 else f"{1e-3 * length_m:.2f} km"
+
+
+def _duration(time_s: float) -> str:
+    for unit, seconds in (("h", 3600.0), ("min", 60.0)):
+        if time_s >= seconds:
+            return f"{time_s / seconds:.1f} {unit}"
+    return f"{time_s:.1f} s"
 
 
 def _cells(row: Row) -> dict[str, object]:

@@ -16,6 +16,8 @@ from pipeline.runs.provenance import package_version
 from pipeline.settings import Override, dump, load_settings
 from pipeline.source import source_of
 
+ROWS_FOLDER = "rows"  # of a batch's directory: what became of each log
+
 
 class State(StrEnum):
     """How a log ended."""
@@ -70,7 +72,7 @@ class Task(Struct, frozen=True):
     @property
     def row_file(self) -> Path:
         """What became of it, kept beside the run directory."""
-        return Path(self.out) / "rows" / f"{self.key}.json"
+        return Path(self.out) / ROWS_FOLDER / f"{self.key}.json"
 
     @property
     def said_file(self) -> Path:
@@ -107,7 +109,7 @@ class Row(Struct, frozen=True):
 
 def said_file(out: Path, key: str) -> Path:
     """Where a batch keeps all that the last try of a log said."""
-    return out / "rows" / f"{key}.txt"
+    return out / ROWS_FOLDER / f"{key}.txt"
 
 
 def finished_row(task: Task) -> Row | None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.ground_truth import max_gap_option
 from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
@@ -36,12 +37,7 @@ _PATH = click.Path(path_type=Path)
     show_default=True,
     help="How the frames are brought together for the ATE.",
 )
-@click.option(
-    "--max-gap",
-    type=float,
-    metavar="SECONDS",
-    help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
-)
+@max_gap_option
 @click.option(
     "--rpe",
     default="1pose,1s,10m,100m",
@@ -80,21 +76,26 @@ def evaluate(
     trajectory = read_kitti(estimate) if kitti else read_tum(estimate)
     results = Results({}, {})
     if reference is not None:
-        if max_gap is not None and not 0.0 <= max_gap < inf:
-            raise InputError(f"--max-gap is {max_gap:g} s; choose a number from 0 up")
         truth = read_kitti(reference) if kitti else read_truth(reference).at(trajectory.stamps_ns)
         results = _against(trajectory, truth, align, max_gap, _stretches(rpe))
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
+    for warning in results.warnings:
+        click.echo(f"warning: {warning}", err=True)
     click.echo(_json(results) if as_json else _text(results))
 
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """What was computed, by name, and what could not be, with the reason."""
+    """What was computed, by name, and what could not be, with the reason.
+
+    ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
+    """
 
     found: dict[str, Result]
     missing: dict[str, str]
+    pairing: str = ""
+    warnings: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,8 @@ def _against(
         **{stretch.name: partial(stretch.error, pairs) for stretch in stretches},
         "kitti": partial(kitti_error_on_any_course, pairs),
     }
-    results = Results({"ate": absolute_error(pairs, Alignment(align))}, {})
+    ate = absolute_error(pairs, Alignment(align))
+    results = Results({"ate": ate}, {}, pairs.description, pairs.warnings)
     for name, metric in metrics.items():
         try:
             results.found[name] = metric()
@@ -153,7 +155,8 @@ def _against(
 
 
 def _text(results: Results) -> str:
-    lines = [f"{result.summary}\n  {result.definition}" for result in results.found.values()]
+    lines = [f"paired {results.pairing}"] if results.pairing else []
+    lines += [f"{result.summary}\n  {result.definition}" for result in results.found.values()]
     return "\n".join([*lines, *(f"{name}: none: {reason}" for name, reason in results.missing.items())])
 
 
@@ -171,7 +174,7 @@ def _figures(record: object) -> object:
         return [_figures(item) for item in record]
     if isinstance(record, float):
         return record if isfinite(record) else None
-    return record if isinstance(record, int | str) else _LEFT_OUT
+    return record if isinstance(record, int | str | None) else _LEFT_OUT
 
 
 _LEFT_OUT = object()

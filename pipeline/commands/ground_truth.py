@@ -1,10 +1,32 @@
-"""``--gt``: a file or a topic."""
+"""``--gt``: a file or a topic, and ``--max-gap``."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from math import inf
 from pathlib import Path
 
+import click
+
+from pipeline.errors import InputError
 from pipeline.settings import Override
+
+
+def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
+    """The option ``--max-gap``."""
+    return click.option(
+        "--max-gap",
+        type=float,
+        callback=_checked_gap,
+        metavar="SECONDS",
+        help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
+    )(command)
+
+
+def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not 0.0 <= value < inf:
+        raise InputError(f"--max-gap is {value:g} s; choose a number from 0 up")
+    return value
 
 
 def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.ground_truth import ground_truth
+from pipeline.commands.ground_truth import ground_truth, max_gap_option
 from pipeline.commands.log_type import LOG
 from pipeline.commands.override_command import OverrideCommand, alias, overrides
 from pipeline.errors import InputError, ScanchainError
@@ -45,6 +45,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 @click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
+@max_gap_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Go on from the last checkpoint of a run that was killed or stopped.")
 @click.option(
@@ -64,6 +65,7 @@ def run(
     config: Path | None,
     rerun: str,
     gt: str | None,
+    max_gap: float | None,
     force: bool,
     resume: bool,
     checkpoint: float,
@@ -102,6 +104,7 @@ def run(
         overrides=overrides(ctx, [*aliases(shortcuts), *truth_topic]),
         sinks=_sinks(rerun),
         ground_truth=truth_file,
+        max_gap_s=max_gap,
         force=force,
         resume=resume,
         checkpoint_s=checkpoint,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pipeline.commands.outputs import check_output
 from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
 
@@ -23,8 +24,9 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Draw trajectory, ground truth and map to a picture.",
 )
+@click.option("--force", is_flag=True, help="Replace an existing picture.")
 @click.pass_context
-def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> None:
+def view(ctx: click.Context, directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map without one.
 
     DIR is a run directory, or a .rrd file.
@@ -43,6 +45,7 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None) -> No
         )
     viewing: Viewing = ctx.obj
     if png is not None:
+        check_output(png, force=force, endings=(".png",))
         viewing.draw(directory, png)
         click.echo(png)
         return

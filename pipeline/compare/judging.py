@@ -136,7 +136,7 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
         nees=float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
     )
     found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
-    definitions = (*judged.definitions, *found)
+    definitions = (*judged.definitions, *found, f"Paired: {pairs.description}")
     return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, judged.relations, definitions)
 
 

@@ -11,7 +11,7 @@ from pipeline import lie
 from pipeline.data import Matrix, Pose, Trajectory
 from pipeline.errors import InputError
 from pipeline.evaluate.alignment import Alignment, align
-from pipeline.evaluate.pairing import Pairs, during, pair
+from pipeline.evaluate.pairing import Pairs, pair
 from pipeline.evaluate.statistics import Statistics
 
 _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
@@ -23,7 +23,7 @@ class AbsoluteError:
 
     Attributes
     ----------
-    definition : what was computed, in words
+    definition : what was computed, in words; pairing : over which poses
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
@@ -33,6 +33,7 @@ class AbsoluteError:
     """
 
     definition: str
+    pairing: str
     alignment: Alignment
     translation_m: Statistics
     rotation_rad: Statistics
@@ -70,8 +71,9 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
     return AbsoluteError(
         definition=(
             f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({alignment.description}) and the angle of "
-            f"{rotations}, over {pairs.description}"
+            f"{rotations}"
         ),
+        pairing=pairs.description,
         alignment=alignment,
         translation_m=Statistics.of(errors_m),
         rotation_rad=Statistics.of(errors_rad),
@@ -90,14 +92,14 @@ def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
         return absolute_error(pairs, Alignment.FIRST)
 
 
-def on_the_estimate(estimate: Trajectory, reference: Trajectory) -> Trajectory:
-    """The reference during the estimate, moved onto it by the alignment of the ATE.
+def on_the_estimate(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Trajectory:
+    """The reference at the stamps of the estimate, moved onto it by the alignment of the ATE.
 
     Raises InputError where they have no pairs.
     """
-    T_reference_estimate = absolute_error_on_any_course(pair(estimate, reference)).T_reference_estimate
-    near = during(reference, estimate.stamps_ns)
-    return Trajectory(near.stamps_ns, lie.inverse(T_reference_estimate) @ lie.lift(near.poses))
+    pairs = pair(estimate, reference, gap_s=gap_s)
+    T_reference_estimate = absolute_error_on_any_course(pairs).T_reference_estimate
+    return Trajectory(pairs.stamps_ns, lie.inverse(T_reference_estimate) @ pairs.reference)
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:

@@ -22,12 +22,12 @@ _LONG_PATH_M = 200.0  # from here on the published lengths leave a choice of sta
 
 @dataclass(frozen=True, slots=True)
 class LengthError:
-    """Mean drift over the stretches of one length; zeros where none fits."""
+    """Mean drift over the stretches of one length; None where none fits."""
 
     length_m: float
     stretches: int
-    translation_share: float
-    rotation_rad_per_m: float
+    translation_share: float | None
+    rotation_rad_per_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class KittiError:
 
     Attributes
     ----------
-    definition : what was computed, in words
+    definition : what was computed, in words; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
     stretches : how many there were
@@ -44,6 +44,7 @@ class KittiError:
     """
 
     definition: str
+    pairing: str
     translation_share: float
     rotation_rad_per_m: float
     stretches: int
@@ -84,10 +85,11 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     return KittiError(
         definition=(
             f"KITTI: translation and angle of (P_i⁻¹ P_j)⁻¹ (R_i⁻¹ R_j) over the length, mean of {len(share)} "
-            f"stretches of {lengths} m from every {starts}; {pairs.description}"
+            f"stretches of {lengths} m from every {starts}"
         ),
-        translation_share=_mean(share),
-        rotation_rad_per_m=_mean(turn),
+        pairing=pairs.description,
+        translation_share=float(share.mean()),
+        rotation_rad_per_m=float(turn.mean()),
         stretches=len(share),
         by_length=tuple(by_length),
     )
@@ -111,5 +113,5 @@ def _drift(
     return np.linalg.norm(error[:, :3, 3], axis=1) / length_m, lie.rotation_angle(error) / length_m
 
 
-def _mean(values: NDArray[np.float64]) -> float:
-    return float(values.mean()) if len(values) else 0.0
+def _mean(values: NDArray[np.float64]) -> float | None:
+    return float(values.mean()) if len(values) else None

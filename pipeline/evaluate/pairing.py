@@ -17,6 +17,7 @@ _WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is 
 _INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
 _SAME_S = 1e-6  # what a stamp that was a floating-point number of seconds is off
 _ROUNDED_S = 5e-4  # what one written in milliseconds is off
+_FEW = 10  # poses, whose error says little
 _ROUNDING_SHARE = 0.1  # of the reference's median interval, that either is at most
 
 
@@ -32,7 +33,7 @@ class Pairs:
     estimate_count, reference_count : poses there were
     interpolated : how many of the N reference poses lie between two of the reference's own
     early, late, in_gap : estimated poses without a reference pose: before its begin, after its end, in gaps of it
-    gap_s : widest gap that was interpolated over
+    gap_s : between true poses that may be interpolated over; widest_s : between those that were
     """
 
     stamps_ns: NDArray[np.int64]
@@ -46,6 +47,7 @@ class Pairs:
     late: int
     in_gap: int
     gap_s: float
+    widest_s: float
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -65,12 +67,33 @@ class Pairs:
     def description(self) -> str:
         """What was paired and how, in words."""
         exact = len(self) - self.interpolated
+        how = ""
+        if self.interpolated:
+            how = (
+                f": {exact:,} as they are, {self.interpolated:,} interpolated (position linear, rotation by "
+                f"SLERP, gaps up to {self.gap_s:.3g} s), none extrapolated"
+            )
         return (
             f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
-            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp: {exact:,} as they are, "
-            f"{self.interpolated:,} interpolated (position linear, rotation by SLERP, gaps up to "
-            f"{self.gap_s:.3g} s), none extrapolated" + (f"; {self.missing}" if self.missing else "")
+            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp{how}"
+            + (f"; {self.missing}" if self.missing else "")
         )
+
+    @property
+    def warnings(self) -> list[str]:
+        """Why figures over these pairs may mislead, a line each."""
+        lines = []
+        if 2 * len(self) < self.estimate_count:
+            lines.append(
+                f"accuracy is that of {len(self):,} of {self.estimate_count:,} scans alone: {self.missing}"
+            )
+        elif len(self) < _FEW:
+            lines.append(f"accuracy is that of {counted(len(self), 'pose')} alone")
+        if self.widest_s > _WIDEST_GAP_S:
+            lines.append(
+                f"true poses are up to {self.widest_s:.3g} s apart, and the path between them is taken as straight"
+            )
+        return lines
 
     def _reasons(self) -> Iterator[str]:
         if self.early:
@@ -102,7 +125,9 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     early, late = after == 0, after == len(stamps_ns)
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
     interval = stamps_ns[after] - stamps_ns[before]
-    same_ns, rounded_ns = (min(each * 1e9, _ROUNDING_SHARE * interval_ns) for each in (_SAME_S, _ROUNDED_S))
+    same_ns, rounded_ns = (
+        min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in (_SAME_S, _ROUNDED_S)
+    )
     between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
     known = between | (difference_ns <= rounded_ns)
     poses = reference.poses[index]
@@ -124,6 +149,7 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
         late=int((late & ~known).sum()),
         in_gap=int((~early & ~late & ~known).sum()),
         gap_s=gap_ns * 1e-9,
+        widest_s=float(interval[between].max(initial=0)) * 1e-9,
     )
 
 
@@ -179,6 +205,8 @@ def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matri
 def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
     here, there = estimate.stamps_ns, reference.stamps_ns
     spans = f"the estimate ({span(here)}) has no pose with a true one beside it in the reference ({span(there)})"
+    if len(np.unique(there)) == 1:
+        return f"{spans}, which has poses at one instant alone; give true poses all along the trajectory"
     if here.max() < there.min() or there.max() < here.min():
         return f"{spans}; check that both keep the same clock"
-    return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; evaluate --max-gap allows more"
+    return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"

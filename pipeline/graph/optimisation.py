@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.data import GraphState, fit_text
 from pipeline.graph.initialise import Initialisation
 from pipeline.graph.soundness import has_loop
+from pipeline.words import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +24,9 @@ class GraphChange:
 
 def fit(state: GraphState) -> str:
     """How well its edges in force agree, in words."""
-    rejected = int(state.is_rejected.sum())
-    return fit_text(state.chi2, state.degrees_of_freedom, rejected, "edges", has_loops=has_loops(state))
+    count = int(state.is_rejected.sum())
+    rejected = f"{counted(count, 'edge')} rejected" if count else ""
+    return fit_text(state.chi2, state.degrees_of_freedom, rejected, has_loops=has_loops(state))
 
 
 def has_loops(state: GraphState) -> bool:

@@ -74,7 +74,8 @@ def against_truth(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> t
     error = absolute_error(pair(estimate, Trajectory(stamps_ns, pose_matrices(truth.poses))), Alignment.RIGID)
     T_truth_estimate = lie.flatten(error.T_reference_estimate)
     moved = lie.transform(T_truth_estimate, state.landmarks)
-    return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), error.definition), T_truth_estimate
+    definition = f"{error.definition}, over {error.pairing}"
+    return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), definition), T_truth_estimate
 
 
 def nanoseconds(times_s: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
-    damage : what could not be read; complete once ``scans`` is through
+    damage : what could not be read; complete once ``scans`` is through or closed
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -126,7 +126,7 @@ class Log:
             idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
         return idle
 
-    def scans(self) -> Iterator[Scan]:
+    def scans(self) -> Generator[Scan, None, None]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
 
         A scan that is malformed or has no valid point at all is counted in ``damage`` and left out, like damaged
@@ -141,24 +141,26 @@ class Log:
         times = PointTimes(self.config)
         self.scans_with_wheels = 0
         count, index, asked = 0, 0, working_s()
-        for message, beside in self._with_poses(poses, times):
-            count += 1
-            if (count - 1) % self.config.every:
-                continue
-            complaint = self._complaint(message, count - 1)
-            if complaint:
-                tally.skip(complaint)
-                self._check_bad(tally.bad, complaint)
-                continue
-            scan = self._scan(index, message, beside, waited_s=working_s() - asked)
-            tally.take(scan)
-            self.scans_with_wheels += scan.T_odom_base is not None
-            yield scan
-            index += 1
-            asked = working_s()
-        self._truth = poses.ground_truth()
-        self.damage += [*tally.losses(), *poses.complaints()]
-        self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
+        try:
+            for message, beside in self._with_poses(poses, times):
+                count += 1
+                if (count - 1) % self.config.every:
+                    continue
+                complaint = self._complaint(message, count - 1)
+                if complaint:
+                    tally.skip(complaint)
+                    self._check_bad(tally.bad, complaint)
+                    continue
+                scan = self._scan(index, message, beside, waited_s=working_s() - asked)
+                tally.take(scan)
+                self.scans_with_wheels += scan.T_odom_base is not None
+                yield scan
+                index += 1
+                asked = working_s()
+            self._truth = poses.ground_truth()
+        finally:  # also where the caller wants no more scans
+            self.damage += [*tally.losses(), *poses.complaints()]
+            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:
             raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:

@@ -32,6 +32,7 @@ def write_closures(
         "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
         "proposed_by": pa.array([str(closure.proposed_by) for closure in closures], pa.string()),
         "verdict": pa.array([str(item.verdict) for item in judged], pa.string()),
+        "rejected_by": pa.array([item.rejected_by for item in judged], pa.string()),
         "reason": pa.array([item.reason for item in judged], pa.string()),
         "weight": pa.array([item.weight for item in judged], pa.float64()),
         "chi2_before": pa.array([closure.chi2_before for closure in closures], pa.float64(), from_pandas=True),
@@ -55,6 +56,8 @@ def write_closures(
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
         "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
         "proposed_by": "position: near by odometry; place: looked alike wherever odometry has it",
+        "rejected_by": "verification: by matching; back end: verified, but it contradicts the rest of the graph; "
+        "empty where it is accepted",
         "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
         "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
     }

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 COLUMNS = ("covariance", "state")
 
 
-def nees_of_steps(steps: pa.Table, odometry: Trajectory, truth: Trajectory) -> NDArray[np.float64]:
+def nees_of_steps(
+    steps: pa.Table, odometry: Trajectory, truth: Trajectory, *, gap_s: float | None = None
+) -> NDArray[np.float64]:
     """(N,) NEES of the motion up to each scan; NaN without a true pose at both ends, or where a scan was not ok.
 
     steps : with ``COLUMNS``, a row a scan; odometry : T_odom_lidar of the same scans, SE(2) or lifted
@@ -27,7 +29,7 @@ def nees_of_steps(steps: pa.Table, odometry: Trajectory, truth: Trajectory) -> N
     unknown, k = [np.nan] * size, math.isqrt(size)
     covariances = np.array([row or unknown for row in steps["covariance"].to_pylist()]).reshape(-1, k, k)
     covariances[[state != "ok" for state in steps["state"].to_pylist()]] = np.nan
-    pairs = pair(odometry, truth)
+    pairs = pair(odometry, truth, gap_s=gap_s)
     place = pairs.places
     estimate, reference = pairs.estimate, pairs.reference
     if k == 3:

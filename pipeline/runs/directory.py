@@ -142,8 +142,17 @@ def _is_written_by(pid: int, run_file: Path) -> bool:
         return False
 
 
+def check_outside_runs(destination: Path) -> None:
+    """Refuse a directory within that of a run, which is replaced as a whole. Raises InputError."""
+    for folder in destination.resolve().parents:
+        file = folder / RUN_FILE
+        if file.is_file() and b'"scanchain"' in file.read_bytes():
+            raise InputError(f"{destination}: lies in the run directory {folder}; choose another --out")
+
+
 def _check(destination: Path, force: bool) -> None:
     """Refuse what must not be overwritten."""
+    check_outside_runs(destination)
     if not destination.exists():
         return
     if not destination.is_dir():

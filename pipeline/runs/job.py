@@ -23,6 +23,7 @@ class Job:
     config_file : on top of the preset; overrides : on top of both
     sinks : where the recording goes
     ground_truth : a TUM or KITTI file; None where the log's own is good
+    max_gap_s : between true poses to interpolate over; None for the default
     force : whether a run directory of that name is replaced
     resume : whether to go on from the last checkpoint of a run that was killed, where there is one
     checkpoint_s : seconds between two checkpoints, or more where they are large
@@ -35,6 +36,7 @@ class Job:
     overrides: tuple[Override, ...] = ()
     sinks: frozenset[SinkName] = frozenset({"save"})
     ground_truth: Path | None = None
+    max_gap_s: float | None = None
     force: bool = False
     resume: bool = False
     checkpoint_s: float = 10.0

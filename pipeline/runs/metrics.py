@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
@@ -10,13 +11,13 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from pipeline.data import State, Trajectory, Verdict, fit_text
+from pipeline.data import State, Trajectory, fit_text
 from pipeline.errors import InputError
-from pipeline.evaluate import absolute_error_on_any_course, kitti_error_on_any_course, pair
+from pipeline.evaluate import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
 from pipeline.evaluate.absolute import path_length
 from pipeline.runs.results import Cloud
 from pipeline.runs.step_table import STAGES, StepTable
-from pipeline.runs.verdicts import JudgedClosure
+from pipeline.runs.verdicts import BACK_END, VERIFICATION, JudgedClosure
 from pipeline.slam import SlamResult
 from pipeline.words import counted
 
@@ -44,12 +45,16 @@ class Accuracy(Struct, frozen=True):
 
 
 class GroundTruth(Struct, frozen=True):
-    """How good the run is: after optimisation and before."""
+    """How good the run is: after optimisation and before.
+
+    ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
+    """
 
     source: str
     path_length_m: float
     optimised: Accuracy
     odometry: Accuracy
+    max_gap_s: float | None = None
 
     @property
     def complaint(self) -> str:
@@ -68,8 +73,9 @@ class Metrics(Struct, frozen=True):
     """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
     No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
-    Of the closures tried, some were verified by matching; of those the optimised graph accepted some and rejected
-    the others. ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
+    Closures tried = rejected by verification + verified; verified = rejected by the back end + accepted.
+    ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
+    ``stopped`` says why the run did not see the whole log, of which these are the numbers up to there; else empty.
     ``unreliable`` says why the result as a whole is not to be used, empty where it is.
     ``warnings`` : what was lost, left out or is wrong, a line each
     """
@@ -88,9 +94,10 @@ class Metrics(Struct, frozen=True):
     lost: int
     keyframes: int
     closures_tried: int
+    closures_rejected_by_verification: int
     closures_verified: int
+    closures_rejected_by_back_end: int
     closures_accepted: int
-    closures_rejected: int
     map_points: int
     moving_points_removed: int
     chi2: float
@@ -103,6 +110,7 @@ class Metrics(Struct, frozen=True):
     ground_truth: GroundTruth | None
     warnings: tuple[str, ...]
     unreliable: str = ""
+    stopped: str = ""
     compile_s: float = 0.0
 
     @property
@@ -113,7 +121,19 @@ class Metrics(Struct, frozen=True):
     @property
     def fit(self) -> str:
         """Of the pose graph, in words."""
-        return fit_text(self.chi2, self.degrees_of_freedom, self.closures_rejected)
+        count = self.closures_rejected_by_back_end
+        rejected = f"{counted(count, 'closure')} rejected by the back end" if count else ""
+        return fit_text(self.chi2, self.degrees_of_freedom, rejected, has_loops=self.closures_accepted > 0)
+
+    @property
+    def closures(self) -> str:
+        """How many loop closures were tried, and what became of them, in words."""
+        if not self.closures_tried:
+            return "none tried"
+        return (
+            f"{self.closures_tried:,} tried: {self.closures_rejected_by_verification:,} rejected by verification, "
+            f"{self.closures_rejected_by_back_end:,} by the back end, {self.closures_accepted:,} accepted"
+        )
 
     @property
     def compiling(self) -> str:
@@ -137,6 +157,7 @@ def measure(
     compile_s: float,
     ground_truth: GroundTruth | None,
     warnings: Sequence[str] = (),
+    stopped: str = "",
 ) -> Metrics:
     """The numbers of a finished run."""
     matches = [row.match for row in steps.rows]
@@ -145,6 +166,7 @@ def measure(
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
+    rejected = Counter(item.rejected_by for item in judged)
     return Metrics(
         scans=len(steps),
         dimension=result.trajectory.dimension,
@@ -160,9 +182,10 @@ def measure(
         lost=states[State.LOST],
         keyframes=len(result.keyframes),
         closures_tried=len(judged),
-        closures_verified=sum(item.closure.verdict is Verdict.ACCEPTED for item in judged),
-        closures_accepted=sum(item.verdict is Verdict.ACCEPTED for item in judged),
-        closures_rejected=sum(item.verdict is not item.closure.verdict for item in judged),
+        closures_rejected_by_verification=rejected[VERIFICATION],
+        closures_verified=len(judged) - rejected[VERIFICATION],
+        closures_rejected_by_back_end=rejected[BACK_END],
+        closures_accepted=rejected[""],
         map_points=len(cloud.points),
         moving_points_removed=cloud.removed,
         chi2=result.state.chi2,
@@ -174,6 +197,7 @@ def measure(
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
         unreliable=unreliable(states, [row.points for row in steps.rows]),
+        stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,
     )
@@ -194,11 +218,14 @@ def unreliable(states: Mapping[State, int], points: Sequence[int]) -> str:
     return f"{line}: the surroundings leave it open there, or the log is at fault (scanchain doctor)"
 
 
-def judge(result: SlamResult, reference: Trajectory, source: str) -> GroundTruth:
-    """Both trajectories of a result against the ground truth."""
-    optimised, length_m = _accuracy(result.trajectory, reference)
-    odometry, _ = _accuracy(result.odometry, reference)
-    return GroundTruth(source, length_m, optimised, odometry)
+def judge(
+    result: SlamResult, reference: Trajectory, source: str, gap_s: float | None
+) -> tuple[GroundTruth, list[str]]:
+    """Both trajectories of a result against the ground truth, and why that may mislead, a line each."""
+    pairs = pair(result.trajectory, reference, gap_s=gap_s)
+    optimised, length_m = _accuracy(pairs)
+    odometry, _ = _accuracy(pair(result.odometry, reference, gap_s=gap_s))
+    return GroundTruth(source, length_m, optimised, odometry, gap_s), pairs.warnings
 
 
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
@@ -211,9 +238,8 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
         f"{m.lost:,} lost{dropped}",
-        f"way            {m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}; "
-        f"{counted(m.closures_tried, 'loop closure')} tried, {m.closures_verified:,} verified, "
-        f"{m.closures_accepted:,} accepted",
+        f"way            {m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
+        f"loop closures  {m.closures}",
         f"pose graph     {m.fit}",
         f"map            {counted(m.map_points, 'point')}; "
         f"{m.moving_points_removed:,} more left out as having moved",
@@ -231,8 +257,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
 
 
-def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, float]:
-    pairs = pair(trajectory, reference)
+def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
     ate = absolute_error_on_any_course(pairs)
     try:
         kitti = kitti_error_on_any_course(pairs)
@@ -248,7 +273,7 @@ def _accuracy(trajectory: Trajectory, reference: Trajectory) -> tuple[Accuracy, 
         ate_rotation_rmse_rad=ate.rotation_rad.rmse,
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
-        definition=ate.definition,
+        definition=f"{ate.definition}, over {ate.pairing}",
     )
     return accuracy, ate.path_length_m
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -67,6 +67,7 @@ def process(
             config=config.recording,
         ) as recording,
         journal,
+        closing(scans),  # what it left out is counted then, also if the run was stopped
     ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
@@ -85,7 +86,7 @@ def process(
             cloud = write_results(folder, result, judged, config, recording)
             write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
             steps.write(folder / "steps.parquet", result.trajectory)
-            _show_truth(true_poses, result, recording)
+            _show_truth(true_poses, job.max_gap_s, result, recording)
             if config.outputs.mcap:
                 write_results_mcap(folder, log, steps, result)
         slam.points.close()
@@ -96,7 +97,7 @@ def process(
 
 def _begin(
     job: Job, log: Log, config: Config, folder: Path, left: Left | None
-) -> tuple[Slam, Iterator[Scan], Checkpoints]:
+) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
     """The chain, new or as it was left, the scans that it has not seen, and what writes it down."""
     if left is None:
         slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)
@@ -109,12 +110,13 @@ def _begin(
     return checkpoint.slam, scans, checkpoints
 
 
-def _show_truth(true_poses: TruePoses, result: SlamResult, recording: Recorder) -> None:
+def _show_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:
     """Ground truth into the recording, moved onto the trajectory; one that does not fit is warned of elsewhere."""
     with suppress(InputError):
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is not None:
-            recording.log_ground_truth(on_the_estimate(result.trajectory, reference).poses)
+            moved = on_the_estimate(result.trajectory, reference, gap_s=gap_s)
+            recording.log_ground_truth(moved.poses)
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:

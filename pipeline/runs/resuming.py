@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +47,9 @@ def find_left(out: Path, configuration: str) -> Left | None:
     return Left(folder, checkpoint, steps, size)
 
 
-def after(rows: Sequence[StepRow], scans: Iterator[Scan], folder: Path) -> Iterator[Scan]:
+def after(
+    rows: Sequence[StepRow], scans: Generator[Scan, None, None], folder: Path
+) -> Generator[Scan, None, None]:
     """The scans that follow those already done. Raises InputError where these were not the same."""
     for row in rows:
         scan = next(scans, None)

@@ -91,13 +91,12 @@ def run(
             compile_s = compiled_s() - compiled_before_s
             stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
             with directory.results() as folder:
-                truth, note = _judge(
-                    true_poses, str(job.ground_truth or log.ground_truth_topic), done.result, folder
-                )
+                source = str(job.ground_truth or log.ground_truth_topic)
+                truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
                 warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.judged,
-                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings,
+                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
                 metrics.write(folder / "metrics.json")
@@ -163,20 +162,18 @@ def _true_poses(
 
 
 def _judge(
-    true_poses: TruePoses, source: str, result: SlamResult, folder: Path
+    true_poses: TruePoses, source: str, gap_s: float | None, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
     """Accuracy where there is a truth; warnings where it does not fit, is of few scans, or far off."""
     try:
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is None:
             return None, ()
-        truth = judge(result, reference, source)
+        truth, misleading = judge(result, reference, source, gap_s)
         write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
-    scans, known = len(result.trajectory), truth.optimised.pairs
-    few = f"accuracy is that of {known:,} of {scans:,} scans alone: {truth.optimised.missing}"
-    return truth, tuple(line for line in (truth.complaint, few if 2 * known < scans else "") if line)
+    return truth, tuple(filter(None, (truth.complaint, *misleading)))
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from pipeline.data import REJECTED_WEIGHT, Closure, GraphState, Verdict
 
+VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
+
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
@@ -22,6 +24,13 @@ class JudgedClosure:
     reason: str
     weight: float
     chi2_after: float
+
+    @property
+    def rejected_by(self) -> str:
+        """Verification by matching, or the back end, which found it to contradict the graph; empty if accepted."""
+        if self.verdict is Verdict.ACCEPTED:
+            return ""
+        return BACK_END if self.closure.verdict is Verdict.ACCEPTED else VERIFICATION
 
 
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[JudgedClosure, ...]:
