@@ -81,7 +81,7 @@ def load_settings(
         if not (isinstance(dimension, int) and dimension in PRESETS):
             raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
         layer = read_layer(preset_path(PRESETS[dimension]))
-        source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
+        source = f"preset {PRESETS[dimension]} of {dimension}D logs"
     source += "" if file is None else f", {file}"
     preset = {key: spec.default for key, spec in config_keys().items()} | layer
     values = preset | ({} if file is None else read_layer(file))
@@ -110,8 +110,8 @@ def _named(key: str, value: Value, origin: str) -> str:
 def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:
     """The keys that other keys, or the kind of log, leave without an effect, and why."""
     reasons = {
-        "the log is 3D, and it is of planar logs": _PLANAR_KEYS if dimension == 3 else (),
-        "the log is 2D, and it is of 3D logs": _SPATIAL_KEYS if dimension == 2 else (),
+        "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
+        "it is of 3D logs alone": _SPATIAL_KEYS if dimension == 2 else (),
         "loops.recognise_places is false": () if values["loops.recognise_places"] else _PLACE_KEYS,
         "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
         "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),

@@ -69,6 +69,41 @@ def test_a_healthy_log_is_all_well(tmp_path):
     assert "0.200, 0.100" in found["mounting"].found
 
 
+def covered(*numbers):
+    """The room, but for scans in which all returns are of the robot itself."""
+    return lambda k: np.full(100, 0.2) if k in numbers else room(k)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (0, 20), (38, 39)])
+def test_scans_without_a_point_in_range_are_left_out_wherever_they_are(call, tmp_path, numbers):
+    path = saved(tmp_path, drive(ranges=covered(*numbers)))
+    found = diagnose(path)["damage"]
+    assert (
+        found.severity == "warning"
+        and "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
+    )
+    flags = ["--preprocess.min_range_m", "0.5", "--rerun", "off"]
+    code, output, errors = call("run", path, "--out", tmp_path / "a", *flags)
+    assert code == 0 and "scans          38 over" in output
+    assert (
+        f"warning: 2 of 40 scans of /scan were left out (the first: {path}: scan {numbers[0]} of /scan" in errors
+    )
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+
+
+@pytest.mark.parametrize("percent", ["10", "100"])
+def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path, percent):
+    path = saved(tmp_path, drive(ranges=covered(*range(40))))
+    found = diagnose(path)
+    assert (found["damage"].severity, found["damage"].remedy) == ("problem", "")
+    assert found["ranges"].remedy == "--preprocess.min_range_m 0.18"
+    flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", percent]
+    code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off", *flags)
+    assert code == 2 and errors.count("\n") == 1 and not (tmp_path / "a").exists()
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+    assert "lie at 0.2 to 0.2 m" in errors
+
+
 def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path):
     slow = {"stamp": lambda k: 9 * k * STEP_NS, "log": lambda k: 9 * k * STEP_NS}
     planar = diagnose(saved(tmp_path, drive(**slow)))["rate"]

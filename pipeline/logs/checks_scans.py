@@ -28,7 +28,7 @@ _FEW_POINTS = 50
 
 def check_scans(seen: Survey, preprocess: PreprocessConfig) -> Iterator[Finding]:
     """Every finding about the scans. ``preprocess`` is what a run of this log would use."""
-    yield _damage(seen)
+    yield _damage(seen, preprocess)
     yield _returns(seen)
     yield _no_return(seen)
     yield _ranges(seen, preprocess)
@@ -39,20 +39,25 @@ def check_scans(seen: Survey, preprocess: PreprocessConfig) -> Iterator[Finding]
     yield _mounting(seen)
 
 
-def _damage(seen: Survey) -> Finding:
+def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     empty = sum(scan.kept == 0 for scan in seen.scans)
-    bad = len(seen.malformed) + empty
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
+    bad = len(seen.malformed) + empty + outside
     lines = list(seen.damage)
     if seen.malformed:
         lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
     if empty:
         lines.append(f"{counted(empty, 'scan')} without a valid point")
+    if outside:
+        limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
+        lines.append(f"{counted(outside, 'scan')} without a point between {limits}")
     if not lines:
         return Finding("damage", Severity.OK, "every scan is readable and has points")
     messages = len(seen.scans) + len(seen.malformed)
     if bad > most_bad_scans(messages, seen.log.config):
         effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
-        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}" if bad < messages else ""
         return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
     effect = "what was damaged is left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pipeline import lie
 from pipeline.checks import LONGEST_SWEEP_S
 from pipeline.clock import working_s
-from pipeline.config import LogConfig
+from pipeline.config import LogConfig, PreprocessConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError, shown
 from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
-from pipeline.logs.limits import RangeLimits, Returns
+from pipeline.logs.limits import RangeLimits, Returns, none_retained
 from pipeline.logs.mounting import (
     find_mounting,
     in_plane,
@@ -126,11 +126,12 @@ class Log:
             idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
         return idle
 
-    def scans(self) -> Iterator[Scan]:
+    def scans(self, preprocess: PreprocessConfig | None = None) -> Iterator[Scan]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
 
-        A scan that is malformed or has no valid point at all is counted in ``damage`` and left out, like damaged
-        chunks. Raises InputError when there are more of them than ``log.max_bad_scans_percent`` allows.
+        A scan that is malformed, has no valid point at all or none in the range that ``preprocess`` retains is
+        counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
+        than ``log.max_bad_scans_percent`` allows.
         """
         self.damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
@@ -145,7 +146,7 @@ class Log:
             count += 1
             if (count - 1) % self.config.every:
                 continue
-            complaint = self._complaint(message, count - 1)
+            complaint = self._complaint(message, count - 1, preprocess)
             if complaint:
                 tally.skip(complaint)
                 self._check_bad(tally.bad, complaint)
@@ -294,15 +295,16 @@ class Log:
                 "another --topic"
             )
 
-    def _complaint(self, message: Decoded, number: int) -> str:
+    def _complaint(self, message: Decoded, number: int, preprocess: PreprocessConfig | None) -> str:
         """What is wrong with a scan, empty where it is good."""
         returns = message.value
-        farthest_s = float(np.abs(returns.times_s).max(initial=0.0)) if isinstance(returns, Returns) else 0.0
-        if isinstance(returns, Returns) and len(returns.points) and farthest_s <= LONGEST_SWEEP_S:
-            return ""
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(returns, Returns):
             return f"{where} is malformed: {returns}"
+        farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
         if farthest_s > LONGEST_SWEEP_S:
             return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
-        return f"{where} has no valid point ({returns.why})"
+        if not len(returns.points):
+            return f"{where} has no valid point ({returns.why})"
+        outside = "" if preprocess is None else none_retained(returns.points, preprocess)
+        return outside and f"{where} has {outside}"
