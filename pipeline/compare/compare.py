@@ -130,7 +130,7 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
     if contest.ground_truth is not None:
         truth, source = read_truth(contest.ground_truth).at(scans.stamps_ns), str(contest.ground_truth)
     elif topic and truth is None:
-        raise InputError(f"{log.paths[0]}: has no poses on {topic}; scanchain info lists the topics that have")
+        raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
             missing = pair(standing, truth).missing

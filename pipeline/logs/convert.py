@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs.opening import index_files
-from pipeline.logs.records import FileIndex
+from pipeline.logs.records import FileIndex, name_of
 from pipeline.logs.selection import EVERYTHING, chosen_span, whole_span
 from pipeline.logs.stream import Decoded, decoded_messages
 from pipeline.logs.topics import find_lidar, is_lidar, topics_of
@@ -64,7 +64,7 @@ def convert(
                 progress(sum(counts.values()), total)
         if not sum(counts.values()):
             raise InputError(
-                f"{sources[0]}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+                f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
             )
     notes = tuple(line for index in indexes for line in index.notes)
     return Converted(destination, counts, notes, tuple(damage))

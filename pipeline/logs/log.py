@@ -30,7 +30,7 @@ from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, pla
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
-from pipeline.logs.records import FileIndex
+from pipeline.logs.records import FileIndex, name_of
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally, most_bad_scans
@@ -62,7 +62,7 @@ class Log:
 
     Attributes
     ----------
-    paths : its files
+    paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
     mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
     scan_count : scans to expect after start, end and every, by the index
@@ -77,6 +77,7 @@ class Log:
         self.config = config
         self.indexes = indexes
         self.paths = tuple(index.path for index in indexes)
+        self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
@@ -161,7 +162,7 @@ class Log:
         self.damage += [*tally.losses(), *poses.complaints()]
         self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:
-            raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
+            raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
             scans = counted(count - tally.bad, "scan")
             self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
@@ -193,7 +194,7 @@ class Log:
 
     def _out_of_plane(self, motion: str) -> InputError:
         return InputError(
-            f"{self.paths[0]}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
+            f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
             "another --topic, a part in which it rests (--start, --end), or join its scans to 3D clouds first "
             "(laser_assembler)"
         )
@@ -230,7 +231,7 @@ class Log:
                 last_ns = min(self.span.end_ns, whole_span(self.indexes).end_ns)
                 first_ns = message.value.stamp_ns
                 return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
-        raise InputError(f"{self.paths[0]}: no message of {topic} in the part that is read could be understood")
+        raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood")
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""

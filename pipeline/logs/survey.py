@@ -92,7 +92,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     watch.close()
     if not scans:
         reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
-        raise InputError(f"{log.paths[0]}: no scan of {log.topic} could be read: {reasons}")
+        raise InputError(f"{log.name}: no scan of {log.topic} could be read: {reasons}")
     stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
     assumed = "" if is_scan(log.lidar) else times.assumed
     return Survey(
