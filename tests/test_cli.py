@@ -522,6 +522,26 @@ def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_for
     says(output, "--log.point_times clockwise has no effect")
 
 
+@pytest.mark.parametrize("command", ["info", "doctor"])
+def test_flags_about_times_or_wheels_that_a_log_of_clouds_lacks_are_told(call, tmp_path, command):
+    points = np.zeros(400, [(axis, "<f4") for axis in "xyz"])
+    for axis in "xyz":
+        points[axis] = np.random.default_rng(ord(axis)).uniform(-9.0, 9.0, 400)
+    times = [STAMP_NS + k * SECOND // 10 for k in range(5)]
+    path = write(tmp_path / "a.mcap", [cloud_said(time, point_cloud(time, points)) for time in times])
+    flags = {
+        "--log.point_times ns": "the scans have no times of their points",
+        "--preprocess.deskew false": "the scans have no times of their points",
+        "--odometry.prior constant-velocity": "the log has no wheel odometry",
+        "--log.rate_hz 5": "the log has its own stamps",
+    }
+    code, output, _ = call(command, path, *" ".join(flags).split())
+    assert code == 0
+    for words, why in flags.items():
+        says(output, f"{words} has no effect: {why}")
+    assert "no effect" not in call(command, path, "--log.point_times", "clockwise")[1]
+
+
 def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     says(

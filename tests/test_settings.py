@@ -48,6 +48,8 @@ def says(text, *parts):
         (3, "odometry.max_turn_rad_s", "3", "it is of 2D logs alone"),
         (3, "log.revolution_s", "0.2", "log.point_times"),
         (2, "graph.robust_scale", "2", "graph.robust"),
+        (2, "preprocess.range_voxels", "3", "preprocess.min_scale is 1"),
+        (2, "preprocess.match_points", "300", "preprocess.match_voxel_m is not above preprocess.map_voxel_m"),
     ],
 )
 def test_a_flag_without_effect_is_told_with_its_reason_and_not_as_in_force(dimension, key, text, why):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
-from pipeline.logs.opening import index_files
+from pipeline.logs.opening import HAS_STAMPS, index_files
 from pipeline.logs.records import FileIndex, name_of
 from pipeline.logs.selection import EVERYTHING, chosen_span, whole_span
 from pipeline.logs.stream import Decoded, decoded_messages
@@ -67,6 +67,8 @@ def convert(
                 f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
             )
     notes = tuple(line for index in indexes for line in index.notes)
+    if config.rate_hz and not any(index.takes_rate for index in indexes):
+        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
     return Converted(destination, counts, notes, tuple(damage))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from pipeline.logs.mounting import (
     joint_topics,
     leaves_plane,
 )
-from pipeline.logs.opening import index_files
+from pipeline.logs.opening import HAS_STAMPS, index_files
 from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
@@ -43,7 +45,7 @@ _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
 _POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start_rad")
-_WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
+_WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
@@ -119,13 +121,24 @@ class Log:
     def idle_keys(self) -> dict[str, str]:
         """Settings that have no effect on this log, and why."""
         idle: dict[str, str] = {}
+        if not self._has_point_times():
+            idle |= dict.fromkeys(
+                ("log.point_times", "preprocess.deskew"), "the scans have no times of their points"
+            )
         if is_scan(self.lidar):
             idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan tells the times of its beams itself")
         if not any(index.takes_rate for index in self.indexes):
-            idle["log.rate_hz"] = "the log has its own stamps, it is no folder of clouds"
+            idle["log.rate_hz"] = HAS_STAMPS
         if not self.has_odometry:
             idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
         return idle
+
+    def _has_point_times(self) -> bool:
+        """Whether the first scan that has returns has times of its points; of a remote log it is taken to have."""
+        if not all(isinstance(path, Path) for path in self.paths):
+            return True
+        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(self.config)).decode)
+        return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Iterator[Scan]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
