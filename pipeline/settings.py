@@ -66,7 +66,7 @@ class Settings:
 def load_settings(
     dimension: int | None = None,
     *,
-    file: Path | None = None,
+    file: Path | str | None = None,
     overrides: Sequence[Override] = (),
     idle: Mapping[str, str] = _NOTHING,
 ) -> Settings:
@@ -84,7 +84,7 @@ def load_settings(
         source = f"preset {PRESETS[dimension]} of {dimension}D logs"
     source += "" if file is None else f", {file}"
     preset = {key: spec.default for key, spec in config_keys().items()} | layer
-    values = preset | ({} if file is None else read_layer(file))
+    values = preset | ({} if file is None else read_layer(Path(file)))
     origins = {key: str(file) for key in values if values[key] != preset[key]}
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)

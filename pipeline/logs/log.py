@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.checks import LONGEST_SWEEP_S
+from pipeline.checks import LONGEST_SWEEP_S, instance
 from pipeline.clock import working_s
 from pipeline.config import LogConfig, PreprocessConfig
 from pipeline.data import Pose, Scan, Trajectory
@@ -56,6 +56,7 @@ def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig =
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
+    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
     return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 
