@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import difflib
 import errno
 import gc
 import os
@@ -73,6 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         click.echo(error.format_message())
         return 2
     except click.UsageError as error:
+        if isinstance(error, click.NoSuchOption):
+            error = _with_near_options(error)
         path = error.ctx.command_path if error.ctx else "scanchain"
         return _fail(f"{error.format_message().rstrip('.')}; see {path} --help", 2)
     except click.ClickException as error:
@@ -97,6 +100,13 @@ def _unforeseen(error: Exception) -> int:
     if isinstance(error, OSError) and told(error):
         return _fail(told(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
     return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows where it happened", 1)
+
+
+def _with_near_options(error: click.NoSuchOption) -> click.NoSuchOption:
+    """The error without suggestions that are near only by the hyphens that every option begins with."""
+    bare = {option.lstrip("-"): option for option in error.possibilities or ()}
+    near = [bare[name] for name in difflib.get_close_matches(error.option_name.lstrip("-"), bare)]
+    return click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
 
 
 def _fail(message: str, code: int) -> int:

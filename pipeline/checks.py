@@ -106,8 +106,29 @@ def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
     return value if _is_ready(value, np.float32) else array.astype(np.float32)  # type: ignore[return-value]
 
 
-def integer(value: object, name: str, wanted: str) -> int:
-    """A whole number; floats are refused, also those without a fraction."""
+def truth(value: object, name: str) -> bool:
+    """True or False; texts and numbers are refused: "no" counts as true."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise InputError(f"{name} is {shown(value)}; wanted True or False")
+
+
+def truths(value: object, name: str, count: int) -> NDArray[np.bool_]:
+    """Of each of so many, True or False (N,)."""
+    array = _array(value, name, f"({count},) of True or False")
+    if array.shape != (count,) or (array.dtype.kind != "b" and count):
+        raise InputError(f"{name} is {shown(value)} of {_kind(array)}; wanted ({count},) of True or False")
+    return array.astype(np.bool_, copy=False)
+
+
+def one_of(value: object, choices: tuple[str, ...], name: str) -> None:
+    """Refuse what is not one of a few words."""
+    if not (isinstance(value, str) and value in choices):
+        raise InputError(f"{name} is {shown(value)}; it must be one of {', '.join(choices)}")
+
+
+def integer(value: object, name: str, wanted: str, *, least: int | None = None) -> int:
+    """A whole number, not below ``least``; floats are refused, also those without a fraction."""
     if isinstance(value, bool):
         raise InputError(f"{name} is {value}; wanted {wanted}")
     try:
@@ -116,6 +137,8 @@ def integer(value: object, name: str, wanted: str) -> int:
         raise InputError(f"{name} is {shown(value)}; wanted {wanted}") from None
     if abs(whole) >= 1 << 63:
         raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
+    if least is not None and whole < least:
+        raise InputError(f"{name} is {whole}; wanted {wanted}")
     return whole
 
 

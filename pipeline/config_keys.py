@@ -148,10 +148,11 @@ def find_key(name: str, source: str) -> ConfigKey:
 def _remedy(name: str, keys: tuple[str, ...]) -> str:
     section, _, leaf = name.rpartition(".")
     same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
-    inside = [key for key in keys if key.startswith(f"{section}.")]
-    near = same_leaf or difflib.get_close_matches(name, inside or keys, n=1, cutoff=0.5)
-    if not near:
-        near = difflib.get_close_matches(name, keys, n=1, cutoff=0.5)
+    inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
+    near = difflib.get_close_matches(name, same_leaf, n=1, cutoff=0.0)
+    near = near or [inside[other] for other in difflib.get_close_matches(leaf, inside, n=1)]
+    if not near and not inside:
+        near = difflib.get_close_matches(name, keys, n=1)
     listing = "all keys: scanchain config show"
     return f"did you mean {near[0]}? ({listing})" if near else listing
 

@@ -25,10 +25,10 @@ Matrix = NDArray[np.float64]
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
 
 _WHOLE = (
-    ("index", "the number of the scan, from 0"),
-    ("stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)"),
-    ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)"),
-    ("dropped", "a number of returns"),
+    ("index", "the number of the scan, from 0", 0),
+    ("stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)", None),
+    ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)", None),
+    ("dropped", "a number of returns, from 0", 0),
 )
 
 
@@ -63,9 +63,8 @@ class Scan:
         """Check and convert; the class is frozen, so that what was checked stays so."""
         from pipeline import checks  # compiled: whoever reads --help makes no scan
 
-        for name, wanted in _WHOLE:
-            if type(value := getattr(self, name)) is not int:
-                object.__setattr__(self, name, checks.integer(value, name, wanted))
+        for name, wanted, least in _WHOLE:
+            object.__setattr__(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
         d = 2 if checks.shape(self.points, "points")[1:] == (2,) else 3
         points = checks.points(self.points, "points", d, dtype=np.float32)
         object.__setattr__(self, "points", points)

@@ -66,7 +66,7 @@ class Settings:
 def load_settings(
     dimension: int | None = None,
     *,
-    file: Path | None = None,
+    file: Path | str | None = None,
     overrides: Sequence[Override] = (),
     idle: Mapping[str, str] = _NOTHING,
 ) -> Settings:
@@ -81,10 +81,10 @@ def load_settings(
         if not (isinstance(dimension, int) and dimension in PRESETS):
             raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
         layer = read_layer(preset_path(PRESETS[dimension]))
-        source = f"preset {PRESETS[dimension]}, chosen because the log is {dimension}D"
+        source = f"preset {PRESETS[dimension]} of {dimension}D logs"
     source += "" if file is None else f", {file}"
     preset = {key: spec.default for key, spec in config_keys().items()} | layer
-    values = preset | ({} if file is None else read_layer(file))
+    values = preset | ({} if file is None else read_layer(Path(file)))
     origins = {key: str(file) for key in values if values[key] != preset[key]}
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
@@ -103,18 +103,23 @@ def load_settings(
 
 def _named(key: str, value: Value, origin: str) -> str:
     """A setting as the user wrote it."""
-    text = str(value).lower() if isinstance(value, bool) else value
+    text = str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else value
     return f"{origin} {text}" if origin.startswith("--") else f"{origin}: {key} {text}"
 
 
 def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:
     """The keys that other keys, or the kind of log, leave without an effect, and why."""
+    matches_all = float(values["preprocess.match_voxel_m"]) <= float(values["preprocess.map_voxel_m"])
     reasons = {
-        "the log is 3D, and it is of planar logs": _PLANAR_KEYS if dimension == 3 else (),
-        "the log is 2D, and it is of 3D logs": _SPATIAL_KEYS if dimension == 2 else (),
+        "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
+        "it is of 3D logs alone": _SPATIAL_KEYS if dimension == 2 else (),
         "loops.recognise_places is false": () if values["loops.recognise_places"] else _PLACE_KEYS,
         "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
         "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
+        "preprocess.min_scale is 1": ("preprocess.range_voxels",) if values["preprocess.min_scale"] == 1.0 else (),
+        "preprocess.match_voxel_m is not above preprocess.map_voxel_m": (
+            ("preprocess.match_points",) if matches_all else ()
+        ),
         "matching.matcher is svd": ("matching.optimiser",) if values["matching.matcher"] == "svd" else (),
         "log.point_times is not clockwise or counterclockwise": (
             () if values["log.point_times"] in ("clockwise", "counterclockwise") else _REVOLUTION_KEYS

@@ -28,7 +28,7 @@ from pipeline import (
     rigid_transform,
     write_tum,
 )
-from pipeline.config import LocalMapConfig, MatchingConfig, PreprocessConfig
+from pipeline.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
 from pipeline.evaluate import absolute_error, pair
 
 CALLS = 2000
@@ -120,6 +120,15 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: PoseGraph(2).add_edge(0, 1, I3, np.eye(6)), r"information has the shape \(6, 6\); wanted"),
         (lambda: PoseGraph(2).add_edge(0.0, 1, I3, I3), "i is 0.0; wanted the index of a pose"),
         (lambda: PoseGraph(2).add_edges([[0.5, 1]], I3[None], I3[None], [False]), "edges holds float64; wanted"),
+        (lambda: replace(scan(I3), dropped=-1), "dropped is -1; wanted a number of returns, from 0"),
+        (lambda: replace(scan(I3), index=-1), "index is -1; wanted the number of the scan, from 0"),
+        (lambda: PoseGraph(2).add_edge(0, 1, I3, I3, is_loop="no"), "is_loop is 'no'; wanted True or False"),
+        (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], ["no"]), "is_loop .* wanted .* True or"),
+        (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], [0]), "is_loop .* wanted .* True or"),
+        (lambda: PoseGraph(2).optimise(Config()), "config is .*; wanted a GraphConfig"),
+        (lambda: PoseGraph(2).optimise(GraphConfig(), initialise="best"), "initialise is 'best'; it must be"),
+        (lambda: PoseGraph(2).optimise(GraphConfig(), judgement="fair"), "judgement is 'fair'; it must be"),
+        (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
@@ -129,6 +138,21 @@ def test_a_wrong_argument_is_named_with_what_came_and_what_is_wanted(call, words
     with pytest.raises(InputError, match=words) as error:
         call()
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("matcher", "given", "words"),
+    [
+        ("plicp", {"wide": "no"}, "wide is 'no'; wanted True or False"),
+        ("svd", {"wide": 1}, "wide is 1; wanted True or False"),
+        ("plicp", {"prior": I4}, "prior is an array .*; wanted a Prior"),
+    ],
+)
+def test_how_to_align_is_told_by_the_right_kind_of_argument(matcher, given, words):
+    align, target = mapped(ROOM, matcher)
+    with pytest.raises(InputError, match=words):
+        align.align(ROOM, target, I4, **given)
+    assert align.align(ROOM, target, I4, wide=np.True_).converged
 
 
 @pytest.mark.parametrize("matcher", ["plicp", "svd"])

@@ -311,6 +311,8 @@ def test_a_span_without_a_scan_names_the_length_of_the_log(refused, tmp_path, of
         (["--log.odometry_topic", "/nope"], ["log.odometry_topic /nope", "/odom"]),
         (["--config", "absent.toml"], ["absent.toml", "--config"]),
         (["--colour"], ["No such option '--colour'", "scanchain run --help"]),
+        (["--nosuch", "3"], ["No such option '--nosuch'; see scanchain run --help"]),
+        (["--forec"], ["No such option '--forec'. Did you mean '--force'?; see"]),
     ],
 )
 def test_a_wrong_flag_names_itself_its_value_and_what_is_allowed(refused, tmp_path, office, flags, words):
@@ -403,6 +405,17 @@ def test_ctrl_c_is_one_line_with_exit_code_1(call, monkeypatch, office):
     assert (code, output, errors.strip()) == (1, "", "error: interrupted")
 
 
+def test_an_interruption_while_the_imports_run_is_one_line_too():
+    stopped_at = (
+        "import sys; from pipeline.entry import main\nclass Stop:\n def find_spec(*_): raise KeyboardInterrupt\n"
+    )
+    command = [sys.executable, "-c", f"{stopped_at}sys.meta_path.insert(0, Stop()); sys.exit(main())"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"scanchain": "pipeline.entry:main"}
+
+
 # run
 
 
@@ -410,7 +423,7 @@ def test_a_run_is_quiet_but_for_its_summary_when_piped(call, tmp_path, office):
     code, output, errors = call("run", office, "--out", tmp_path / "a")
     assert (code, errors) == (0, "")
     assert output == (tmp_path / "a" / "summary.txt").read_text() + f"written        {tmp_path / 'a'}\n"
-    says(output, office, "/scan", "preset lidar2d, chosen because the log is 2D", "60 over 5.9 s: 60 ok")
+    says(output, office, "/scan", "preset lidar2d of 2D logs", "60 over 5.9 s: 60 ok")
 
 
 def test_json_prints_the_metrics_and_nothing_else(call, tmp_path, office):
@@ -497,7 +510,7 @@ def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_for
     code, output, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", *words)
     assert code == 0
     (line,) = [line for line in output.splitlines() if line.startswith("configuration")]
-    assert line.endswith("chosen because the log is 2D")
+    assert line.endswith("preset lidar2d of 2D logs")
     for said, why in (
         ("point_times clockwise", "laser scan"),
         ("rate_hz 5", "stamps"),
@@ -507,6 +520,26 @@ def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_for
         says(warning, "has no effect", why)
     _, output, _ = call("doctor", office, "--log.point_times", "clockwise")
     says(output, "--log.point_times clockwise has no effect")
+
+
+@pytest.mark.parametrize("command", ["info", "doctor"])
+def test_flags_about_times_or_wheels_that_a_log_of_clouds_lacks_are_told(call, tmp_path, command):
+    points = np.zeros(400, [(axis, "<f4") for axis in "xyz"])
+    for axis in "xyz":
+        points[axis] = np.random.default_rng(ord(axis)).uniform(-9.0, 9.0, 400)
+    times = [STAMP_NS + k * SECOND // 10 for k in range(5)]
+    path = write(tmp_path / "a.mcap", [cloud_said(time, point_cloud(time, points)) for time in times])
+    flags = {
+        "--log.point_times ns": "the scans have no times of their points",
+        "--preprocess.deskew false": "the scans have no times of their points",
+        "--odometry.prior constant-velocity": "the log has no wheel odometry",
+        "--log.rate_hz 5": "the log has its own stamps",
+    }
+    code, output, _ = call(command, path, *" ".join(flags).split())
+    assert code == 0
+    for words, why in flags.items():
+        says(output, f"{words} has no effect: {why}")
+    assert "no effect" not in call(command, path, "--log.point_times", "clockwise")[1]
 
 
 def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
@@ -555,7 +588,7 @@ def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):
     mine = tmp_path / "mine.toml"
     mine.write_text("[maps]\nvoxel_size_m = 0.4\n")
     _, output, _ = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--config", mine, "--every", "2")
-    source = f"preset lidar2d, chosen because the log is 2D, {mine}, log.every 2"
+    source = f"preset lidar2d of 2D logs, {mine}, log.every 2"
     says(output, f"configuration  {source}")
     assert config(tmp_path / "a") == flatten(configured(2)) | {"maps.voxel_size_m": 0.4, "log.every": 2}
     assert json.loads((tmp_path / "a" / "run.json").read_text())["configuration"] == source
@@ -860,7 +893,7 @@ def test_evaluate_agrees_with_the_metrics_of_the_run(call, tmp_path, office):
 def test_config_show_lists_every_key_with_unit_and_range_and_marks_changes(call):
     code, output, errors = call("config", "show", "--lidar", "2d", "--log.every", "7")
     assert (code, errors) == (0, "")
-    says(output, "# preset lidar2d", "log.every 7")
+    says(output, "# preset lidar2d of 2D logs, log.every 7; * differs")
     lines = {line[2:].split()[0]: line for line in output.splitlines()[1:]}
     defaults = flatten(configured(3))
     values = flatten(configured(2, {"log.every": 7}))

@@ -10,6 +10,7 @@ from numba import njit
 from pipeline.__main__ import _record
 from pipeline.clock import compiled_s, working_s
 from pipeline.matching import VoxelMap
+from pipeline.runs import results
 from pipeline.runs.compiling import telling_of_compilation
 from pipeline.runs.job import Job
 from pipeline.runs.progress import Unwatched
@@ -75,8 +76,25 @@ def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_rehearsal_reaches_the_end(dimension):
+def test_a_rehearsal_optimises_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
+    made = {}
+    for name in ("cloud_of", "grid_of"):
+        monkeypatch.setattr(f"pipeline.runs.rehearsal.{name}", _remembering(made, name))
     rehearse(dimension)
+    assert list(made) == ["cloud_of", "grid_of"]
+    (result, _), cloud = made["cloud_of"]
+    assert len(result.keyframes) == len(result.trajectory) == 3 and len(result.state.edges) >= 2
+    assert len(cloud.points) > 0 and made["grid_of"][1].log_odds.max() > 0.0
+
+
+def _remembering(made, name):
+    function = getattr(results, name)
+
+    def remembered(*given):
+        made[name] = (given, function(*given))
+        return made[name][1]
+
+    return remembered
 
 
 def test_the_clock_stands_still_while_a_kernel_and_those_it_calls_are_compiled():

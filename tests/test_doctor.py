@@ -29,7 +29,7 @@ from pipeline.simulate import simulate
 
 STEP_NS = SECOND // 10
 CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]
-CHECKS += ["ranges", "duplicates", "rest", "mounting", "sensors"]
+CHECKS += ["ranges", "surfaces", "duplicates", "rest", "mounting", "sensors"]
 
 
 def diagnose(*paths, **config):
@@ -67,6 +67,41 @@ def test_a_healthy_log_is_all_well(tmp_path):
     assert {finding.severity for finding in found.values()} == {"ok"}
     assert "10 Hz" in found["rate"].found and "40 readings, 0 of 40" in found["wheels"].found
     assert "0.200, 0.100" in found["mounting"].found
+
+
+def covered(*numbers):
+    """The room, but for scans in which all returns are of the robot itself."""
+    return lambda k: np.full(100, 0.2) if k in numbers else room(k)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (0, 20), (38, 39)])
+def test_scans_without_a_point_in_range_are_left_out_wherever_they_are(call, tmp_path, numbers):
+    path = saved(tmp_path, drive(ranges=covered(*numbers)))
+    found = diagnose(path)["damage"]
+    assert (
+        found.severity == "warning"
+        and "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
+    )
+    flags = ["--preprocess.min_range_m", "0.5", "--rerun", "off"]
+    code, output, errors = call("run", path, "--out", tmp_path / "a", *flags)
+    assert code == 0 and "scans          38 over" in output
+    assert (
+        f"warning: 2 of 40 scans of /scan were left out (the first: {path}: scan {numbers[0]} of /scan" in errors
+    )
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+
+
+@pytest.mark.parametrize("percent", ["10", "100"])
+def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path, percent):
+    path = saved(tmp_path, drive(ranges=covered(*range(40))))
+    found = diagnose(path)
+    assert (found["damage"].severity, found["damage"].remedy) == ("problem", "")
+    assert found["ranges"].remedy == "--preprocess.min_range_m 0.18"
+    flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", percent]
+    code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off", *flags)
+    assert code == 2 and errors.count("\n") == 1 and not (tmp_path / "a").exists()
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+    assert "lie at 0.2 to 0.2 m" in errors
 
 
 def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path):
@@ -201,6 +236,39 @@ def test_a_log_that_was_cut_off_is_told(tmp_path):
     path.write_bytes(path.read_bytes()[:-1500])
     finding = diagnose(path)["damage"]
     assert finding.severity == "warning" and "cut off" in finding.found
+
+
+def test_a_view_that_leaves_a_motion_open_is_told_with_it(tmp_path):
+    angles = np.abs(np.sin(-1.0 + 0.02 * np.arange(100))) + 1e-9
+    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan))
+    finding = diagnose(saved(tmp_path, along_walls))["surfaces"]
+    assert finding.severity == "warning" and "in 10 of 10 scans looked at" in finding.found
+    assert "hardly determine motion along x" in finding.found and "wheel odometry" in finding.effect
+    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan), wheels=True)
+    assert "wheel" not in diagnose(saved(tmp_path, along_walls))["surfaces"].effect
+
+
+def test_clouds_of_one_plane_with_noise_leave_motions_open(tmp_path):
+    rng = np.random.default_rng(0)
+    said = []
+    for k in range(5):
+        rows = np.zeros(2000, [(axis, "<f4") for axis in "xyz"])
+        rows["x"], rows["y"] = rng.uniform(-20.0, 20.0, (2, 2000))
+        rows["z"] = rng.normal(-1.0, 0.01, 2000)
+        time_ns = STAMP_NS + k * STEP_NS
+        said.append(cloud_said(time_ns, point_cloud(time_ns, rows)))
+    finding = diagnose(saved(tmp_path, said))["surfaces"]
+    assert finding.severity == "warning" and "in 5 of 5 scans" in finding.found
+
+
+@pytest.mark.parametrize(
+    ("name", "motion"),
+    [("corridor", "motion along x"), ("field", "rotation about z"), ("town", ""), ("highway", "")],
+)
+def test_worlds_that_leave_a_motion_open_are_told_from_those_that_do_not(tmp_path, name, motion):
+    simulate(name, tmp_path / "a.mcap", duration_s=20.0, sensor="vlp-16")
+    finding = diagnose(tmp_path / "a.mcap")["surfaces"]
+    assert (finding.severity == "ok") == (not motion) and motion in finding.found
 
 
 def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path):

@@ -139,6 +139,11 @@ def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, smal
         (["--odometry-noise", "1,2"], "give four positive numbers"),
         (["--odometry-noise", "0.1,0.1,-1,1"], "give four positive numbers"),
         (["--robot", "0"], "--robot"),
+        (["--methods", "lu,lu"], "--methods names one twice: lu, lu"),
+        (["--robot", "3"], "--robot is for MRCLAM folders alone"),
+        (["--odometry-noise", "1,1,1,1"], "--odometry-noise is for MRCLAM folders alone"),
+        (["--guess", "odometry"], "--guess is for nonlinear files alone"),
+        (["--optimiser", "dogleg"], "--optimiser is for nonlinear files alone"),
     ],
 )
 def test_bad_arguments_are_one_line_and_leave_nothing(call, small, tmp_path, words, said):

@@ -138,11 +138,12 @@ def test_without_motion_capture_the_estimate_stands_and_its_accuracy_is_unknown(
         ("Robot1_Odometry.dat", "1.0 2.0\n", "has 2 numbers a line; it must have 3"),
         ("Robot1_Odometry.dat", "1.0 2.0 x\n", "is no table of 3 numbers"),
         ("Robot1_Odometry.dat", "", "is empty"),
+        ("Robot1_Odometry.dat", "# time forward turn\n \n", "is empty"),
         ("Robot1_Measurement.dat", "1.0 63 nan 0.0\n", "row 1 is not finite"),
         ("Robot1_Measurement.dat", "11.0 14 1.0 0.0\n", "robot 1 saw no landmark"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:loadtxt")
+@pytest.mark.filterwarnings("error")
 def test_every_damage_of_a_folder_is_one_line(folder, file, text, said):
     (folder / file).write_text(text)
     with pytest.raises(InputError, match=said) as raised:

@@ -150,6 +150,21 @@ def test_several_lidars_are_listed(tmp_path):
     assert len(list(log.scans())) == log.scan_count == 1
 
 
+def test_several_logs_with_a_lidar_each_are_all_named_with_their_topics(tmp_path):
+    paths = [
+        write(tmp_path / f"{name}.mcap", [scan_said(STAMP_NS, laser_scan(STAMP_NS, [1.0]), f"/{name}")])
+        for name in ("front", "rear", "top")
+    ]
+    says(complaint(*paths[:2]), f"{paths[0]} and {paths[1]}, read as one log: has several lidar topics")
+    says(complaint(*paths[:2]), "/front (sensor_msgs/msg/LaserScan) in front.mcap, /rear", ") in rear.mcap")
+    for config, complained in (
+        ({"topic": "/nope"}, "has no topic /nope"),
+        ({"odometry_topic": "/nope", "topic": "/top"}, "/nope"),
+    ):
+        with pytest.raises(InputError, match=f"{paths[0]} and 2 more files, read as one log: .*{complained}"):
+            open_log(paths, LogConfig(**config))
+
+
 def test_an_odometry_topic_that_is_absent_is_named(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
     says(complaint(path, odometry_topic="/wheels"), "/wheels", "odometry_topic", "/odom")

@@ -42,12 +42,14 @@ def says(text, *parts):
 @pytest.mark.parametrize(
     ("dimension", "key", "text", "why"),
     [
-        (2, "loops.place_drift", "0.2", "the log is 2D"),
-        (2, "maps.slice_min_z_m", "-1", "the log is 2D"),
-        (3, "loops.refine", "false", "the log is 3D"),
-        (3, "odometry.max_turn_rad_s", "3", "the log is 3D"),
+        (2, "loops.place_drift", "0.2", "it is of 3D logs alone"),
+        (2, "maps.slice_min_z_m", "-1", "it is of 3D logs alone"),
+        (3, "loops.refine", "false", "it is of 2D logs alone"),
+        (3, "odometry.max_turn_rad_s", "3", "it is of 2D logs alone"),
         (3, "log.revolution_s", "0.2", "log.point_times"),
         (2, "graph.robust_scale", "2", "graph.robust"),
+        (2, "preprocess.range_voxels", "3", "preprocess.min_scale is 1"),
+        (2, "preprocess.match_points", "300", "preprocess.match_voxel_m is not above preprocess.map_voxel_m"),
     ],
 )
 def test_a_flag_without_effect_is_told_with_its_reason_and_not_as_in_force(dimension, key, text, why):
@@ -163,6 +165,7 @@ def test_a_key_in_the_wrong_section_is_told_the_right_one():
     [
         ("[matching]\nmax_distanc_m = 1\n", "matching.max_distanc_m", "matching.max_distance_m"),
         ("[matchin]\nmatcher = 'svd'\n", "matchin.matcher", "matching.matcher"),
+        ("[matchin]\nmax_distance_m = 1\n", "matchin.max_distance_m", "matching.max_distance_m"),
         ("[matchin]\n", "matchin", "matching."),
         ("matching = 3\n", "matching", "matching."),
         ("matcher = 'svd'\n", "matcher", "matching.matcher"),
@@ -173,10 +176,11 @@ def test_an_unknown_key_in_a_file_names_file_key_and_the_nearest_one(tmp_path, t
     says(complaint(file=file), f"{file}: {unknown} is not a configuration key", f"did you mean {nearest}")
 
 
-def test_a_key_like_none_there_is_points_to_the_list():
-    text = complaint(overrides=[flag("zzz.qqq", "1")])
+@pytest.mark.parametrize("key", ["zzz.qqq", "log.nosuch"])
+def test_a_key_like_none_there_is_points_to_the_list(key):
+    text = complaint(overrides=[flag(key, "1")])
     assert "did you mean" not in text
-    says(text, "--zzz.qqq", "scanchain config show")
+    says(text, f"--{key}", "scanchain config show")
 
 
 @pytest.mark.parametrize(

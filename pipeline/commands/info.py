@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -37,8 +37,10 @@ def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_jso
     from pipeline.logs.info import describe
 
     chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
-    description = describe(logs, load_settings(overrides=chosen).config.log)
-    click.echo(json.dumps(asdict(description), indent=2) if as_json else _text(description))
+    found = describe(logs, load_settings(overrides=chosen).config.log)
+    idle = load_settings(found.dimension or None, overrides=chosen, idle=found.idle_keys).without_effect
+    found = replace(found, notes=(*found.notes, *idle))
+    click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
 
 
 def _text(log: LogInfo) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from pipeline.commands.override_command import OnceCommand
 from pipeline.errors import InputError
@@ -103,6 +104,7 @@ def landmarks(
     """
     from pipeline.commands.outputs import check_output
     from pipeline.commands.terminal import Terminal
+    from pipeline.landmarks.npz import read_landmark_data
     from pipeline.landmarks.solvers import parse_methods
     from pipeline.landmarks.study import Options
     from pipeline.landmarks.study_file import study_file
@@ -113,11 +115,16 @@ def landmarks(
 
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
     viewing: Viewing = ctx.obj
+    problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
+    _check_options(ctx, {"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
         check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with telling_of_compilation(terminal):
-            studies = [(study_log if path.is_dir() else study_file)(path, options) for path in data]
+            studies = [
+                study_log(each, options) if isinstance(each, Path) else study_file(each, options)
+                for each in problems
+            ]
         _check_names(studies)
         tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
         _write(directory.path, data, studies, tree)
@@ -128,6 +135,22 @@ def landmarks(
     click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
+
+
+_OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
+_ALONE = {  # options that only some problems take
+    "robot": ("--robot", *_OF_LOGS),
+    "noise": ("--odometry-noise", *_OF_LOGS),
+    "guess": ("--guess", *_OF_NONLINEAR),
+    "optimiser": ("--optimiser", *_OF_NONLINEAR),
+}
+
+
+def _check_options(ctx: click.Context, kinds: Collection[str]) -> None:
+    """Refuse options that none of the problems, of these kinds, takes."""
+    for name, (flag, kind, what) in _ALONE.items():
+        if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise InputError(f"{flag} is for {what} alone, and DATA names none; leave it out")
 
 
 def _noise(text: str | None) -> OdometryNoise | None:

@@ -84,14 +84,16 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
     """
     began = perf_counter()
     log = open_log(contest.logs, load_settings(overrides=contest.overrides).config.log)
+    settings = load_settings(log.dimension, overrides=contest.overrides, idle=log.idle_keys())
     names = contest.methods or default_names(log.dimension)
     methods = resolve(names, log.dimension, file=contest.settings_file, overrides=contest.overrides)
-    for line in load_settings(log.dimension, overrides=contest.overrides, idle=log.idle_keys()).without_effect:
+    for line in settings.without_effect:
         progress.tell(line)
     directory = RunDirectory(contest.out, force=contest.force)
     provenance = describe_start(contest.command, contest.logs, ", ".join(names))
     with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
-        scans = store(progress.track(log.scans(), log.scan_count), log.T_base_lidar, Path(shared))
+        decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
+        scans = store(decoded, log.T_base_lidar, Path(shared))
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
@@ -128,7 +130,7 @@ def _reference(contest: Contest, log: Log, scans: StoredScans) -> Reference:
     if contest.ground_truth is not None:
         truth, source = read_truth(contest.ground_truth).at(scans.stamps_ns), str(contest.ground_truth)
     elif topic and truth is None:
-        raise InputError(f"{log.paths[0]}: has no poses on {topic}; scanchain info lists the topics that have")
+        raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
             missing = pair(standing, truth).missing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -140,8 +142,9 @@ class PoseGraph:
         """
         T_ij = checks.pose(T_ij, "T_ij", self.dimension)
         information = checks.matrices(information, "information", (self.freedom, self.freedom))
+        is_loop = checks.truth(is_loop, "is_loop")
         pair = [checks.integer(each, name, "the index of a pose") for each, name in ((i, "i"), (j, "j"))]
-        self._add_edges(np.array([pair], np.int64), T_ij[None], information[None], np.array([bool(is_loop)]))
+        self._add_edges(np.array([pair], np.int64), T_ij[None], information[None], np.array([is_loop]))
 
     def add_edges(
         self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
@@ -150,12 +153,11 @@ class PoseGraph:
         edges = checks.indices(edges, "edges")
         measurements = checks.poses(measurements, "measurements", self.dimension)
         information = checks.matrices(information, "information", (len(edges), self.freedom, self.freedom))
-        is_loop = np.asarray(is_loop, np.bool_)
-        if len(measurements) != len(edges) or is_loop.shape != (len(edges),):
+        is_loop = checks.truths(is_loop, "is_loop", len(edges))
+        if len(measurements) != len(edges):
             raise InputError(
-                f"measurements has {counted(len(measurements), 'entry', 'entries')}, "
-                f"is_loop the shape {is_loop.shape}; wanted one for "
-                f"each of {counted(len(edges), 'edge')}"
+                f"measurements has {counted(len(measurements), 'entry', 'entries')}; "
+                f"wanted one for each of {counted(len(edges), 'edge')}"
             )
         self._add_edges(edges, measurements, information, is_loop)
 
@@ -197,6 +199,9 @@ class PoseGraph:
 
         judgement : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
         """
+        checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
+        checks.one_of(initialise, get_args(Initialisation), "initialise")
+        checks.one_of(judgement, get_args(Judgement), "judgement")
         begin = working_s()
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))

@@ -91,10 +91,10 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
 
 
 def _table(path: Path, columns: int) -> Matrix:
-    """The numbers of a file, (rows, columns); lines that begin with # are comments."""
+    """The numbers of a file, (rows, columns); what follows a # is a comment."""
     try:
-        with path.open(encoding="utf-8") as file:
-            table = np.loadtxt(file, ndmin=2)
+        rows = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
+        table = np.loadtxt(rows, ndmin=2) if rows else np.empty((0, columns))
     except FileNotFoundError:
         raise InputError(f"{path}: does not exist; an MRCLAM folder needs it") from None
     except OSError as error:

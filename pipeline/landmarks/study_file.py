@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from pipeline.landmarks.bearing_range import BearingRangeProblem, world_referenc
 from pipeline.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from pipeline.landmarks.covariance import Covariance
 from pipeline.landmarks.minimise import minimise
-from pipeline.landmarks.npz import read_landmark_data
 from pipeline.landmarks.problem import LandmarkData, State
 from pipeline.landmarks.relative_position import linear_system, state_of
 from pipeline.landmarks.solvers import create_solver, methods_for
@@ -27,9 +25,8 @@ from pipeline.words import FREEDOM, counted
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 
 
-def study_file(path: Path, options: Options) -> Study:
-    """Read a problem, solve it by every method that is asked for, compare with the truth in the file."""
-    data = read_landmark_data(path)
+def study_file(data: LandmarkData, options: Options) -> Study:
+    """Solve the problem of a file by every method that is asked for, compare with the truth in the file."""
     return _write_up(data, _linear(data, options) if data.kind == "linear" else _nonlinear(data, options))
 
 

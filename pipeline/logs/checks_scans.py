@@ -1,4 +1,4 @@
-"""The doctor's checks of the scans themselves: returns, ranges, rings, repetitions, rest, mounting, damage."""
+"""The doctor's checks of the scans: damage, returns, ranges, surfaces, rings, copies, rest, mounting."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.config import PreprocessConfig
 from pipeline.logs.finding import Finding, Severity
 from pipeline.logs.rest import LEAST_S, Rest
+from pipeline.logs.surfaces import weakest_motion
 from pipeline.logs.survey import Survey
 from pipeline.logs.tally import most_bad_scans
 from pipeline.words import counted
@@ -24,35 +25,42 @@ _STUCK_SHARE = 0.01  # of beams, all at the farthest range
 _LONG_REST_S = 5.0
 _WHEELS_MOVE = 0.02  # metres, or the sine of a turn
 _FEW_POINTS = 50
+_OPEN = 0.003  # information about the weakest motion, below which matches are degenerate as a rule
 
 
 def check_scans(seen: Survey, preprocess: PreprocessConfig) -> Iterator[Finding]:
     """Every finding about the scans. ``preprocess`` is what a run of this log would use."""
-    yield _damage(seen)
+    yield _damage(seen, preprocess)
     yield _returns(seen)
     yield _no_return(seen)
     yield _ranges(seen, preprocess)
     if seen.log.dimension == 3:
         yield _rings(seen)
+    yield _surfaces(seen, preprocess)
     yield _duplicates(seen)
     yield _rest(seen)
     yield _mounting(seen)
 
 
-def _damage(seen: Survey) -> Finding:
+def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     empty = sum(scan.kept == 0 for scan in seen.scans)
-    bad = len(seen.malformed) + empty
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
+    bad = len(seen.malformed) + empty + outside
     lines = list(seen.damage)
     if seen.malformed:
         lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
     if empty:
         lines.append(f"{counted(empty, 'scan')} without a valid point")
+    if outside:
+        limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
+        lines.append(f"{counted(outside, 'scan')} without a point between {limits}")
     if not lines:
         return Finding("damage", Severity.OK, "every scan is readable and has points")
     messages = len(seen.scans) + len(seen.malformed)
     if bad > most_bad_scans(messages, seen.log.config):
         effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
-        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}" if bad < messages else ""
         return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
     effect = "what was damaged is left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
@@ -126,6 +134,23 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
         remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, remedy)
     return Finding("ranges", Severity.OK, found)
+
+
+def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    """Whether the surfaces in sight determine every motion; a run judges this by matching, scan by scan."""
+    found = [weakest_motion(sample, preprocess) for sample in seen.samples]
+    open_motions = Counter(each.direction for each in found if each.information < _OPEN)
+    bad = open_motions.total()
+    if not bad:
+        return Finding(
+            "surfaces", Severity.OK, f"they determine every motion in {counted(len(found), 'scan')} looked at"
+        )
+    motions = " and ".join(motion for motion, _ in open_motions.most_common(2))
+    told = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
+    effect = "scans are degenerate there, that motion is predicted; a run most of whose scans are so is unreliable"
+    if not seen.wheels:
+        effect += "; wheel odometry, or a lidar with a wider view or a longer range, helps"
+    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, told, effect)
 
 
 def _rings(seen: Survey) -> Finding:

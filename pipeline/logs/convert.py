@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
-from pipeline.logs.opening import index_files
-from pipeline.logs.records import FileIndex
+from pipeline.logs.opening import HAS_STAMPS, index_files
+from pipeline.logs.records import FileIndex, name_of
 from pipeline.logs.selection import EVERYTHING, chosen_span, whole_span
 from pipeline.logs.stream import Decoded, decoded_messages
 from pipeline.logs.topics import find_lidar, is_lidar, topics_of
@@ -64,9 +64,11 @@ def convert(
                 progress(sum(counts.values()), total)
         if not sum(counts.values()):
             raise InputError(
-                f"{sources[0]}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+                f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
             )
     notes = tuple(line for index in indexes for line in index.notes)
+    if config.rate_hz and not any(index.takes_rate for index in indexes):
+        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
     return Converted(destination, counts, notes, tuple(damage))
 
 

@@ -39,7 +39,8 @@ class LogInfo:
     ``sensors`` are those beside lidar and wheels.
     ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
     nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
-    ``base_frame`` is empty where the log does not tell it.
+    ``base_frame`` is empty where the log does not tell it. ``idle_keys`` are the settings that have no effect on
+    it, and why.
     """
 
     files: tuple[str, ...]
@@ -56,6 +57,7 @@ class LogInfo:
     T_base_lidar: tuple[tuple[float, ...], ...]
     base_frame: str
     mount_motion: str
+    idle_keys: dict[str, str]
     notes: tuple[str, ...]
     damage: tuple[str, ...]
     problem: str
@@ -83,6 +85,7 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         base_frame="" if log is None else log.mounting.base,
         mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
+        idle_keys={} if log is None else log.idle_keys(),
         notes=() if log is None else tuple(log.notes),
         damage=tuple(line for index in indexes for line in index.damage),
         problem=problem,

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import lie
-from pipeline.checks import LONGEST_SWEEP_S
+from pipeline.checks import LONGEST_SWEEP_S, instance
 from pipeline.clock import working_s
-from pipeline.config import LogConfig
+from pipeline.config import LogConfig, PreprocessConfig
 from pipeline.data import Pose, Scan, Trajectory
 from pipeline.errors import InputError, shown
 from pipeline.logs.first_messages import first_messages
 from pipeline.logs.laser_scan import LaserScanDecoder
-from pipeline.logs.limits import RangeLimits, Returns
+from pipeline.logs.limits import RangeLimits, Returns, none_retained
 from pipeline.logs.mounting import (
     find_mounting,
     in_plane,
@@ -25,12 +27,12 @@ from pipeline.logs.mounting import (
     joint_topics,
     leaves_plane,
 )
-from pipeline.logs.opening import index_files
+from pipeline.logs.opening import HAS_STAMPS, index_files
 from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from pipeline.logs.point_times import PointTimes
 from pipeline.logs.poses import StampedPose
 from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
-from pipeline.logs.records import FileIndex
+from pipeline.logs.records import FileIndex, name_of
 from pipeline.logs.selection import chosen_span, count_scans, whole_span
 from pipeline.logs.stream import Decoded, Decoders, decoded_messages
 from pipeline.logs.tally import Tally, most_bad_scans
@@ -43,7 +45,7 @@ _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
 _POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start_rad")
-_WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
+_WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
@@ -54,6 +56,7 @@ def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig =
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
+    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
     return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
 
 
@@ -62,7 +65,7 @@ class Log:
 
     Attributes
     ----------
-    paths : its files
+    paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
     mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
     scan_count : scans to expect after start, end and every, by the index
@@ -77,6 +80,7 @@ class Log:
         self.config = config
         self.indexes = indexes
         self.paths = tuple(index.path for index in indexes)
+        self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
@@ -118,19 +122,31 @@ class Log:
     def idle_keys(self) -> dict[str, str]:
         """Settings that have no effect on this log, and why."""
         idle: dict[str, str] = {}
+        if not self._has_point_times():
+            idle |= dict.fromkeys(
+                ("log.point_times", "preprocess.deskew"), "the scans have no times of their points"
+            )
         if is_scan(self.lidar):
             idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan tells the times of its beams itself")
         if not any(index.takes_rate for index in self.indexes):
-            idle["log.rate_hz"] = "the log has its own stamps, it is no folder of clouds"
+            idle["log.rate_hz"] = HAS_STAMPS
         if not self.has_odometry:
             idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
         return idle
 
-    def scans(self) -> Generator[Scan, None, None]:
+    def _has_point_times(self) -> bool:
+        """Whether the first scan that has returns has times of its points; of a remote log it is taken to have."""
+        if not all(isinstance(path, Path) for path in self.paths):
+            return True
+        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(self.config)).decode)
+        return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
+
+    def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
 
-        A scan that is malformed or has no valid point at all is counted in ``damage`` and left out, like damaged
-        chunks. Raises InputError when there are more of them than ``log.max_bad_scans_percent`` allows.
+        A scan that is malformed, has no valid point at all or none in the range that ``preprocess`` retains is
+        counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
+        than ``log.max_bad_scans_percent`` allows.
         """
         self.damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
@@ -146,7 +162,7 @@ class Log:
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
-                complaint = self._complaint(message, count - 1)
+                complaint = self._complaint(message, count - 1, preprocess)
                 if complaint:
                     tally.skip(complaint)
                     self._check_bad(tally.bad, complaint)
@@ -162,7 +178,7 @@ class Log:
             self.damage += [*tally.losses(), *poses.complaints()]
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
         if not index:
-            raise InputError(f"{self.paths[0]}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
+            raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
             scans = counted(count - tally.bad, "scan")
             self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
@@ -194,7 +210,7 @@ class Log:
 
     def _out_of_plane(self, motion: str) -> InputError:
         return InputError(
-            f"{self.paths[0]}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
+            f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
             "another --topic, a part in which it rests (--start, --end), or join its scans to 3D clouds first "
             "(laser_assembler)"
         )
@@ -231,7 +247,7 @@ class Log:
                 last_ns = min(self.span.end_ns, whole_span(self.indexes).end_ns)
                 first_ns = message.value.stamp_ns
                 return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
-        raise InputError(f"{self.paths[0]}: no message of {topic} in the part that is read could be understood")
+        raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood")
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
@@ -296,15 +312,16 @@ class Log:
                 "another --topic"
             )
 
-    def _complaint(self, message: Decoded, number: int) -> str:
+    def _complaint(self, message: Decoded, number: int, preprocess: PreprocessConfig | None) -> str:
         """What is wrong with a scan, empty where it is good."""
         returns = message.value
-        farthest_s = float(np.abs(returns.times_s).max(initial=0.0)) if isinstance(returns, Returns) else 0.0
-        if isinstance(returns, Returns) and len(returns.points) and farthest_s <= LONGEST_SWEEP_S:
-            return ""
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(returns, Returns):
             return f"{where} is malformed: {returns}"
+        farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
         if farthest_s > LONGEST_SWEEP_S:
             return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
-        return f"{where} has no valid point ({returns.why})"
+        if not len(returns.points):
+            return f"{where} has no valid point ({returns.why})"
+        outside = "" if preprocess is None else none_retained(returns.points, preprocess)
+        return outside and f"{where} has {outside}"

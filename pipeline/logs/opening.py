@@ -21,6 +21,8 @@ from pipeline.logs.sizes import misspelled
 from pipeline.logs.whole import fetch_whole
 from pipeline.source import Source
 
+HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.rate_hz has no effect
+
 Indexer = Callable[[Path, int], FileIndex]
 
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")

@@ -12,7 +12,7 @@ from pipeline.logs.limits import NO_TIMES
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_NONE = "no point times: every scan counts as measured at once (log.point_times can tell them by the azimuth)"
+_NONE = "no point times: every scan counts as measured at once"
 _SHORTEST_SCAN_NS = 500_000  # whole numbers that span less are microseconds
 _LONGEST_SCAN = 1e4  # in milliseconds; floats that span more are micro- or nanoseconds
 _NEAR_S = 1.0  # no scan begins further from its stamp than this

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -209,3 +209,10 @@ def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
     if end > len(data):
         raise struct.error("bytes beyond the end")
     return bytes(data[offset + 4 : end])
+
+
+def name_of(indexes: Sequence[FileIndex]) -> str:
+    """The files of a log as errors name them: all of two, of more the first and how many there are beside."""
+    paths = [str(index.path) for index in indexes]
+    shown = f"{paths[0]} and {len(paths) - 1} more files" if len(paths) > 2 else " and ".join(paths)
+    return f"{shown}, read as one log" if len(paths) > 1 else shown

@@ -39,6 +39,7 @@ class ScanFacts(NamedTuple):
     start_rad : azimuth of the first point
     rings : rings with returns, 0 where points do not tell
     digest : of the measurements, equal for equal ones
+    points : (N, d) metres, those that are kept
     outline : (C,) metres, mean distance in each cell of direction, NaN where nothing was seen
     """
 
@@ -58,6 +59,7 @@ class ScanFacts(NamedTuple):
     start_rad: float
     rings: int
     digest: int
+    points: RawPoints
     outline: NDArray[np.float64]
 
 
@@ -116,6 +118,7 @@ def _facts(
         start_rad=start_rad,
         rings=rings,
         digest=digest,
+        points=returns.points,
         outline=_outline(returns.points),
     )
 

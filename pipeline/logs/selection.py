@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.config import LogConfig
 from pipeline.errors import InputError
 from pipeline.logs.counting import log_times
-from pipeline.logs.records import Block, FileIndex
+from pipeline.logs.records import Block, FileIndex, name_of
 
 
 class Span(NamedTuple):
@@ -69,7 +69,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
 
 def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
     """Scans of the topic in the chosen part, thinned out. Raises InputError where there is none."""
-    path, span = indexes[0].path, chosen_span(whole, config)
+    name, span = name_of(indexes), chosen_span(whole, config)
     total = sum(
         index.counts.get(number, 0)
         for index in indexes
@@ -77,11 +77,11 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
         if channel.topic == topic
     )
     if not total:
-        raise InputError(f"{path}: topic {topic} has no messages; see scanchain info {path}")
+        raise InputError(f"{name}: topic {topic} has no messages; scanchain info lists what there is")
     chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
         raise InputError(
-            f"{path}: no scan of {topic} lies {_part(config)}; the log is {whole.duration_s:.1f} s long"
+            f"{name}: no scan of {topic} lies {_part(config)}; the log is {whole.duration_s:.1f} s long"
         )
     return -(-chosen // config.every)
 

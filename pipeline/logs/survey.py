@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import RawPoints
 from pipeline.errors import InputError
 from pipeline.logs.cdr import MalformedMessageError
 from pipeline.logs.log import Log
@@ -20,6 +21,8 @@ from pipeline.logs.selection import whole_span
 from pipeline.logs.stream import decoded_messages
 
 _FORGOTTEN = np.empty(0)
+_NO_POINTS = np.empty((0, 2), np.float32)
+_SAMPLED = 10  # scans whose points are looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +31,9 @@ class Survey:
 
     Attributes
     ----------
-    scans : facts of each readable scan, in the order of log time, their outlines left out
+    scans : facts of each readable scan, in the order of log time, their points and outlines left out
     log_ns, stamps_ns : (N,) int64 log times and header stamps of those scans
+    samples : (N, d) metres, points of some ten scans from all over the log
     rests : when the surroundings stayed as they were, for a second or more
     wheels : poses of the wheels, in the order of log time; empty where there are none
     malformed : what is wrong with each message that is not readable
@@ -41,6 +45,7 @@ class Survey:
     scans: tuple[ScanFacts, ...]
     log_ns: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
+    samples: tuple[RawPoints, ...]
     rests: tuple[Rest, ...]
     wheels: tuple[StampedPose, ...]
     malformed: tuple[str, ...]
@@ -72,6 +77,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     damage = list(log.damage)
     scans: list[ScanFacts] = []
     log_ns: list[int] = []
+    samples: list[RawPoints] = []
     wheels: list[StampedPose] = []
     malformed: list[str] = []
     watch = RestWatch(log.dimension)
@@ -80,7 +86,9 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     ):
         match message.value:
             case ScanFacts() as facts:
-                scans.append(facts._replace(outline=_FORGOTTEN))
+                if len(scans) % max(1, log.scan_count // _SAMPLED) == 0 and facts.kept:
+                    samples.append(facts.points)
+                scans.append(facts._replace(outline=_FORGOTTEN, points=_NO_POINTS))
                 watch.take(facts.outline, message.log_time_ns)
                 log_ns.append(message.log_time_ns)
                 if progress is not None:
@@ -92,7 +100,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     watch.close()
     if not scans:
         reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
-        raise InputError(f"{log.paths[0]}: no scan of {log.topic} could be read: {reasons}")
+        raise InputError(f"{log.name}: no scan of {log.topic} could be read: {reasons}")
     stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
     assumed = "" if is_scan(log.lidar) else times.assumed
     return Survey(
@@ -100,6 +108,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
         scans=tuple(scans),
         log_ns=np.array(log_ns, np.int64),
         stamps_ns=stamps_ns,
+        samples=tuple(samples),
         rests=tuple(watch.rests),
         wheels=tuple(wheels),
         malformed=tuple(malformed),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.errors import InputError
 from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
-from pipeline.logs.records import Channel, FileIndex
+from pipeline.logs.records import Channel, FileIndex, name_of
 from pipeline.words import counted
 
 _MOST_LISTED = 8
@@ -30,14 +30,14 @@ def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
 def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     """The lidar's channel: the topic asked for, else the only one that fits. Raises InputError."""
     channels = topics_of(indexes)
-    path = indexes[0].path
+    name = name_of(indexes)
     lidars = [channel for channel in channels.values() if is_lidar(channel)]
     if wanted and wanted in channels and channels[wanted] in lidars:
         return channels[wanted]
     if not lidars:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
-            f"{path}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
+            f"{name}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
             f"it holds: {_listed(channels.values())}{_damage(indexes)}"
         )
     if wanted:
@@ -46,9 +46,9 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
             if wanted in channels
             else f"has no topic {wanted}"
         )
-        raise InputError(f"{path}: {why}; choose --topic from: {_listed(lidars)}")
+        raise InputError(f"{name}: {why}; choose --topic from: {_listed(lidars)}")
     if len(lidars) > 1:
-        raise InputError(f"{path}: has several lidar topics; choose one with --topic: {_listed(lidars)}")
+        raise InputError(f"{name}: has several lidar topics; choose one with --topic: {_listed(lidars, indexes)}")
     return lidars[0]
 
 
@@ -102,7 +102,7 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
         if channel.topic == wanted:
             return channel
     raise InputError(
-        f"{indexes[0].path}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
+        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
         f"these are: {_listed(channels)}"
     )
 
@@ -122,11 +122,13 @@ def _damage(indexes: Sequence[FileIndex]) -> str:
     return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
 
 
-def _listed(channels: Iterable[Channel]) -> str:
+def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:
+    """Channels with their types and, of several files, the first that each is in."""
     names = []
     channels = list(channels)
     for channel in channels[:_MOST_LISTED]:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
-        names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual})")
+        file = f" in {indexes[channel.key[0]].path.name}" if len(indexes) > 1 else ""
+        names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual}){file}")
     names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
     return ", ".join(names) or "none"

@@ -55,6 +55,8 @@ class PointToShapeMatcher:
         Raises InputError where points or first pose do not fit the map.
         """
         points, T_first = aligned(points, target, T_first)
+        if prior is not None:
+            checks.instance(prior, Prior, "prior", "Prior(T_target_source, covariance, widest), or None")
         expected = _expectation(prior, T_first)
         answer = match(target.voxels, points, T_first, expected, terms_of(self.config, target, wide=wide))
         return match_of(answer, len(points), target, self.config)
@@ -71,6 +73,7 @@ def aligned(points: Points, target: VoxelMap, T_first: Pose) -> tuple[Points, Po
 
 def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
     """The numbers a kernel runs under."""
+    wide = checks.truth(wide, "wide")
     return Terms(
         optimiser=OPTIMISERS[config.optimiser],
         max_iterations=config.max_iterations,

@@ -101,10 +101,10 @@ def _begin(
     """The chain, new or as it was left, the scans that it has not seen, and what writes it down."""
     if left is None:
         slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)
-        return slam, log.scans(), Checkpoints(folder, job.checkpoint_s)
+        return slam, log.scans(config.preprocess), Checkpoints(folder, job.checkpoint_s)
     checkpoint = left.checkpoint
     checkpoint.slam.points.reopen(folder / POINTS_FILE)
-    scans = after(tuple(left.steps.rows), log.scans(), left.folder)
+    scans = after(tuple(left.steps.rows), log.scans(config.preprocess), left.folder)
     set_aside(folder, checkpoint)
     checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
     return checkpoint.slam, scans, checkpoints

@@ -29,6 +29,7 @@ def rehearse(dimension: int) -> None:
     config = load_settings(dimension).config
     slam = Slam(config, lie.identity(dimension))
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
+    points[:, 2:] *= 0.02  # into the slice of which the grid is drawn
     for index in range(_SCANS):
         T_odom_lidar = lie.identity(dimension)
         T_odom_lidar[0, -1] = _STEP_M * index

@@ -135,7 +135,7 @@ def _check_prior(log: Log, config: Config) -> None:
     """Refuse a prior that the log does not have before anything is processed."""
     if config.odometry.prior == "wheel" and not log.has_odometry:
         raise InputError(
-            f"{log.paths[0]}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
+            f"{log.name}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
             "set log.odometry_topic, or odometry.prior to 'auto'"
         )
 
@@ -147,7 +147,7 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
         return
     topic = named(job.overrides, "log.ground_truth_topic")
     if topic and not log.ground_truth_topic:
-        raise InputError(f"{log.paths[0]}: has no topic {topic}; scanchain info lists those with poses")
+        raise InputError(f"{log.name}: has no topic {topic}; scanchain info lists those with poses")
     if topic:
         check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
 

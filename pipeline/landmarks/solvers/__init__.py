@@ -41,14 +41,16 @@ def create_solver(method: str) -> LinearSolver:
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
-    """The names of a list with commas, each once; "all" stands for every method that suits the problem."""
+    """The names of a list with commas; "all" stands for every method that suits the problem."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
         if name != "all" and name not in _MAKERS:
             raise InputError(f"there is no method {name!r}; choose from all, {', '.join(_MAKERS)}")
     if not names:
         raise InputError(f"no method is named; choose from all, {', '.join(_MAKERS)}")
-    return tuple(dict.fromkeys(names))
+    if len(set(names)) < len(names):
+        raise InputError(f"--methods names one twice: {', '.join(names)}; name each once")
+    return tuple(names)
 
 
 def methods_for(asked: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:

@@ -1,0 +1,13 @@
+"""Where the command ``scanchain`` begins: until the rest is imported, Ctrl-C ends it with one line, too."""
+
+import sys
+
+
+def main() -> int:
+    """Import the command line and run it; 130 where Ctrl-C came before it was there."""
+    try:
+        from pipeline.__main__ import main as run
+    except KeyboardInterrupt:
+        sys.stderr.write("error: interrupted\n")
+        return 130
+    return run()
