@@ -1,4 +1,6 @@
 PYTHON ?= python3
+SHELL := /bin/bash
+.SHELLFLAGS := -o pipefail -c
 BIN := .venv/bin
 RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
@@ -27,18 +29,19 @@ test: $(DEV)
 lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/basedpyright
-	$(BIN)/lint-imports
+	rm -rf build/lint && mkdir -p build/lint && cp -R pipeline build/lint/scanchain && cp -R viz build/lint/scanchain/viz
+	$(BIN)/basedpyright | sed 's|[^ ]*build/lint/scanchain/viz|viz|; s|[^ ]*build/lint/scanchain|pipeline|'
+	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 
-$(RUNTIME): pyproject.toml
+$(RUNTIME): pyproject.toml setup.py
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12')"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(DEV): pyproject.toml $(RUNTIME)
+$(DEV): pyproject.toml setup.py $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
 clean:
-	rm -rf .venv logs runs/demo-office runs/demo-town runs/demo-office.png runs/demo-town.png
+	rm -rf .venv build logs runs/demo-office runs/demo-town runs/demo-office.png runs/demo-town.png

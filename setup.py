@@ -1,0 +1,15 @@
+"""Which folder is installed under which name; all else stands in pyproject.toml, which cannot say this one thing."""
+
+from setuptools import find_packages, setup
+
+FOLDERS = {
+    "scanchain": "pipeline",
+    "scanchain.viz": "viz",
+    "scanchain.presets": "configs",
+    "scanchain.sequences": "sequences",
+}
+
+setup(
+    package_dir=FOLDERS,
+    packages=[*FOLDERS, *(f"scanchain.{name}" for name in find_packages("pipeline"))],
+)
