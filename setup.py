@@ -1,4 +1,4 @@
-"""Which folder is installed under which name; all else stands in pyproject.toml, which cannot say this one thing."""
+"""Which folder is installed under which name; everything else stands in pyproject.toml."""
 
 from setuptools import find_packages, setup
 
