@@ -1,22 +1,22 @@
 """Lidar logs in, trajectory and map out.
 
-The names below are the Python API; each is imported when it is first used, so that ``import pipeline`` is cheap.
+The names below are the Python API; each is imported when it is first used, so that ``import scanchain`` is cheap.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipeline.config import Config
-    from pipeline.data import Match, Scan, State, Step, Trajectory
-    from pipeline.errors import InputError, ScanchainError
-    from pipeline.graph.pose_graph import PoseGraph
-    from pipeline.logs import open_log
-    from pipeline.matching import VoxelMap, create_matcher, rigid_transform
-    from pipeline.odometry import Odometry
-    from pipeline.settings import load_settings
-    from pipeline.slam import Slam, SlamResult
-    from pipeline.trajectory import read_tum, write_tum
+    from scanchain.config import Config
+    from scanchain.data import Match, Scan, State, Step, Trajectory
+    from scanchain.errors import InputError, ScanchainError
+    from scanchain.graph.pose_graph import PoseGraph
+    from scanchain.logs import open_log
+    from scanchain.matching import VoxelMap, create_matcher, rigid_transform
+    from scanchain.odometry import Odometry
+    from scanchain.settings import load_settings
+    from scanchain.slam import Slam, SlamResult
+    from scanchain.trajectory import read_tum, write_tum
 
 _HOMES = {
     "Config": "config",
@@ -71,7 +71,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
+        raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
     if name in _COMPILED:
-        import_module("pipeline.clock").tell_compilation()
-    return globals().setdefault(name, getattr(import_module(f"pipeline.{_HOMES[name]}"), name))
+        import_module("scanchain.clock").tell_compilation()
+    return globals().setdefault(name, getattr(import_module(f"scanchain.{_HOMES[name]}"), name))

@@ -14,27 +14,27 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.batch import batch
-from pipeline.commands.compare import compare
-from pipeline.commands.config import config
-from pipeline.commands.convert import convert
-from pipeline.commands.doctor import doctor
-from pipeline.commands.evaluate import evaluate
-from pipeline.commands.info import info
-from pipeline.commands.landmarks import landmarks
-from pipeline.commands.optimize import optimize
-from pipeline.commands.run import run
-from pipeline.commands.sequence import sequence
-from pipeline.commands.simulate import simulate
-from pipeline.commands.view import view
-from pipeline.config import RecordingConfig
-from pipeline.errors import InputError, ScanchainError, told
-from pipeline.runs.recorder import Recorder, SinkName, Viewing
+from scanchain.commands.batch import batch
+from scanchain.commands.compare import compare
+from scanchain.commands.config import config
+from scanchain.commands.convert import convert
+from scanchain.commands.doctor import doctor
+from scanchain.commands.evaluate import evaluate
+from scanchain.commands.info import info
+from scanchain.commands.landmarks import landmarks
+from scanchain.commands.optimize import optimize
+from scanchain.commands.run import run
+from scanchain.commands.sequence import sequence
+from scanchain.commands.simulate import simulate
+from scanchain.commands.view import view
+from scanchain.config import RecordingConfig
+from scanchain.errors import InputError, ScanchainError, told
+from scanchain.runs.recorder import Recorder, SinkName, Viewing
 
 if TYPE_CHECKING:
-    from pipeline.batch.task import Row
-    from pipeline.graph.optimisation import GraphChange
-    from pipeline.landmarks.study import Study
+    from scanchain.batch.task import Row
+    from scanchain.graph.optimisation import GraphChange
+    from scanchain.landmarks.study import Study
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -117,63 +117,63 @@ def _fail(message: str, code: int) -> int:
 def _record(
     path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
 ) -> Recorder:
-    from viz.recording import Recording
+    from scanchain.viz.recording import Recording
 
     return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
 
 
 def _show(path: Path, tell: Callable[[str], None], in_browser: bool) -> None:
-    from viz.show import show
+    from scanchain.viz.show import show
 
     show(path, tell, in_browser=in_browser)
 
 
 def _draw(directory: Path, picture: Path) -> None:
-    from viz.run_picture import draw_run
+    from scanchain.viz.run_picture import draw_run
 
     draw_run(directory, picture)
 
 
 def _draw_graph(change: GraphChange, picture: Path) -> None:
-    from viz.graph_picture import draw_graph
+    from scanchain.viz.graph_picture import draw_graph
 
     draw_graph(change, picture)
 
 
 def _record_graph(change: GraphChange, path: Path) -> None:
-    from viz.graph_recording import record_graph
+    from scanchain.viz.graph_recording import record_graph
 
     record_graph(change, path)
 
 
 def _report(directory: Path) -> None:
-    from viz.run_report import write_run_report
+    from scanchain.viz.run_report import write_run_report
 
     write_run_report(directory)
 
 
 def _present_batch(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
-    from viz.batch_report import write_batch_report
+    from scanchain.viz.batch_report import write_batch_report
 
     write_batch_report(directory, rows, command)
 
 
 def _present_comparison(directory: Path) -> None:
-    from viz.compare_recording import record_comparison
-    from viz.compare_report import write_compare_report
+    from scanchain.viz.compare_recording import record_comparison
+    from scanchain.viz.compare_report import write_compare_report
 
     write_compare_report(directory)
     record_comparison(directory)
 
 
 def _present_landmarks(directory: Path, studies: Sequence[Study]) -> None:
-    from viz.landmark_report import write_report
+    from scanchain.viz.landmark_report import write_report
 
     write_report(directory, studies)
 
 
 def _record_landmarks(studies: Sequence[Study], path: Path) -> None:
-    from viz.landmark_recording import record_landmarks
+    from scanchain.viz.landmark_recording import record_landmarks
 
     record_landmarks(studies, path)
 

@@ -11,17 +11,17 @@ from urllib.parse import urlsplit
 import msgspec
 from msgspec import Meta, Struct
 
-from pipeline.download import fetch
-from pipeline.errors import InputError
-from pipeline.logs.convert import convert
-from pipeline.simulate import simulate
+from scanchain.download import fetch
+from scanchain.errors import InputError
+from scanchain.logs.convert import convert
+from scanchain.simulation import simulate
 
 Sha256 = Annotated[str, Meta(pattern="^([0-9a-f]{64}|unknown)$")]
 _FILE = "sequence.toml"
 
 
 class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="simulated"):
-    """A drive through a simulated world; fields as in ``pipeline.simulate.simulate``."""
+    """A drive through a simulated world; fields as in ``scanchain.simulation.simulate``."""
 
     world: str
     sensor: str

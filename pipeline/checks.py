@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from pipeline.errors import InputError, shown
-from pipeline.kernels.validity import largest_magnitude, largest_moved, rigidity_error
+from scanchain.errors import InputError, shown
+from scanchain.kernels.validity import largest_magnitude, largest_moved, rigidity_error
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat

@@ -23,7 +23,7 @@ class _Compilation(event.Listener):
         if not self.depth:
             self.began_s = perf_counter()
         self.depth += 1
-        if not self.is_silent and event.data["dispatcher"].py_func.__module__.startswith("pipeline."):
+        if not self.is_silent and event.data["dispatcher"].py_func.__module__.startswith("scanchain."):
             self.is_silent = True
             logging.getLogger("scanchain").warning(_TOLD)
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 from msgspec.structs import fields, force_setattr
 
-from pipeline.config_keys import section_keys
-from pipeline.errors import InputError, shown
+from scanchain.config_keys import section_keys
+from scanchain.errors import InputError, shown
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]

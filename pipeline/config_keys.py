@@ -13,7 +13,7 @@ from typing import Literal
 from msgspec import inspect
 from msgspec.structs import fields
 
-from pipeline.errors import InputError, shown
+from scanchain.errors import InputError, shown
 
 Value = bool | int | float | str
 Kind = Literal["bool", "int", "float", "choice", "str"]
@@ -120,7 +120,7 @@ class ConfigKey:
 @functools.cache
 def config_keys() -> dict[str, ConfigKey]:
     """All keys by name, in the order of the tree."""
-    from pipeline.config import Config
+    from scanchain.config import Config
 
     return {key.name: key for field in fields(Config) for key in section_keys(field.type)}
 

@@ -13,9 +13,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.point_store import StoredPoints
-from pipeline.words import FREEDOM, counted
+from scanchain.errors import InputError
+from scanchain.point_store import StoredPoints
+from scanchain.words import FREEDOM, counted
 
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that what was checked stays so."""
-        from pipeline import checks  # compiled: whoever reads --help makes no scan
+        from scanchain import checks  # compiled: whoever reads --help makes no scan
 
         for name, wanted, least in _WHOLE:
             object.__setattr__(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
@@ -322,7 +322,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         """Check and convert. Raises InputError where there is not one rigid pose for each stamp."""
-        from pipeline import checks  # compiled, as above
+        from scanchain import checks  # compiled, as above
 
         stamps, poses = checks.shape(self.stamps_ns, "stamps_ns"), checks.shape(self.poses, "poses")
         if len(stamps) != 1 or len(poses) != 3 or poses[1:] not in ((3, 3), (4, 4)) or poses[0] != stamps[0]:

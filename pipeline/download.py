@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from pipeline.errors import InputError, ScanchainError
+from scanchain.errors import InputError, ScanchainError
 
 Progress = Callable[[int, int], None]
 

@@ -6,7 +6,7 @@ import sys
 def main() -> int:
     """Import the command line and run it; 1 where Ctrl-C came before it was there, as after."""
     try:
-        from pipeline.__main__ import main as run
+        from scanchain.__main__ import main as run
     except KeyboardInterrupt:
         sys.stderr.write("error: interrupted\n")
         return 1

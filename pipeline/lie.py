@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix, Pose
-from pipeline.kernels import pose_log, poses
-from pipeline.kernels.twist import orthonormalise
+from scanchain.data import Matrix, Pose
+from scanchain.kernels import pose_log, poses
+from scanchain.kernels.twist import orthonormalise
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from scanchain.errors import InputError
 
 _NUMBER = np.dtype("<f4")  # as lidars give them
 

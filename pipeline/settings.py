@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import tomli_w
 
-from pipeline.config import Config
-from pipeline.config_keys import Value, config_keys, find_key
-from pipeline.errors import InputError, shown
+from scanchain.config import Config
+from scanchain.config_keys import Value, config_keys, find_key
+from scanchain.errors import InputError, shown
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.clock import working_s
-from pipeline.config import Config
-from pipeline.data import (
+from scanchain import lie
+from scanchain.clock import working_s
+from scanchain.config import Config
+from scanchain.data import (
     Closure,
     GraphState,
     Keyframe,
@@ -25,14 +25,14 @@ from pipeline.data import (
     Trajectory,
     Verdict,
 )
-from pipeline.errors import InputError
-from pipeline.graph.graduation import Judgement
-from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.loops import LoopCloser, refined, spread
-from pipeline.odometry import FrontEnd, Located, checked_mounting
-from pipeline.point_store import PointStore
-from pipeline.words import counted
+from scanchain.errors import InputError
+from scanchain.graph.graduation import Judgement
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops import LoopCloser, refined, spread
+from scanchain.odometry import FrontEnd, Located, checked_mounting
+from scanchain.point_store import PointStore
+from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
 _GROWTH = 0.05  # of the graph, between two optimisations that change little

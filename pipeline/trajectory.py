@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Matrix, Trajectory
-from pipeline.errors import InputError
-from pipeline.words import counted
+from scanchain import lie
+from scanchain.data import Matrix, Trajectory
+from scanchain.errors import InputError
+from scanchain.words import counted
 
 _NS_PER_S = 1_000_000_000
 _TUM_FIELDS = "stamp x y z qx qy qz qw"

@@ -13,7 +13,7 @@ from time import monotonic
 
 import psutil
 
-from pipeline.memory import resident_mib
+from scanchain.memory import resident_mib
 
 
 @dataclass(frozen=True, slots=True)

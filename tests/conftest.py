@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import settings
 
-from pipeline.__main__ import main
+from scanchain.__main__ import main
 
 settings.register_profile("compiling", deadline=None)
 settings.load_profile("compiling")

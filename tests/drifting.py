@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.slam import Slam
+from scanchain import lie
+from scanchain.slam import Slam
 
 
 class DriftingOdometry:

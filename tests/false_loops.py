@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.data import Verdict
+from scanchain.data import Verdict
 
 MADE_UP = "made up"  # the reason that is given for them
 

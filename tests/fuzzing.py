@@ -18,15 +18,15 @@ from mutations import CHUNK, Seed, cut_and_flipped, cut_at, mutant, mutated_mess
 from naive_logs import STAMP_NS, cloud_said, odometry, odometry_said, office, point_cloud, write
 from scenes import shared_data
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.laser_scan import LaserScanDecoder
-from pipeline.logs.limits import RangeLimits
-from pipeline.logs.point_cloud import PointCloudDecoder
-from pipeline.logs.point_times import PointTimes
-from pipeline.logs.readers import (
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.laser_scan import LaserScanDecoder
+from scanchain.logs.limits import RangeLimits
+from scanchain.logs.point_cloud import PointCloudDecoder
+from scanchain.logs.point_times import PointTimes
+from scanchain.logs.readers import (
     cloud_reader,
     has_poses,
     has_transforms,
@@ -36,7 +36,7 @@ from pipeline.logs.readers import (
     scan_reader,
     transforms_reader,
 )
-from pipeline.logs.records import Channel
+from scanchain.logs.records import Channel
 
 LONGEST_S = 5.0  # of CPU, so that a busy machine makes no difference
 LONGEST_WAIT_S = 120.0

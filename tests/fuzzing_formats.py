@@ -20,9 +20,9 @@ from fuzzing import within_bounds
 from mutations import Mutant, any_mutant
 from rosbags import rosbag1
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 SCANS = 12
 UNPACKED_AT_ONCE = 64  # bytes of packed text, which are lost with those that are damaged

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Matrix, Points, Pose
-from pipeline.kernels.downsample import first_per_voxel
-from pipeline.simulate.drive import plan
-from pipeline.simulate.town import town
+from scanchain import lie
+from scanchain.data import Matrix, Points, Pose
+from scanchain.kernels.downsample import first_per_voxel
+from scanchain.simulation.drive import plan
+from scanchain.simulation.town import town
 
 PLACE_SEED = 3
 

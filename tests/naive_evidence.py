@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.kernels.hashing import unpack
-from pipeline.kernels.voxels import (
+from scanchain import lie
+from scanchain.kernels.hashing import unpack
+from scanchain.kernels.voxels import (
     ACROSS,
     BORN,
     DIRECTION,

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import expm, logm
 
-from pipeline import lie
+from scanchain import lie
 
 
 def error(T_i, T_j, Z):

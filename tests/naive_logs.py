@@ -1,4 +1,4 @@
-"""Logs written by the mcap package, messages packed by hand in either byte order: independent of pipeline.logs."""
+"""Logs written by the mcap package, packed by hand in either byte order: independent of scanchain.logs."""
 
 import struct
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pipeline.logs.ros2_definitions import schema_text
+from scanchain.logs.ros2_definitions import schema_text
 
 SECOND = 1_000_000_000
 STAMP_NS = 1_700_000_000 * SECOND

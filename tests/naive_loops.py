@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.kernels.registration import CONVERGED, align
+from scanchain import lie
+from scanchain.kernels.registration import CONVERGED, align
 
 
 def heights(points, T, cell_m, size):

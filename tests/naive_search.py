@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline import lie
+from scanchain import lie
 
 
 def hits(means, origin, resolution_m, shape):

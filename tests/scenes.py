@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from pipeline.config import Config
-from pipeline.logs import open_log
-from pipeline.point_store import PointStore, StoredPoints
+from scanchain.config import Config
+from scanchain.logs import open_log
+from scanchain.point_store import PointStore, StoredPoints
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import shared_data
 
-from pipeline import (
+from scanchain import (
     Config,
     InputError,
     Odometry,
@@ -28,8 +28,8 @@ from pipeline import (
     rigid_transform,
     write_tum,
 )
-from pipeline.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
-from pipeline.evaluate import absolute_error, pair
+from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
+from scanchain.evaluation import absolute_error, pair
 
 CALLS = 2000
 

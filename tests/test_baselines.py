@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scenes import kitti_scans, shared_data
 
-from pipeline import baselines, lie
-from pipeline.baselines.at_stamp import AtStamp
-from pipeline.baselines.baseline import finite
-from pipeline.data import Trajectory
-from pipeline.errors import InputError, MissingExtraError
-from pipeline.evaluate import absolute_error, pair
-from pipeline.simulate import plan
-from pipeline.simulate.motion import Motion
-from pipeline.simulate.sweep import take_sweep
-from pipeline.trajectory import read_tum
+from scanchain import baselines, lie
+from scanchain.baselines.at_stamp import AtStamp
+from scanchain.baselines.baseline import finite
+from scanchain.data import Trajectory
+from scanchain.errors import InputError, MissingExtraError
+from scanchain.evaluation import absolute_error, pair
+from scanchain.simulation import plan
+from scanchain.simulation.motion import Motion
+from scanchain.simulation.sweep import take_sweep
+from scanchain.trajectory import read_tum
 
 PACKAGES = {
     "kiss-icp": "kiss_icp",

@@ -16,14 +16,14 @@ from browser import look
 from scenes import ROOT
 from web_server import serving
 
-from pipeline.__main__ import main
-from pipeline.batch.collecting import collect
-from pipeline.errors import InputError
-from pipeline.logs.write import LogWriter
-from pipeline.memory import resident_mib
-from pipeline.simulate import simulate
-from pipeline.source import Address
-from viz.batch_report import names_of
+from scanchain.__main__ import main
+from scanchain.batch.collecting import collect
+from scanchain.errors import InputError
+from scanchain.logs.write import LogWriter
+from scanchain.memory import resident_mib
+from scanchain.simulation import simulate
+from scanchain.source import Address
+from scanchain.viz.batch_report import names_of
 
 POISON = """
 import sys
@@ -211,7 +211,7 @@ def test_a_wrong_configuration_ends_the_batch_before_any_log(drawers, tmp_path, 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
 def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp_path):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "pipeline", "batch", f"{drawers}/log_*.mcap", "--out", str(out)]
+    command = [sys.executable, "-m", "scanchain", "batch", f"{drawers}/log_*.mcap", "--out", str(out)]
     child = subprocess.Popen(
         [*command, "--workers", "1"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )

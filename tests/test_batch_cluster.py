@@ -6,8 +6,8 @@ import pyarrow.parquet as pq
 import pytest
 from scenes import ROOT
 
-from pipeline.batch.batch import Batch, run_batch
-from pipeline.simulate import simulate
+from scanchain.batch.batch import Batch, run_batch
+from scanchain.simulation import simulate
 
 pytest.importorskip("ray", reason="the extra cluster is not installed")
 
@@ -30,7 +30,7 @@ class Watching:
 def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster
 
-    from pipeline.batch.cluster import on_cluster
+    from scanchain.batch.cluster import on_cluster
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")

@@ -28,15 +28,15 @@ from naive_logs import (
 )
 from scenes import ROOT, configured
 
-from pipeline import lie
-from pipeline.__main__ import scanchain
-from pipeline.commands.override_command import OnceCommand
-from pipeline.data import Trajectory
-from pipeline.graph.g2o import read_g2o
-from pipeline.logs.write import LogWriter
-from pipeline.settings import flatten
-from pipeline.simulate import simulate
-from pipeline.trajectory import read_tum, write_kitti, write_tum
+from scanchain import lie
+from scanchain.__main__ import scanchain
+from scanchain.commands.override_command import OnceCommand
+from scanchain.data import Trajectory
+from scanchain.graph.g2o import read_g2o
+from scanchain.logs.write import LogWriter
+from scanchain.settings import flatten
+from scanchain.simulation import simulate
+from scanchain.trajectory import read_tum, write_kitti, write_tum
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def test_a_disk_that_fills_up_during_a_run_is_told_once_with_what_to_do(call, mo
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("pipeline.runs.processing.write_results", fail)
+    monkeypatch.setattr("scanchain.runs.processing.write_results", fail)
     code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off")
     assert code == 1 and "Errno" not in errors and errors.count("full") == 1
     assert errors.startswith(f"error: {tmp_path / 'a'}: {FULL}; ")
@@ -386,7 +386,7 @@ def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, of
     def broken(*_):
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr("pipeline.logs.info.describe", broken)
+    monkeypatch.setattr("scanchain.logs.info.describe", broken)
     monkeypatch.delenv("SCANCHAIN_DEBUG", raising=False)
     code, output, errors = call("info", office)
     assert (code, output) == (1, "")
@@ -400,20 +400,20 @@ def test_ctrl_c_is_one_line_with_exit_code_1(call, monkeypatch, office):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.logs.info.describe", interrupted)
+    monkeypatch.setattr("scanchain.logs.info.describe", interrupted)
     code, output, errors = call("info", office)
     assert (code, output, errors.strip()) == (1, "", "error: interrupted")
 
 
 def test_an_interruption_while_the_imports_run_is_one_line_too():
     stopped_at = (
-        "import sys; from pipeline.entry import main\nclass Stop:\n def find_spec(*_): raise KeyboardInterrupt\n"
+        "import sys; from scanchain.entry import main\nclass Stop:\n def find_spec(*_): raise KeyboardInterrupt\n"
     )
     command = [sys.executable, "-c", f"{stopped_at}sys.meta_path.insert(0, Stop()); sys.exit(main())"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "error: interrupted\n")
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts == {"scanchain": "pipeline.entry:main"}
+    assert scripts == {"scanchain": "scanchain.entry:main"}
 
 
 # run
@@ -1201,7 +1201,7 @@ def test_optimize_refuses_bad_graphs_in_one_line(refused, tmp_path, ring):
 
 def program(*words):
     return subprocess.run(
-        [sys.executable, "-m", "pipeline", *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "scanchain", *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=60
     )
 
 
@@ -1214,7 +1214,7 @@ def test_it_runs_as_a_module_with_its_exit_codes(tmp_path):
 
 
 def test_a_reader_that_goes_away_is_no_error_to_talk_about():
-    command = f"{sys.executable} -m pipeline config show --json | head -c 1"
+    command = f"{sys.executable} -m scanchain config show --json | head -c 1"
     answer = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (answer.stdout, answer.stderr) == ("[", "")
 
@@ -1222,7 +1222,7 @@ def test_a_reader_that_goes_away_is_no_error_to_talk_about():
 def test_help_does_not_load_the_heavy_packages():
     script = """
 import sys
-from pipeline.__main__ import main
+from scanchain.__main__ import main
 main(["run", "--help"])
 print([name for name in ("numba", "scipy", "pyarrow", "rerun") if name in sys.modules], file=sys.stderr)
 """

@@ -7,16 +7,16 @@ from time import perf_counter
 import pytest
 from numba import njit
 
-from pipeline.__main__ import _record
-from pipeline.clock import compiled_s, working_s
-from pipeline.matching import VoxelMap
-from pipeline.runs import results
-from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.job import Job
-from pipeline.runs.progress import Unwatched
-from pipeline.runs.rehearsal import rehearse
-from pipeline.runs.run import run
-from pipeline.simulate import simulate
+from scanchain.__main__ import _record
+from scanchain.clock import compiled_s, working_s
+from scanchain.matching import VoxelMap
+from scanchain.runs import results
+from scanchain.runs.compiling import telling_of_compilation
+from scanchain.runs.job import Job
+from scanchain.runs.progress import Unwatched
+from scanchain.runs.rehearsal import rehearse
+from scanchain.runs.run import run
+from scanchain.simulation import simulate
 
 
 class Told(Unwatched):
@@ -38,15 +38,15 @@ def kernel(module):
 def test_each_module_of_kernels_is_named_once_and_others_are_not():
     told = Told()
     with telling_of_compilation(told):
-        for module in ("pipeline.kernels.voxels", "pipeline.kernels.voxels", "numba.np.arrayobj"):
+        for module in ("scanchain.kernels.voxels", "scanchain.kernels.voxels", "numba.np.arrayobj"):
             assert kernel(module)(2) == 4
-    kernel("pipeline.kernels.eigen")(2)
+    kernel("scanchain.kernels.eigen")(2)
     assert told.lines == ["compiling, once after the installation:", "  kernels.voxels"]
 
 
 def test_what_is_compiled_already_is_not_told():
     told = Told()
-    compiled = kernel("pipeline.kernels.voxels")
+    compiled = kernel("scanchain.kernels.voxels")
     compiled(2)
     with telling_of_compilation(told):
         compiled(3)
@@ -63,7 +63,7 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
     monkeypatch.setattr(subprocess, "Popen", remembered)
     with telling_of_compilation(Told(), ("http.server", "0")):
         assert not begun
-        for module in ("pipeline.kernels.voxels", "pipeline.kernels.eigen"):
+        for module in ("scanchain.kernels.voxels", "scanchain.kernels.eigen"):
             kernel(module)(2)
         assert len(begun) == 1 and begun[0].poll() is None
     assert begun[0].poll() is not None
@@ -79,7 +79,7 @@ def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
 def test_a_rehearsal_optimises_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
     made = {}
     for name in ("cloud_of", "grid_of"):
-        monkeypatch.setattr(f"pipeline.runs.rehearsal.{name}", _remembering(made, name))
+        monkeypatch.setattr(f"scanchain.runs.rehearsal.{name}", _remembering(made, name))
     rehearse(dimension)
     assert list(made) == ["cloud_of", "grid_of"]
     (result, _), cloud = made["cloud_of"]
@@ -98,7 +98,7 @@ def _remembering(made, name):
 
 
 def test_the_clock_stands_still_while_a_kernel_and_those_it_calls_are_compiled():
-    inner = kernel("pipeline.kernels.voxels")
+    inner = kernel("scanchain.kernels.voxels")
 
     @njit
     def outer(x):
@@ -132,7 +132,7 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
         if not compiled:
             before_s = compiled_s()
             while compiled_s() - before_s < 0.6:
-                kernel("pipeline.kernels.voxels")(2)
+                kernel("scanchain.kernels.voxels")(2)
             compiled.append(compiled_s() - before_s)
         return insert(self, *words)
 

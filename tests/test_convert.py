@@ -14,9 +14,9 @@ from scenes import shared_data
 from test_inputs_carmen import flaser, odom, save
 from test_inputs_folders import kitti_odometry, kitti_raw, xyzi
 
-from pipeline.__main__ import main
-from pipeline.config import LogConfig
-from pipeline.logs import open_log
+from scanchain.__main__ import main
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
 
 
 def carmen(folder):

@@ -4,10 +4,10 @@ import naive_search
 import numpy as np
 import pytest
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig
-from pipeline.kernels.branch_and_bound import draw_hits, fill_pyramid, search
-from pipeline.matching import CorrelativeMap, VoxelMap
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.kernels.branch_and_bound import draw_hits, fill_pyramid, search
+from scanchain.matching import CorrelativeMap, VoxelMap
 
 
 def walls(rng, count, side_m):

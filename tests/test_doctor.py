@@ -20,12 +20,12 @@ from naive_logs import (
 )
 from scenes import configured, shared_data
 
-from pipeline.__main__ import main
-from pipeline.config import Config, LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
-from pipeline.logs.doctor import examine
-from pipeline.simulate import simulate
+from scanchain.__main__ import main
+from scanchain.config import Config, LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.doctor import examine
+from scanchain.simulation import simulate
 
 STEP_NS = SECOND // 10
 CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]

@@ -14,9 +14,9 @@ from mcap_ros2.decoder import DecoderFactory
 from naive_logs import SECOND, Said, cloud_said, laser_scan, odometry, odometry_said, point_cloud, scan_said, write
 from scenes import ROOT
 
-from pipeline.__main__ import main
-from pipeline.logs import open_log
-from pipeline.simulate import simulate
+from scanchain.__main__ import main
+from scanchain.logs import open_log
+from scanchain.simulation import simulate
 
 ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
 WHOLE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])

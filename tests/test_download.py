@@ -15,11 +15,11 @@ import recorders
 from test_inputs_carmen import flaser, save
 from test_inputs_folders import kitti_raw
 
-from pipeline import catalogue
-from pipeline.__main__ import main
-from pipeline.download import DownloadError, fetch
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain import catalogue
+from scanchain.__main__ import main
+from scanchain.download import DownloadError, fetch
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -23,9 +23,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from test_recording import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
 
-from pipeline.__main__ import main
-from pipeline.settings import flatten
-from viz import entities
+from scanchain.__main__ import main
+from scanchain.settings import flatten
+from scanchain.viz import entities
 
 FILES = {
     "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
@@ -421,7 +421,7 @@ def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(dri
     (line,) = drawn.to_record_batch().column("LineStrips3D:strips").to_pylist()[0]
     np.testing.assert_allclose(np.array(line), found, atol=0.1)
     shown = {}
-    monkeypatch.setattr("viz.run_picture.draw_map", lambda path, **what: shown.update(what))
+    monkeypatch.setattr("scanchain.viz.run_picture.draw_map", lambda path, **what: shown.update(what))
     succeed("view", drive.folder, "--png", tmp_path / "a.png")
     np.testing.assert_allclose(shown["ground_truth"][:, :3, 3], found, atol=0.1)
 
@@ -442,7 +442,7 @@ def assert_same(a, b):
 
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_the_same_run_in_another_process_is_bit_equal_whatever_the_threads(drive, tmp_path, threads):
-    words = [sys.executable, "-m", "pipeline", "run", drive.log, "--out", tmp_path / "again", *drive.flags]
+    words = [sys.executable, "-m", "scanchain", "run", drive.log, "--out", tmp_path / "again", *drive.flags]
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), threads)
     subprocess.run(words, cwd=ROOT, env=os.environ | limits, check=True, capture_output=True, timeout=200)
     assert_same(drive.folder, tmp_path / "again")

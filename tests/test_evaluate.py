@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scenes import configured, kitti_scans, shared_data
 
-from pipeline import lie
-from pipeline.data import Trajectory
-from pipeline.errors import InputError
-from pipeline.evaluate import (
+from scanchain import lie
+from scanchain.data import Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import (
     Alignment,
     absolute_error,
     kitti_error,
@@ -25,12 +25,12 @@ from pipeline.evaluate import (
     relative_error_over_frames,
     relative_error_over_time,
 )
-from pipeline.evaluate.absolute import path_length
-from pipeline.evaluate.pairing import nearest
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import Override, load_settings
-from pipeline.trajectory import parse_stamp_ns, read_tum, write_kitti
+from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.pairing import nearest
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.settings import Override, load_settings
+from scanchain.trajectory import parse_stamp_ns, read_tum, write_kitti
 
 
 def drive(count=300, seed=1, step_m=1.0):

@@ -2,10 +2,10 @@ import naive_graph
 import numpy as np
 import pytest
 
-from pipeline import lie
-from pipeline.graph.between import BetweenProblem, right_information
-from pipeline.graph.robust import RobustLoss, robust_loss
-from pipeline.kernels import graph_between_se2
+from scanchain import lie
+from scanchain.graph.between import BetweenProblem, right_information
+from scanchain.graph.robust import RobustLoss, robust_loss
+from scanchain.kernels import graph_between_se2
 
 ANGLES = [0.0, 1e-9, 1e-5, 1e-3, 0.05, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-5]
 

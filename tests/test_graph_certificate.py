@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import BlockPattern
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.minorant import Minorants, minorise
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.kernels.graph_dual import scatter_dual
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import BlockPattern
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.minorant import Minorants, minorise
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.graph_dual import scatter_dual
 
 PLAIN = GraphConfig(robust="none")
 

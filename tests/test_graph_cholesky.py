@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
 
 
 def _matrix(sizes, pairs, seed):

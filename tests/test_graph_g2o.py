@@ -3,13 +3,13 @@ import pytest
 from scenes import shared_data
 from scipy.spatial.transform import Rotation
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.errors import InputError
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.g2o_write import write_g2o, write_toro
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.soundness import check_connected, nearest_semidefinite
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.g2o_write import write_g2o, write_toro
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.soundness import check_connected, nearest_semidefinite
 
 SQUARE = """\
 # a comment

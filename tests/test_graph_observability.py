@@ -4,13 +4,13 @@ import naive_graph
 import numpy as np
 import pytest
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.errors import InputError
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.observability import free_poses
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.soundness import ranks
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.observability import free_poses
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.soundness import ranks
 
 PLAIN = GraphConfig(robust="none")
 NAMES = {2: ("x", "y", "yaw"), 3: ("x", "y", "z", "roll", "pitch", "yaw")}

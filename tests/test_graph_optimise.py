@@ -5,14 +5,14 @@ import pytest
 from naive_graph import dense, normal_equations
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.errors import InputError
-from pipeline.graph.curvature import full_curvature
-from pipeline.graph.estimate import Estimate
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.steps import Optimiser
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.curvature import full_curvature
+from scanchain.graph.estimate import Estimate
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.steps import Optimiser
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {

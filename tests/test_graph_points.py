@@ -5,10 +5,10 @@ import pytest
 from naive_graph import dense
 from scipy.optimize import least_squares
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.pose_graph import PoseGraph
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.pose_graph import PoseGraph
 
 PLAIN = GraphConfig(robust="none")
 

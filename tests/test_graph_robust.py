@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.verdicts import contradictions
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.verdicts import contradictions
 from tests.benchmarks.wrong_edges import try_wrong_loops
 
 

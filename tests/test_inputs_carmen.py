@@ -9,10 +9,10 @@ import pytest
 from carmen_text import BEGIN_S, flaser, odom, robotlaser
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 
 def save(path, *lines):

@@ -7,12 +7,12 @@ from folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 from recorders import SECOND, STAMP_NS, assert_clouds
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
-from pipeline.logs.formats.cloud_folder import stamp_of_name
-from pipeline.simulate import simulate
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.formats.cloud_folder import stamp_of_name
+from scanchain.simulation import simulate
 
 
 def read(path, **config):
@@ -99,7 +99,7 @@ def test_a_kitti_odometry_sequence_begins_at_time_zero_and_knows_its_truth(tmp_p
 
 
 def test_a_part_of_a_kitti_sequence_opens_only_its_own_files(tmp_path, monkeypatch):
-    from pipeline.logs.formats import kitti
+    from scanchain.logs.formats import kitti
 
     opened = []
 
@@ -141,7 +141,7 @@ def test_real_kitti_sweeps_are_the_same_out_of_a_folder(tmp_path):
 
 
 def open3d():
-    from pipeline.baselines.open3d_pairs import Open3dPairs
+    from scanchain.baselines.open3d_pairs import Open3dPairs
 
     return Open3dPairs("point-to-point").open3d
 

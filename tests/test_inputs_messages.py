@@ -11,10 +11,10 @@ from mcap.writer import Writer
 from mcap_ros1.decoder import DecoderFactory
 from recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar
 
-from pipeline import lie
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 
 def read(path, **config):

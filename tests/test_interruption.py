@@ -16,16 +16,16 @@ from killing import assert_readable, kill_at_random, partial, same_result, start
 from scenes import ROOT, configured, shared_data
 from test_recording import column
 
-from pipeline.errors import InputError
-from pipeline.logs import open_log
-from pipeline.runs.checkpoint import _CLASSES, Checkpoints, read_checkpoint
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from pipeline.runs.journal import JOURNAL_FILE, read_journal
-from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
-from pipeline.simulate import simulate
-from pipeline.slam import Slam
-from pipeline.trajectory import read_tum
-from viz import entities
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.runs.checkpoint import _CLASSES, Checkpoints, read_checkpoint
+from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
+from scanchain.runs.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.simulation import simulate
+from scanchain.slam import Slam
+from scanchain.trajectory import read_tum
+from scanchain.viz import entities
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
@@ -116,7 +116,7 @@ def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was
 
 @pytest.mark.parametrize(
     "module, kind, method",
-    [("viz.recording", "Recording", "go_on"), ("pipeline.runs.checkpoint", "Checkpoints", "write")],
+    [("scanchain.viz.recording", "Recording", "go_on"), ("scanchain.runs.checkpoint", "Checkpoints", "write")],
 )
 def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
     office, whole, tmp_path, module, kind, method
@@ -129,7 +129,7 @@ def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
     child.wait()
     dying = f"""
 import os, signal, sys
-from pipeline.__main__ import main
+from scanchain.__main__ import main
 from {module} import {kind}
 act = {kind}.{method}
 def dying(self, *values):
@@ -195,8 +195,8 @@ def waiting_at(scan):
     """The command line as a script that says "there" before it places that scan, and then waits."""
     return f"""
 import sys, time
-from pipeline.__main__ import main
-from pipeline.slam import Slam
+from scanchain.__main__ import main
+from scanchain.slam import Slam
 place = Slam.place
 def waiting(self, located):
     if located.tracked.scan.index == {scan}:
@@ -299,7 +299,7 @@ def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, wh
 def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib):
     full = f"""
 import resource, signal, sys
-from pipeline.__main__ import main
+from scanchain.__main__ import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10))
 sys.exit(main(sys.argv[1:]))

@@ -6,9 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pipeline.kernels
+import scanchain.kernels
 
-WHERE = "import pipeline.kernels, numba; print(numba.config.CACHE_DIR)"
+WHERE = "import scanchain.kernels, numba; print(numba.config.CACHE_DIR)"
 
 
 def cache_of(package, cache, **environment):
@@ -22,9 +22,9 @@ def cache_of(package, cache, **environment):
 
 
 def package_at(folder):
-    kernels = folder / "pipeline" / "kernels"
-    shutil.copytree(Path(pipeline.kernels.__file__).parent, kernels, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "pipeline" / "__init__.py").touch()
+    kernels = folder / "scanchain" / "kernels"
+    shutil.copytree(Path(scanchain.kernels.__file__).parent, kernels, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "scanchain" / "__init__.py").touch()
     return kernels
 
 

@@ -3,16 +3,16 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig
-from pipeline.kernels import descent, downsample, eigen, hashing
-from pipeline.kernels.association import associate
-from pipeline.kernels.residuals import normal_equations
-from pipeline.kernels.shortest_ways import shortest_ways
-from pipeline.kernels.trust import weigh
-from pipeline.kernels.twist import orthonormalise, perturb
-from pipeline.kernels.voxels import DIRECTION, SHAPE
-from pipeline.matching import VoxelMap
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.kernels import descent, downsample, eigen, hashing
+from scanchain.kernels.association import associate
+from scanchain.kernels.residuals import normal_equations
+from scanchain.kernels.shortest_ways import shortest_ways
+from scanchain.kernels.trust import weigh
+from scanchain.kernels.twist import orthonormalise, perturb
+from scanchain.kernels.voxels import DIRECTION, SHAPE
+from scanchain.matching import VoxelMap
 
 SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}
 

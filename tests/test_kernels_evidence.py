@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from naive_evidence import hold, seen_from_source, spectrum
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig, MatchingConfig
-from pipeline.kernels import evidence, poses
-from pipeline.kernels.eigen import eigensystem
-from pipeline.kernels.matching import root_mean_square_range
-from pipeline.matching import VoxelMap
-from pipeline.matching.matcher import terms_of
+from scanchain import lie
+from scanchain.config import LocalMapConfig, MatchingConfig
+from scanchain.kernels import evidence, poses
+from scanchain.kernels.eigen import eigensystem
+from scanchain.kernels.matching import root_mean_square_range
+from scanchain.matching import VoxelMap
+from scanchain.matching.matcher import terms_of
 
 
 def definite(k, spread=1.0, seed=0):

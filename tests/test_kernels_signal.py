@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from naive_evidence import signal_along
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig, MatchingConfig
-from pipeline.data import Prior
-from pipeline.kernels import registration, signal
-from pipeline.matching import VoxelMap, create_matcher
-from pipeline.matching.matcher import terms_of
+from scanchain import lie
+from scanchain.config import LocalMapConfig, MatchingConfig
+from scanchain.data import Prior
+from scanchain.kernels import registration, signal
+from scanchain.matching import VoxelMap, create_matcher
+from scanchain.matching.matcher import terms_of
 
 LIMITS = MatchingConfig(max_distance_m=1.0, sensor_noise_m=0.02)
 BEFORE = 12  # scans

@@ -6,14 +6,14 @@ import pytest
 from naive_landmarks import numeric_jacobian
 from scenes import shared_data
 
-from pipeline.graph.robust import RobustLoss
-from pipeline.kernels import dead_reckoning, landmark_factors
-from pipeline.landmarks import guess as guesses
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
-from pipeline.landmarks.minimise import QUADRATIC, minimise
-from pipeline.landmarks.npz import read_landmark_data
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import METHODS, UndeterminedError, create_solver
+from scanchain.graph.robust import RobustLoss
+from scanchain.kernels import dead_reckoning, landmark_factors
+from scanchain.landmarks import guess as guesses
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
+from scanchain.landmarks.minimise import QUADRATIC, minimise
+from scanchain.landmarks.npz import read_landmark_data
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
 
 
 @pytest.mark.parametrize("size", [2, 3])

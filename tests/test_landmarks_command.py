@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scenes import shared_data
 
-from pipeline.landmarks.solvers import ESTIMATOR, METHODS
-from pipeline.trajectory import read_tum
+from scanchain.landmarks.solvers import ESTIMATOR, METHODS
+from scanchain.trajectory import read_tum
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 

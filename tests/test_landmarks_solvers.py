@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import InputError
-from pipeline.kernels import column_order
-from pipeline.landmarks.covariance import Covariance
-from pipeline.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
-from pipeline.landmarks.solvers.eliminate_landmarks import LandmarkElimination
-from pipeline.landmarks.system import Layout, LinearSystem, Pattern
+from scanchain.errors import InputError
+from scanchain.kernels import column_order
+from scanchain.landmarks.covariance import Covariance
+from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
+from scanchain.landmarks.solvers.eliminate_landmarks import LandmarkElimination
+from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
 OWN = ("qr", "qr_colamd", "cholesky", "schur")
 

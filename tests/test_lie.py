@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import lie
+from scanchain import lie
 
 _length = st.floats(-50.0, 50.0)
 _angles = st.one_of(

@@ -5,10 +5,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline import lie
-from pipeline.errors import InputError
-from pipeline.logs.ros2_definitions import schema_text
-from pipeline.logs.write import LogWriter
+from scanchain import lie
+from scanchain.errors import InputError
+from scanchain.logs.ros2_definitions import schema_text
+from scanchain.logs.write import LogWriter
 
 STAMP_NS = 1_700_000_000_123_456_789
 

@@ -23,9 +23,9 @@ from naive_logs import (
 )
 from scenes import shared_data
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 
 def complaint(*paths, **config):

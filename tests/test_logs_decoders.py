@@ -20,10 +20,10 @@ from naive_logs import (
     write,
 )
 
-from pipeline import lie
-from pipeline.config import LogConfig
-from pipeline.logs import open_log
-from pipeline.simulate import simulate
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+from scanchain.simulation import simulate
 
 
 def only_scan(folder, said, **config):

@@ -13,15 +13,15 @@ from scenes import shared_data
 from test_inputs_carmen import flaser, save
 from web_server import serving
 
-from pipeline.__main__ import main
-from pipeline.config import LogConfig
-from pipeline.errors import InputError, MissingExtraError
-from pipeline.logs import open_log, read_ahead, remote, write
-from pipeline.logs.opening import index_files
-from pipeline.logs.read_ahead import ReadAhead, merged
-from pipeline.runs.provenance import Provenance, identity_of
-from pipeline.simulate import simulate
-from pipeline.source import Address, source_of
+from scanchain.__main__ import main
+from scanchain.config import LogConfig
+from scanchain.errors import InputError, MissingExtraError
+from scanchain.logs import open_log, read_ahead, remote, write
+from scanchain.logs.opening import index_files
+from scanchain.logs.read_ahead import ReadAhead, merged
+from scanchain.runs.provenance import Provenance, identity_of
+from scanchain.simulation import simulate
+from scanchain.source import Address, source_of
 
 pytest.importorskip("fsspec", reason="the extra remote is not installed")
 

@@ -26,13 +26,13 @@ from naive_logs import (
 )
 from scenes import shared_data
 
-from pipeline import lie
-from pipeline.__main__ import main
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs import open_log
-from pipeline.logs.opening import index_files
-from pipeline.simulate import simulate
+from scanchain import lie
+from scanchain.__main__ import main
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.opening import index_files
+from scanchain.simulation import simulate
 
 
 def read(*paths, **config):
@@ -176,7 +176,7 @@ def test_the_log_can_be_read_again_and_closed_early(tmp_path):
 
 
 def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
-    from pipeline.logs import stream
+    from scanchain.logs import stream
 
     path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
     opened = []

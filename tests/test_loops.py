@@ -5,13 +5,13 @@ import pytest
 from drifting import drifting_slam, stretched
 from scenes import configured, shared_data
 
-from pipeline import lie
-from pipeline.data import Verdict
-from pipeline.evaluate import absolute_error, pair
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.logs import open_log
-from pipeline.loops.doubt import Doubt
-from pipeline.runs.verdicts import final_verdicts
+from scanchain import lie
+from scanchain.data import Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.logs import open_log
+from scanchain.loops.doubt import Doubt
+from scanchain.runs.verdicts import final_verdicts
 
 
 def chain(count, sigma_m=0.01):

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scenes import configured, shared_data, stored
 
-from pipeline import lie
-from pipeline.data import Keyframe, Verdict
-from pipeline.evaluate import absolute_error, pair
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.logs import open_log
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.submaps import Submaps
-from pipeline.odometry import Odometry
-from pipeline.runs.verdicts import final_verdicts
-from pipeline.slam import Slam
+from scanchain import lie
+from scanchain.data import Keyframe, Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.logs import open_log
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.submaps import Submaps
+from scanchain.odometry import Odometry
+from scanchain.runs.verdicts import final_verdicts
+from scanchain.slam import Slam
 
 
 def graph_of(count, loops=()):

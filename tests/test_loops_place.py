@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from scenes import configured, stored
 
-from pipeline import lie
-from pipeline.data import Keyframe, Proposal, Verdict
-from pipeline.kernels.free_space import FAR, compare_ranges, nearest_ranges
-from pipeline.kernels.place import count_heights, mark_heights
-from pipeline.loops.agreement import free_space_agreement
-from pipeline.loops.gallery import Gallery
-from pipeline.loops.local_map import local_map
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.place import compare, describe
-from pipeline.loops.place_closer import PlaceCloser
-from pipeline.loops.submaps import Submaps
-from pipeline.loops.upright import level_frame
-from pipeline.loops.verification import Verifier
-from pipeline.simulate import plan
-from pipeline.simulate.sweep import take_sweep
+from scanchain import lie
+from scanchain.data import Keyframe, Proposal, Verdict
+from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
+from scanchain.kernels.place import count_heights, mark_heights
+from scanchain.loops.agreement import free_space_agreement
+from scanchain.loops.gallery import Gallery
+from scanchain.loops.local_map import local_map
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.place import compare, describe
+from scanchain.loops.place_closer import PlaceCloser
+from scanchain.loops.submaps import Submaps
+from scanchain.loops.upright import level_frame
+from scanchain.loops.verification import Verifier
+from scanchain.simulation import plan
+from scanchain.simulation.sweep import take_sweep
 
 RADIUS_M = 32.0
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scenes import configured
 
-from pipeline import lie
-from pipeline.data import Keyframe
-from pipeline.kernels.refinement import refine
-from pipeline.loops import refined
-from pipeline.matching import VoxelMap
-from pipeline.matching.matcher import terms_of
-from pipeline.point_store import PointStore
+from scanchain import lie
+from scanchain.data import Keyframe
+from scanchain.kernels.refinement import refine
+from scanchain.loops import refined
+from scanchain.matching import VoxelMap
+from scanchain.matching.matcher import terms_of
+from scanchain.point_store import PointStore
 
 ANGLES = np.linspace(-3.0, 3.0, 240)
 

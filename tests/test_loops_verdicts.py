@@ -11,17 +11,17 @@ import pytest
 from false_loops import MADE_UP, false_closures
 from scenes import configured
 
-from pipeline.__main__ import main
-from pipeline.config import GraphConfig, LogConfig
-from pipeline.data import Proposal, Verdict
-from pipeline.evaluate import absolute_error, pair
-from pipeline.graph.g2o import read_g2o
-from pipeline.logs import open_log
-from pipeline.runs.closure_table import write_closures
-from pipeline.runs.metrics import Metrics
-from pipeline.runs.verdicts import final_verdicts
-from pipeline.simulate import simulate
-from pipeline.slam import Slam
+from scanchain.__main__ import main
+from scanchain.config import GraphConfig, LogConfig
+from scanchain.data import Proposal, Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.g2o import read_g2o
+from scanchain.logs import open_log
+from scanchain.runs.closure_table import write_closures
+from scanchain.runs.metrics import Metrics
+from scanchain.runs.verdicts import final_verdicts
+from scanchain.simulation import simulate
+from scanchain.slam import Slam
 
 DURATION_S = 110.0  # round the office's ring once and on for a while
 
@@ -103,7 +103,7 @@ def forced(log, tmp_path_factory):
 
     out = tmp_path_factory.mktemp("forced") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.runs.processing.Slam", Forced)
+        patch.setattr("scanchain.runs.processing.Slam", Forced)
         assert main(["run", str(log.paths[0]), "--out", str(out), "--odometry.prior", "constant-velocity"]) == 0
     return out
 

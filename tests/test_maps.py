@@ -8,12 +8,12 @@ from PIL import Image
 from ruamel.yaml import YAML
 from scenes import kitti_scans, shared_data
 
-from pipeline import lie
-from pipeline.baselines.open3d_pairs import Open3dPairs
-from pipeline.config import MapsConfig
-from pipeline.errors import InputError
-from pipeline.logs.formats.pcd import read_pcd
-from pipeline.maps import (
+from scanchain import lie
+from scanchain.baselines.open3d_pairs import Open3dPairs
+from scanchain.config import MapsConfig
+from scanchain.errors import InputError
+from scanchain.logs.formats.pcd import read_pcd
+from scanchain.maps import (
     OccupancyGrid,
     PointMap,
     build_point_map,
@@ -26,10 +26,10 @@ from pipeline.maps import (
     write_pcd,
     write_ply,
 )
-from pipeline.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
-from pipeline.simulate import SENSORS
-from pipeline.simulate.solids import Scenery
-from pipeline.trajectory import read_tum
+from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
+from scanchain.simulation import SENSORS
+from scanchain.simulation.solids import Scenery
+from scanchain.trajectory import read_tum
 
 RESOLUTION_M = 0.1
 CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)

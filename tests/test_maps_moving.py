@@ -7,10 +7,10 @@ import naive_maps as naive
 import numpy as np
 import pytest
 
-from pipeline import lie
-from pipeline.config import MapsConfig
-from pipeline.kernels.free_space import FAR, nearest_ranges, weigh_points
-from pipeline.maps import View, build_point_map, draw_grid, moved
+from scanchain import lie
+from scanchain.config import MapsConfig
+from scanchain.kernels.free_space import FAR, nearest_ranges, weigh_points
+from scanchain.maps import View, build_point_map, draw_grid, moved
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig, MatchingConfig
-from pipeline.data import Prior
-from pipeline.matching import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
-from pipeline.matching.matcher import OPTIMISERS
+from scanchain import lie
+from scanchain.config import LocalMapConfig, MatchingConfig
+from scanchain.data import Prior
+from scanchain.matching import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
+from scanchain.matching.matcher import OPTIMISERS
 
 
 def room(dimension, seed=0, unit=1.0):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline import lie
-from pipeline.odometry.motion_filter import MotionFilter
+from scanchain import lie
+from scanchain.odometry.motion_filter import MotionFilter
 
 
 def textbook(any_motion, noise, measurements, information):

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scenes import configured, shared_data
 
-from pipeline import baselines, lie
-from pipeline.config import Config
-from pipeline.data import Scan, State, Trajectory, Verdict
-from pipeline.errors import InputError
-from pipeline.evaluate import absolute_error, pair, read_relations, relation_error
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.preprocess import sweep_of
-from pipeline.simulate import simulate
-from pipeline.slam import Slam
+from scanchain import baselines, lie
+from scanchain.config import Config
+from scanchain.data import Scan, State, Trajectory, Verdict
+from scanchain.errors import InputError
+from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.preprocess import sweep_of
+from scanchain.simulation import simulate
+from scanchain.slam import Slam
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline import lie
-from viz.plots import GridPicture, draw_map
+from scanchain import lie
+from scanchain.viz.plots import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
 

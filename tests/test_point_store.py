@@ -5,9 +5,9 @@ import gc
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.memory import resident_mib
-from pipeline.point_store import PointStore
+from scanchain.errors import InputError
+from scanchain.memory import resident_mib
+from scanchain.point_store import PointStore
 
 
 def cloud(count, seed=0):

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scenes import configured
 
-from pipeline.config import PreprocessConfig
-from pipeline.data import Scan
-from pipeline.preprocess import Resolution, downsample, sweep_of
+from scanchain.config import PreprocessConfig
+from scanchain.data import Scan
+from scanchain.preprocess import Resolution, downsample, sweep_of
 
 CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
 

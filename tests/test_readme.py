@@ -5,8 +5,8 @@ import re
 import pytest
 from scenes import ROOT
 
-import pipeline
-from pipeline.simulate import simulate
+import scanchain
+from scanchain.simulation import simulate
 
 README = ROOT / "README.md"
 
@@ -45,4 +45,4 @@ def test_every_block_of_python_in_the_readme_runs_alone(folder, capsys):
 
 
 def test_the_names_of_the_api_are_listed():
-    assert {name for name in dir(pipeline) if not name.startswith("_")} == set(pipeline.__all__)
+    assert {name for name in dir(scanchain) if not name.startswith("_")} == set(scanchain.__all__)

@@ -18,17 +18,17 @@ from killing import same_recording
 from rerun.chunk import RrdReader
 from scenes import ROOT
 
-from pipeline import lie
-from pipeline.config import RecordingConfig
-from pipeline.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
-from pipeline.errors import InputError
-from pipeline.runs.step_table import StepTable
-from pipeline.runs.verdicts import final_verdicts
-from viz import entities, shapes, viewer
-from viz.blueprint import blueprint
-from viz.messages import Message
-from viz.recording import Recording
-from viz.sinks import file_sink, open_stream, write_recording
+from scanchain import lie
+from scanchain.config import RecordingConfig
+from scanchain.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
+from scanchain.errors import InputError
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.verdicts import final_verdicts
+from scanchain.viz import entities, shapes, viewer
+from scanchain.viz.blueprint import blueprint
+from scanchain.viz.messages import Message
+from scanchain.viz.recording import Recording
+from scanchain.viz.sinks import file_sink, open_stream, write_recording
 
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
@@ -361,12 +361,12 @@ import sys, time, os, signal
 from pathlib import Path
 from uuid import uuid4
 from test_recording import drive, free_port
-from pipeline.config import RecordingConfig
-from viz import sinks, viewer
-from viz.blueprint import blueprint
-from viz.messages import Message
-from viz.recording import Recording
-from viz.sinks import open_stream, write_recording
+from scanchain.config import RecordingConfig
+from scanchain.viz import sinks, viewer
+from scanchain.viz.blueprint import blueprint
+from scanchain.viz.messages import Message
+from scanchain.viz.recording import Recording
+from scanchain.viz.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
 server = viewer.start_web(port, free_port())
@@ -398,8 +398,8 @@ def test_view_web_prints_one_address_and_takes_its_server_along(tmp_path, number
     port, web_port = free_port(), free_port()
     script = f"""
 import sys
-from pipeline.__main__ import main
-from viz import viewer
+from scanchain.__main__ import main
+from scanchain.viz import viewer
 viewer.PORT, viewer.WEB_PORT = {port}, {web_port}
 sys.exit(main(["view", "--web", sys.argv[1]]))
 """
@@ -449,11 +449,11 @@ import os, signal, sys, time
 from pathlib import Path
 from uuid import uuid4
 from test_recording import drive
-from pipeline.config import RecordingConfig
-from viz.blueprint import blueprint
-from viz.messages import Message
-from viz.recording import Recording
-from viz.sinks import open_stream, write_recording
+from scanchain.config import RecordingConfig
+from scanchain.viz.blueprint import blueprint
+from scanchain.viz.messages import Message
+from scanchain.viz.recording import Recording
+from scanchain.viz.sinks import open_stream, write_recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
 recording.__enter__()
@@ -477,7 +477,7 @@ import resource, signal, sys
 from pathlib import Path
 from uuid import uuid4
 from test_recording import drive, record
-from viz import sinks
+from scanchain.viz import sinks
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 sinks._FILE_PATIENCE_S = 1.0
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))

@@ -16,18 +16,18 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
-from pipeline.__main__ import main
-from pipeline.compare.columns import COLUMNS
-from pipeline.compare.table import read_table
-from pipeline.logs.write import LogWriter
-from pipeline.maps import read_ply
-from pipeline.simulate import simulate
-from viz.course_figures import plan
-from viz.courses import Course, PathLine
-from viz.map_figures import surroundings
-from viz.map_viewer import SCRIPT, map_scene
-from viz.report import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
-from viz.trajectory_section import Told, trajectory_section
+from scanchain.__main__ import main
+from scanchain.comparison.columns import COLUMNS
+from scanchain.comparison.table import read_table
+from scanchain.logs.write import LogWriter
+from scanchain.maps import read_ply
+from scanchain.simulation import simulate
+from scanchain.viz.course_figures import plan
+from scanchain.viz.courses import Course, PathLine
+from scanchain.viz.map_figures import surroundings
+from scanchain.viz.map_viewer import SCRIPT, map_scene
+from scanchain.viz.report import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.trajectory_section import Told, trajectory_section
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent
@@ -325,7 +325,7 @@ def test_a_page_needs_nothing_but_itself(which, request):
 
 
 def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
-    from viz.compare_report import write_compare_report
+    from scanchain.viz.compare_report import write_compare_report
 
     before = (comparison / "report.html").read_bytes()
     write_compare_report(comparison)

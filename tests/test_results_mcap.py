@@ -7,12 +7,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, transforms, transforms_said, write
 
-from pipeline import lie
-from pipeline.__main__ import main
-from pipeline.logs import open_log
-from pipeline.maps import read_map, read_ply
-from pipeline.runs.results_mcap import ros_covariance
-from pipeline.trajectory import read_tum
+from scanchain import lie
+from scanchain.__main__ import main
+from scanchain.logs import open_log
+from scanchain.maps import read_map, read_ply
+from scanchain.runs.results_mcap import ros_covariance
+from scanchain.trajectory import read_tum
 
 
 def decoded(path):
@@ -126,6 +126,6 @@ def test_a_covariance_turns_with_the_lidar_and_is_zero_where_it_is_unknown():
 
 
 def test_it_is_written_only_where_asked_for():
-    from pipeline.config import Config
+    from scanchain.config import Config
 
     assert not Config().outputs.mcap and msgspec.structs.fields(Config().outputs)[0].name == "mcap"

@@ -17,15 +17,15 @@ from naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, write
 from rerun.chunk import RrdReader
 from scenes import ROOT
 
-from pipeline.__main__ import _record
-from pipeline.errors import InputError
-from pipeline.runs.directory import RunDirectory
-from pipeline.runs.job import Job
-from pipeline.runs.progress import Unwatched
-from pipeline.runs.rescue import PartialRunError
-from pipeline.runs.run import run
-from pipeline.settings import Override
-from pipeline.simulate import simulate
+from scanchain.__main__ import _record
+from scanchain.errors import InputError
+from scanchain.runs.directory import RunDirectory
+from scanchain.runs.job import Job
+from scanchain.runs.progress import Unwatched
+from scanchain.runs.rescue import PartialRunError
+from scanchain.runs.run import run
+from scanchain.settings import Override
+from scanchain.simulation import simulate
 
 
 @pytest.fixture(scope="module")
@@ -363,8 +363,8 @@ def started(log, out):
     """A run in a process of its own that dawdles after forty scans; given back once it is there."""
     script = """
 import sys, time
-from pipeline.__main__ import main
-from pipeline.odometry import FrontEnd
+from scanchain.__main__ import main
+from scanchain.odometry import FrontEnd
 locate = FrontEnd.locate
 def waiting(self, scan):
     if scan.index == 40:

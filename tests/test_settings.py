@@ -6,10 +6,10 @@ import msgspec
 import pytest
 from scenes import ROOT, configured
 
-from pipeline.config import Config
-from pipeline.config_keys import config_keys
-from pipeline.errors import InputError
-from pipeline.settings import Override, dump, flatten, load_settings, preset_path, read_layer
+from scanchain.config import Config
+from scanchain.config_keys import config_keys
+from scanchain.errors import InputError
+from scanchain.settings import Override, dump, flatten, load_settings, preset_path, read_layer
 
 
 def flag(key, text):

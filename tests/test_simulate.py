@@ -10,14 +10,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline import catalogue, lie
-from pipeline.errors import InputError
-from pipeline.simulate import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
-from pipeline.simulate.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
-from pipeline.simulate.normals import surface_normals
-from pipeline.simulate.solids import Solids
-from pipeline.simulate.sweep import take_sweep
-from pipeline.simulate.wheels import wheel_odometry
+from scanchain import catalogue, lie
+from scanchain.errors import InputError
+from scanchain.simulation import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
+from scanchain.simulation.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
+from scanchain.simulation.normals import surface_normals
+from scanchain.simulation.solids import Solids
+from scanchain.simulation.sweep import take_sweep
+from scanchain.simulation.wheels import wheel_odometry
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 STRESSING = [name for name in WORLDS if name not in ("office", "town")]

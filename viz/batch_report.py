@@ -11,16 +11,16 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.batch.table import totals
-from pipeline.batch.task import Row, State, said_file
-from pipeline.runs.metrics import Metrics
-from pipeline.source import source_of, without_keys
-from pipeline.trajectory import read_tum
-from pipeline.words import counted
-from viz import report
-from viz.courses import colour_of
-from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
-from viz.sheet import Sheet
+from scanchain.batch.table import totals
+from scanchain.batch.task import Row, State, said_file
+from scanchain.runs.metrics import Metrics
+from scanchain.source import source_of, without_keys
+from scanchain.trajectory import read_tum
+from scanchain.viz import report
+from scanchain.viz.courses import colour_of
+from scanchain.viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
+from scanchain.viz.sheet import Sheet
+from scanchain.words import counted
 
 _MOST_WAYS = 60
 _MAX_POINTS = 1500  # of a line

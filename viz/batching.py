@@ -9,12 +9,12 @@ from time import perf_counter
 import numpy as np
 import rerun as rr
 
-from pipeline import lie
-from pipeline.data import Match, Matrix, State, Step
-from pipeline.runs.step_table import StepRow
-from viz import entities, shapes
-from viz.keyframe_graph import Verdicts
-from viz.messages import Message, Times
+from scanchain import lie
+from scanchain.data import Match, Matrix, State, Step
+from scanchain.runs.step_table import StepRow
+from scanchain.viz import entities, shapes
+from scanchain.viz.keyframe_graph import Verdicts
+from scanchain.viz.messages import Message, Times
 
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000

@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from viz import entities
-from viz.shapes import Floats
+from scanchain.viz import entities
+from scanchain.viz.shapes import Floats
 
 _PLAY_S = 30.0
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels

@@ -11,16 +11,16 @@ import pyarrow.parquet as pq
 import rerun as rr
 import rerun.blueprint as rrb
 
-from pipeline.compare.evidence import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.table import Table, read_table
-from pipeline.maps import read_ply
-from pipeline.trajectory import read_tum
-from viz import entities, shapes
-from viz.blueprint import eye, time_panel, up_to_now, whole_log
-from viz.compared_courses import read_courses
-from viz.courses import Course
-from viz.messages import Message, Times
-from viz.sinks import write_recording
+from scanchain.comparison.evidence import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.table import Table, read_table
+from scanchain.maps import read_ply
+from scanchain.trajectory import read_tum
+from scanchain.viz import entities, shapes
+from scanchain.viz.blueprint import eye, time_panel, up_to_now, whole_log
+from scanchain.viz.compared_courses import read_courses
+from scanchain.viz.courses import Course
+from scanchain.viz.messages import Message, Times
+from scanchain.viz.sinks import write_recording
 
 RECORDING_FILE = "compare.rrd"
 _MAP_POINTS = 60_000

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.compare.columns import Column, columns_of
-from pipeline.compare.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from pipeline.compare.outcome import CLOSURES_FILE, Status
-from pipeline.compare.table import Row as TableRow
-from pipeline.compare.table import Table, read_table
-from pipeline.maps import read_ply
-from pipeline.trajectory import read_tum
-from viz import course_figures as figures
-from viz.compared_courses import read_courses
-from viz.course_sections import (
+from scanchain.comparison.columns import Column, columns_of
+from scanchain.comparison.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.outcome import CLOSURES_FILE, Status
+from scanchain.comparison.table import Row as TableRow
+from scanchain.comparison.table import Table, read_table
+from scanchain.maps import read_ply
+from scanchain.trajectory import read_tum
+from scanchain.viz import course_figures as figures
+from scanchain.viz.compared_courses import read_courses
+from scanchain.viz.course_sections import (
     chip,
     error_section,
     knowledge_section,
@@ -26,10 +26,10 @@ from viz.course_sections import (
     time_section,
     way_section,
 )
-from viz.courses import Course, Floats
-from viz.map_figures import map_picture, surroundings
-from viz.provenance_folds import provenance_folds
-from viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.courses import Course, Floats
+from scanchain.viz.map_figures import map_picture, surroundings
+from scanchain.viz.provenance_folds import provenance_folds
+from scanchain.viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
 
 _WIDEST = 10  # columns of a table beside the summary
 _NEARLY = 1.25  # times the thickness of the sharpest map

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.compare.evidence import RELATIONS_FILE, SCANS_FILE
-from pipeline.compare.table import Row, read_table
-from viz.courses import Course, Floats, colour_of
+from scanchain.comparison.evidence import RELATIONS_FILE, SCANS_FILE
+from scanchain.comparison.table import Row, read_table
+from scanchain.viz.courses import Course, Floats, colour_of
 
 
 def read_courses(directory: Path) -> list[Course]:

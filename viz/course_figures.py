@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 from scipy.special import gammaincinv
 
-from viz.courses import TRUTH, Course, Floats
-from viz.sheet import INK, Sheet
+from scanchain.viz.courses import TRUTH, Course, Floats
+from scanchain.viz.sheet import INK, Sheet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from viz import course_figures as figures
-from viz.courses import CLOSURES, TRUTH, Course, Floats
-from viz.map_figures import loops_picture
-from viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
+from scanchain.viz import course_figures as figures
+from scanchain.viz.courses import CLOSURES, TRUTH, Course, Floats
+from scanchain.viz.map_figures import loops_picture
+from scanchain.viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _MEDIANS = "Of long logs, medians of neighbouring scans."

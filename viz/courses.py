@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runs.verdicts import BACK_END, VERIFICATION
+from scanchain.runs.verdicts import BACK_END, VERIFICATION
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from pipeline.data import State
-from viz.messages import Message
+from scanchain.data import State
+from scanchain.viz.messages import Message
 
 WORLD = "world"
 ODOM = "world/odom"

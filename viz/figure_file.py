@@ -6,7 +6,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.runs.whole_file import write_whole
+from scanchain.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

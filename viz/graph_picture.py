@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState
-from pipeline.graph.optimisation import GraphChange, fit
-from viz.figure_file import write_figure
+from scanchain.data import GraphState
+from scanchain.graph.optimisation import GraphChange, fit
+from scanchain.viz.figure_file import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

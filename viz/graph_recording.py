@@ -10,11 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState
-from pipeline.graph.optimisation import GraphChange
-from viz import entities, shapes
-from viz.messages import Message, Times
-from viz.sinks import open_stream, write_recording
+from scanchain.data import GraphState
+from scanchain.graph.optimisation import GraphChange
+from scanchain.viz import entities, shapes
+from scanchain.viz.messages import Message, Times
+from scanchain.viz.sinks import open_stream, write_recording
 
 
 def record_graph(change: GraphChange, path: Path) -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from pipeline.data import Closure, GraphState, Step, Verdict
-from pipeline.runs.step_table import StepRow
-from pipeline.runs.verdicts import JudgedClosure, final_verdicts
-from viz import entities, shapes
-from viz.messages import Message, Times
+from scanchain.data import Closure, GraphState, Step, Verdict
+from scanchain.runs.step_table import StepRow
+from scanchain.runs.verdicts import JudgedClosure, final_verdicts
+from scanchain.viz import entities, shapes
+from scanchain.viz.messages import Message, Times
 
 _GROWTH = 1.05  # drawn anew when it grew by this factor: the recording stays linear in the length of the log
 _DOUBT = 0.5  # robust weight below which the back end disagrees with a closure's verdict

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.landmarks.compare import MethodResult
-from pipeline.landmarks.study import Estimate, Study
-from viz.figure_file import write_figure
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.study import Estimate, Study
+from scanchain.viz.figure_file import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

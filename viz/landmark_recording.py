@@ -10,13 +10,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.landmarks.study import Estimate, Study
-from pipeline.landmarks.write import file_stem
-from viz import entities, shapes
-from viz.messages import Message, Times
-from viz.sinks import open_stream, write_recording
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.landmarks.study import Estimate, Study
+from scanchain.landmarks.write import file_stem
+from scanchain.viz import entities, shapes
+from scanchain.viz.messages import Message, Times
+from scanchain.viz.sinks import open_stream, write_recording
 
 _DEVIATIONS = 2.4477  # that hold 95 % of a Gaussian in the plane
 _FLAT_M = 1e-4  # height of an ellipse

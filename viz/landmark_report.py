@@ -6,11 +6,11 @@ from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.landmarks.study import Study
-from pipeline.landmarks.write import accuracy_lines, file_stem, size_of, table_of
-from pipeline.runs.whole_file import write_whole
-from viz.landmark_plots import draw_estimate, draw_factors
+from scanchain.errors import InputError
+from scanchain.landmarks.study import Study
+from scanchain.landmarks.write import accuracy_lines, file_stem, size_of, table_of
+from scanchain.viz.landmark_plots import draw_estimate, draw_factors
+from scanchain.whole_file import write_whole
 
 _PAGE = "report.html"
 

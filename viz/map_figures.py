@@ -8,9 +8,9 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.data import Points
-from viz.courses import CLOSURES, Course, Floats, PathLine
-from viz.sheet import INK, Sheet
+from scanchain.data import Points
+from scanchain.viz.courses import CLOSURES, Course, Floats, PathLine
+from scanchain.viz.sheet import INK, Sheet
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000

@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.data import Points
-from viz.courses import Floats, PathLine
+from scanchain.data import Points
+from scanchain.viz.courses import Floats, PathLine
 
 SCRIPT = (Path(__file__).parent / "templates" / "map_viewer.js").read_text(encoding="utf-8")
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from viz.courses import TRUTH
-from viz.figure_file import write_figure
-from viz.map_figures import extent
+from scanchain.data import Matrix
+from scanchain.viz.courses import TRUTH
+from scanchain.viz.figure_file import write_figure
+from scanchain.viz.map_figures import extent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

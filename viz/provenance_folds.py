@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 
-from pipeline.runs.provenance import Provenance
-from viz.report import Fold
+from scanchain.runs.provenance import Provenance
+from scanchain.viz.report import Fold
 
 
 def provenance_folds(made: Provenance, others: dict[str, str]) -> Iterator[Fold]:

@@ -16,18 +16,18 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.error_utils import catch_and_log_exceptions
 
-from pipeline.config import RecordingConfig
-from pipeline.data import Closure, GraphState, Matrix, Step
-from pipeline.errors import InputError
-from pipeline.runs.recorder import SinkName
-from pipeline.runs.step_table import StepRow
-from pipeline.runs.verdicts import JudgedClosure
-from viz import entities, shapes, viewer
-from viz.batching import Batcher
-from viz.blueprint import blueprint
-from viz.keyframe_graph import KeyframeGraph
-from viz.messages import Message, Times
-from viz.sinks import Sink, file_sink, open_stream, viewer_sink
+from scanchain.config import RecordingConfig
+from scanchain.data import Closure, GraphState, Matrix, Step
+from scanchain.errors import InputError
+from scanchain.runs.recorder import SinkName
+from scanchain.runs.step_table import StepRow
+from scanchain.runs.verdicts import JudgedClosure
+from scanchain.viz import entities, shapes, viewer
+from scanchain.viz.batching import Batcher
+from scanchain.viz.blueprint import blueprint
+from scanchain.viz.keyframe_graph import KeyframeGraph
+from scanchain.viz.messages import Message, Times
+from scanchain.viz.sinks import Sink, file_sink, open_stream, viewer_sink
 
 
 class Recording:

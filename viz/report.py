@@ -10,7 +10,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from pipeline.runs.whole_file import write_whole
+from scanchain.whole_file import write_whole
 
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.evaluate import on_the_estimate
-from pipeline.maps import read_map, read_ply
-from pipeline.runs.directory import TRUTH_FILE
-from pipeline.trajectory import read_tum
-from viz.plots import GridPicture, draw_map
+from scanchain.errors import InputError
+from scanchain.evaluation import on_the_estimate
+from scanchain.maps import read_map, read_ply
+from scanchain.runs.directory import TRUTH_FILE
+from scanchain.trajectory import read_tum
+from scanchain.viz.plots import GridPicture, draw_map
 
 
 def draw_run(directory: Path, picture: Path) -> None:

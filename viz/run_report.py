@@ -11,26 +11,26 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline import lie
-from pipeline.data import Pose, Trajectory
-from pipeline.evaluate import absolute_error_on_any_course, pair
-from pipeline.evaluate.absolute import path_length
-from pipeline.maps import read_ply
-from pipeline.runs.consistency import nees_of_steps
-from pipeline.runs.directory import RUN_FILE, TRUTH_FILE
-from pipeline.runs.metrics import Metrics
-from pipeline.runs.provenance import Provenance
-from pipeline.runs.step_table import STAGES
-from pipeline.settings import read_layer
-from pipeline.trajectory import read_tum
-from pipeline.words import counted
-from viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
-from viz.courses import Course, Floats, colour_of
-from viz.map_viewer import SCRIPT
-from viz.provenance_folds import provenance_folds
-from viz.report import REPORT_FILE, Fold, Page, Section, write_page
-from viz.run_tables import accuracy_section, stages_section
-from viz.trajectory_section import Told, trajectory_section
+from scanchain import lie
+from scanchain.data import Pose, Trajectory
+from scanchain.evaluation import absolute_error_on_any_course, pair
+from scanchain.evaluation.absolute import path_length
+from scanchain.maps import read_ply
+from scanchain.runs.consistency import nees_of_steps
+from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
+from scanchain.runs.metrics import Metrics
+from scanchain.runs.provenance import Provenance
+from scanchain.runs.step_table import STAGES
+from scanchain.settings import read_layer
+from scanchain.trajectory import read_tum
+from scanchain.viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
+from scanchain.viz.courses import Course, Floats, colour_of
+from scanchain.viz.map_viewer import SCRIPT
+from scanchain.viz.provenance_folds import provenance_folds
+from scanchain.viz.report import REPORT_FILE, Fold, Page, Section, write_page
+from scanchain.viz.run_tables import accuracy_section, stages_section
+from scanchain.viz.trajectory_section import Told, trajectory_section
+from scanchain.words import counted
 
 
 def write_run_report(directory: Path) -> None:

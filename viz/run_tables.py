@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.runs.metrics import Accuracy, GroundTruth, Metrics
-from pipeline.runs.step_table import STAGES
-from pipeline.words import counted
-from viz.report import Cell, Grid, Head, Row, Section
+from scanchain.runs.metrics import Accuracy, GroundTruth, Metrics
+from scanchain.runs.step_table import STAGES
+from scanchain.viz.report import Cell, Grid, Head, Row, Section
+from scanchain.words import counted
 
 
 def accuracy_section(truth: GroundTruth) -> Section:

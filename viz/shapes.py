@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
+from scanchain import lie
+from scanchain.data import Matrix
 
 Floats = NDArray[np.float32]
 

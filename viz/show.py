@@ -8,8 +8,8 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.errors import InputError
-from viz import viewer
+from scanchain.errors import InputError
+from scanchain.viz import viewer
 
 
 def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
@@ -22,7 +22,7 @@ def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
         return
     if not viewer.has_display():
         raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
-    command = [sys.executable, "-m", "rerun_cli", "--bind", viewer.HOST, str(path), "--new"]
+    command = [sys.executable, "-P", "-m", "rerun_cli", "--bind", viewer.HOST, str(path), "--new"]
     subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
 
 

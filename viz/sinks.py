@@ -22,10 +22,10 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from pipeline.errors import InputError
-from pipeline.runs.whole_file import write_whole
-from pipeline.words import counted
-from viz.messages import Message
+from scanchain.errors import InputError
+from scanchain.viz.messages import Message
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
 
 _QUEUED_BATCHES = 16
 _COPIED_CHUNKS = 64  # that are in memory at a time when a recording is copied

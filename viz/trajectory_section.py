@@ -12,14 +12,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.data import Points, State
-from pipeline.runs.verdicts import BACK_END
-from pipeline.words import counted
-from viz import course_figures as figures
-from viz.courses import CLOSURES, TRUTH, Course, Floats, PathLine
-from viz.map_figures import map_picture, path_over_map, surroundings
-from viz.map_viewer import map_scene
-from viz.report import Chip, Drawing, Section
+from scanchain.data import Points, State
+from scanchain.runs.verdicts import BACK_END
+from scanchain.viz import course_figures as figures
+from scanchain.viz.courses import CLOSURES, TRUTH, Course, Floats, PathLine
+from scanchain.viz.map_figures import map_picture, path_over_map, surroundings
+from scanchain.viz.map_viewer import map_scene
+from scanchain.viz.report import Chip, Drawing, Section
+from scanchain.words import counted
 
 _CONTRADICTED = "contradicted"
 _COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6"}

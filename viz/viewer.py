@@ -12,7 +12,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from urllib.parse import quote
 
-from pipeline.errors import ScanchainError
+from scanchain.errors import ScanchainError
 
 HOST = "127.0.0.1"
 PORT = 9876
@@ -92,7 +92,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 def _launch(*arguments: str) -> subprocess.Popen[bytes]:
     """Start rerun bound to this machine alone (its own default is every interface)."""
     return subprocess.Popen(
-        [sys.executable, "-m", "rerun_cli", "--bind", HOST, *arguments],
+        [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -9,13 +9,13 @@ from typing import Any
 
 from msgspec import Struct
 
-from pipeline.baselines.baseline import Baseline
-from pipeline.baselines.genz import GENZ, GenzIcp, GenzSettings
-from pipeline.baselines.gicp import GICP, PLANAR_GICP, PLANAR_VGICP, VGICP, SmallGicpModel, SmallGicpPairs
-from pipeline.baselines.in_plane import InPlane
-from pipeline.baselines.kiss import KISS, PLANAR_KISS, KissIcp
-from pipeline.baselines.open3d_pairs import OPEN3D, PLANAR_OPEN3D, Open3dPairs, Residual
-from pipeline.errors import InputError
+from scanchain.baselines.baseline import Baseline
+from scanchain.baselines.genz import GENZ, GenzIcp, GenzSettings
+from scanchain.baselines.gicp import GICP, PLANAR_GICP, PLANAR_VGICP, VGICP, SmallGicpModel, SmallGicpPairs
+from scanchain.baselines.in_plane import InPlane
+from scanchain.baselines.kiss import KISS, PLANAR_KISS, KissIcp
+from scanchain.baselines.open3d_pairs import OPEN3D, PLANAR_OPEN3D, Open3dPairs, Residual
+from scanchain.errors import InputError
 
 __all__ = ["BASELINES", "Baseline", "Entry", "InPlane", "create", "find", "names"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Pose
+from scanchain import lie
+from scanchain.data import Pose
 
 
 class AtStamp:

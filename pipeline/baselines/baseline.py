@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Pose, RawPoints
+from scanchain.data import Pose, RawPoints
 
 
 class Baseline(Protocol):

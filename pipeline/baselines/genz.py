@@ -8,10 +8,10 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from pipeline.baselines.at_stamp import AtStamp
-from pipeline.baselines.baseline import finite, middle
-from pipeline.data import Pose, RawPoints
-from pipeline.errors import MissingExtraError
+from scanchain.baselines.at_stamp import AtStamp
+from scanchain.baselines.baseline import finite, middle
+from scanchain.data import Pose, RawPoints
+from scanchain.errors import MissingExtraError
 
 Place = Literal["outdoor", "indoor", "kitti"]
 

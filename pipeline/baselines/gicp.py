@@ -11,12 +11,12 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.baselines.at_stamp import AtStamp
-from pipeline.baselines.baseline import finite, middle
-from pipeline.config import Count, Positive
-from pipeline.data import Pose, RawPoints
-from pipeline.errors import MissingExtraError
+from scanchain import lie
+from scanchain.baselines.at_stamp import AtStamp
+from scanchain.baselines.baseline import finite, middle
+from scanchain.config import Count, Positive
+from scanchain.data import Pose, RawPoints
+from scanchain.errors import MissingExtraError
 
 _CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults below
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.baselines.baseline import Baseline
-from pipeline.data import Pose, RawPoints
+from scanchain import lie
+from scanchain.baselines.baseline import Baseline
+from scanchain.data import Pose, RawPoints
 
 _LEVELS, _STEP_M = 5, 0.1  # of a scan that is given height
 

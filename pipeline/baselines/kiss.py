@@ -8,11 +8,11 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from pipeline.baselines.at_stamp import AtStamp
-from pipeline.baselines.baseline import finite, middle
-from pipeline.config import Count, NonNegative, Positive
-from pipeline.data import Pose, RawPoints
-from pipeline.errors import MissingExtraError
+from scanchain.baselines.at_stamp import AtStamp
+from scanchain.baselines.baseline import finite, middle
+from scanchain.config import Count, NonNegative, Positive
+from scanchain.data import Pose, RawPoints
+from scanchain.errors import MissingExtraError
 
 _DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
 

@@ -12,12 +12,12 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.baselines.at_stamp import AtStamp
-from pipeline.baselines.baseline import finite, middle
-from pipeline.config import Count, Positive
-from pipeline.data import Pose, RawPoints
-from pipeline.errors import MissingExtraError
+from scanchain import lie
+from scanchain.baselines.at_stamp import AtStamp
+from scanchain.baselines.baseline import finite, middle
+from scanchain.config import Count, Positive
+from scanchain.data import Pose, RawPoints
+from scanchain.errors import MissingExtraError
 
 Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
 

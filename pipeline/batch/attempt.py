@@ -8,9 +8,9 @@ from threading import Event
 
 import msgspec
 
-from pipeline.batch.task import Row, State, Task
-from pipeline.runs.metrics import Metrics
-from pipeline.watched import Ending, KilledFor, Limits, run_within
+from scanchain.batch.task import Row, State, Task
+from scanchain.runs.metrics import Metrics
+from scanchain.watched import Ending, KilledFor, Limits, run_within
 
 _LOOK_S = 0.1
 _SYSTEM_KILL = -9
@@ -27,7 +27,7 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 
 def _tried(task: Task, stop: Event | None) -> Row:
-    command = [sys.executable, "-m", "pipeline", "run", "--out", str(task.run), "--force", *task.arguments]
+    command = [sys.executable, "-P", "-m", "scanchain", "run", "--out", str(task.run), "--force", *task.arguments]
     task.said_file.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),

@@ -12,17 +12,17 @@ from typing import Protocol
 
 import msgspec
 
-from pipeline.batch.attempt import attempt
-from pipeline.batch.table import write_table
-from pipeline.batch.task import ROWS_FOLDER, Row, State, Task, finished_row, key_of, unfinished_row
-from pipeline.errors import InputError
-from pipeline.logs.sizes import misspelled, spelled
-from pipeline.memory import available_mib
-from pipeline.runs.directory import check_outside_runs
-from pipeline.runs.provenance import identity_of
-from pipeline.settings import Override
-from pipeline.source import Source, source_of
-from pipeline.words import counted
+from scanchain.batch.attempt import attempt
+from scanchain.batch.table import write_table
+from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, finished_row, key_of, unfinished_row
+from scanchain.errors import InputError
+from scanchain.logs.sizes import misspelled, spelled
+from scanchain.memory import available_mib
+from scanchain.runs.directory import check_outside_runs
+from scanchain.runs.provenance import identity_of
+from scanchain.settings import Override
+from scanchain.source import Source, source_of
+from scanchain.words import counted
 
 _SHA256_OF_NOTHING = hashed().hexdigest()  # of an empty file, and of an empty folder
 _SHARE = 0.75  # of the memory that is free, for all workers together

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 
-from pipeline.batch.attempt import attempt
-from pipeline.batch.task import Row, Task
-from pipeline.errors import InputError, MissingExtraError
+from scanchain.batch.attempt import attempt
+from scanchain.batch.task import Row, Task
+from scanchain.errors import InputError, MissingExtraError
 
 _NODE_LOSSES = 10  # of a task, before it counts as lost
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from glob import glob
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.logs.remote import matching
-from pipeline.source import Source, source_of
+from scanchain.errors import InputError
+from scanchain.logs.remote import matching
+from scanchain.source import Source, source_of
 
 _WILD = frozenset("*?[")
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.batch.task import Row, State
-from pipeline.runs.metrics import Metrics
-from pipeline.words import counted
+from scanchain.batch.task import Row, State
+from scanchain.runs.metrics import Metrics
+from scanchain.words import counted
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (

@@ -10,11 +10,11 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from pipeline.logs.sizes import spelled
-from pipeline.runs.metrics import Metrics
-from pipeline.runs.provenance import package_version
-from pipeline.settings import Override, dump, load_settings
-from pipeline.source import source_of
+from scanchain.logs.sizes import spelled
+from scanchain.runs.metrics import Metrics
+from scanchain.runs.provenance import package_version
+from scanchain.settings import Override, dump, load_settings
+from scanchain.source import source_of
 
 ROWS_FOLDER = "rows"  # of a batch's directory: what became of each log
 

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.ground_truth import ground_truth
-from pipeline.commands.limit_options import limit_options
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, overrides
-from pipeline.commands.run import aliases
-from pipeline.errors import InputError, ScanchainError
-from pipeline.settings import Override
-from pipeline.source import Source
-from pipeline.words import counted
+from scanchain.commands.ground_truth import ground_truth
+from scanchain.commands.limit_options import limit_options
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, overrides
+from scanchain.commands.run import aliases
+from scanchain.errors import InputError, ScanchainError
+from scanchain.settings import Override
+from scanchain.source import Source
+from scanchain.words import counted
 
 if TYPE_CHECKING:
-    from pipeline.runs.recorder import Viewing
+    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 _DAY_S = 86_400.0
@@ -86,10 +86,10 @@ def batch(
       scanchain batch --manifest logs.txt --out /shared/all --ray auto
       scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
-    from pipeline.batch.batch import Batch, run_batch
-    from pipeline.batch.cluster import on_cluster
-    from pipeline.batch.collecting import collect
-    from pipeline.commands.terminal import Terminal
+    from scanchain.batch.batch import Batch, run_batch
+    from scanchain.batch.cluster import on_cluster
+    from scanchain.batch.collecting import collect
+    from scanchain.commands.terminal import Terminal
 
     if ray is not None and workers is not None:
         raise InputError("--workers is for this machine alone; on a cluster every core takes a log")

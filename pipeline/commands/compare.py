@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.ground_truth import ground_truth
-from pipeline.commands.limit_options import limit_options
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.errors import ScanchainError
-from pipeline.source import Source
+from scanchain.commands.ground_truth import ground_truth
+from scanchain.commands.limit_options import limit_options
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.errors import ScanchainError
+from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from pipeline.runs.recorder import Viewing
+    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 
@@ -63,7 +63,7 @@ def compare(
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
     A table of --settings sets a method, or makes a variant of one, or of a class of yours with the verb of
-    pipeline.baselines.Baseline:
+    scanchain.baselines.Baseline:
 
     \b
       [kiss-icp]
@@ -81,10 +81,10 @@ def compare(
       scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --log.end_s 600
     """
-    from pipeline.commands.terminal import Terminal
-    from pipeline.compare.compare import Contest
-    from pipeline.compare.compare import compare as run_contest
-    from pipeline.compare.table import TABLE_FILE, text
+    from scanchain.commands.terminal import Terminal
+    from scanchain.comparison.compare import Contest
+    from scanchain.comparison.compare import compare as run_contest
+    from scanchain.comparison.table import TABLE_FILE, text
 
     truth_file, truth_topic = ground_truth(gt)
     contest = Contest(

@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 
-from pipeline.commands.override_command import OverrideCommand, overrides
-from pipeline.config_keys import Value, config_keys
-from pipeline.settings import Settings, dump, flatten, load_settings
+from scanchain.commands.override_command import OverrideCommand, overrides
+from scanchain.config_keys import Value, config_keys
+from scanchain.settings import Settings, dump, flatten, load_settings
 
 _FILE = click.option(
     "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset."

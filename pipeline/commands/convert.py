@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.errors import InputError
-from pipeline.settings import load_settings
-from pipeline.source import Source
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.errors import InputError
+from scanchain.settings import load_settings
+from scanchain.source import Source
 
 _KEYS = tuple(f"log.{name}" for name in ("rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks"))
 
@@ -63,8 +63,8 @@ def convert(
         if override.key not in _KEYS:
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")
     config = load_settings(overrides=chosen).config.log
-    from pipeline.commands.terminal import Terminal
-    from pipeline.logs.convert import convert as convert_log
+    from scanchain.commands.terminal import Terminal
+    from scanchain.logs.convert import convert as convert_log
 
     with Terminal("messages") as terminal:
         done = convert_log([source], destination, config=config, force=force, progress=terminal.count)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.settings import load_settings
-from pipeline.source import Source
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.settings import load_settings
+from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from pipeline.logs.doctor import Diagnosis
+    from scanchain.logs.doctor import Diagnosis
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
@@ -33,8 +33,8 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_j
       scanchain doctor drive.bag --topic /lidar_front/points --json
       scanchain doctor log.mcap --log.point_times ms
     """
-    from pipeline.commands.terminal import Terminal
-    from pipeline.logs.doctor import examine
+    from scanchain.commands.terminal import Terminal
+    from scanchain.logs.doctor import examine
 
     chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
     early = load_settings(overrides=chosen).config

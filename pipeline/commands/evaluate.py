@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.ground_truth import max_gap_option
-from pipeline.commands.override_command import OnceCommand
-from pipeline.errors import InputError
+from scanchain.commands.ground_truth import max_gap_option
+from scanchain.commands.override_command import OnceCommand
+from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from pipeline.data import Trajectory
-    from pipeline.evaluate import AbsoluteError, KittiError, Pairs, RelationError, RelativeError
+    from scanchain.data import Trajectory
+    from scanchain.evaluation import AbsoluteError, KittiError, Pairs, RelationError, RelativeError
 
     Result = AbsoluteError | RelativeError | KittiError | RelationError
 
@@ -68,8 +68,8 @@ def evaluate(
       scanchain evaluate runs/intel/trajectory.tum --relations intel.relations
       scanchain evaluate runs/log/trajectory.tum truth.tum --align first --rpe 5s,50m --json
     """
-    from pipeline.evaluate import read_relations, read_truth, relation_error
-    from pipeline.trajectory import read_kitti, read_tum
+    from scanchain.evaluation import read_relations, read_truth, relation_error
+    from scanchain.trajectory import read_kitti, read_tum
 
     if reference is None and relations is None:
         raise InputError("nothing to compare with; give GT (a TUM or KITTI file) or --relations FILE")
@@ -112,7 +112,7 @@ class Stretch:
 
     def error(self, pairs: Pairs) -> RelativeError:
         """Raises InputError where it does not fit."""
-        from pipeline import evaluate as metrics
+        from scanchain import evaluation as metrics
 
         if self.unit == "pose":
             return metrics.relative_error_over_frames(pairs, int(self.size))
@@ -137,7 +137,7 @@ def _against(
     trajectory: Trajectory, reference: Trajectory, align: str, gap_s: float | None, stretches: list[Stretch]
 ) -> Results:
     """Every metric that the trajectories allow."""
-    from pipeline.evaluate import Alignment, absolute_error, kitti_error_on_any_course, pair
+    from scanchain.evaluation import Alignment, absolute_error, kitti_error_on_any_course, pair
 
     pairs = pair(trajectory, reference, gap_s=gap_s)
     metrics: dict[str, Callable[[], Result]] = {

@@ -7,16 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.words import FREEDOM, counted
+from scanchain.words import FREEDOM, counted
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.graph.certificate import Certificate
-    from pipeline.graph.g2o import G2oFile
-    from pipeline.graph.observability import FreePose
-    from pipeline.graph.optimisation import GraphChange, Optimisation
+    from scanchain.graph.certificate import Certificate
+    from scanchain.graph.g2o import G2oFile
+    from scanchain.graph.observability import FreePose
+    from scanchain.graph.optimisation import GraphChange, Optimisation
 
 _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
@@ -72,7 +72,7 @@ class Answer:
 
     @property
     def _free(self) -> list[str]:
-        from pipeline.graph.observability import free_text, weak_text
+        from scanchain.graph.observability import free_text, weak_text
 
         lines = [f"free           {free_text(self.free)}"] if self.free else []
         return [*lines, f"weakly joined  {weak_text(self.weak)}"] if len(self.weak) else lines
@@ -93,7 +93,7 @@ class Answer:
     @property
     def _chi2(self) -> str:
         """Of the edges in force before and after, with how many degrees of freedom."""
-        from pipeline.graph.optimisation import fit, has_loops
+        from scanchain.graph.optimisation import fit, has_loops
 
         before, after = self.change.before, self.change.after
         first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
-from pipeline.errors import InputError
-from pipeline.settings import Override
+from scanchain.errors import InputError
+from scanchain.settings import Override
 
 
 def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.settings import load_settings
-from pipeline.source import Source
-from pipeline.words import counted
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.settings import load_settings
+from scanchain.source import Source
+from scanchain.words import counted
 
 if TYPE_CHECKING:
-    from pipeline.logs.info import LogInfo
+    from scanchain.logs.info import LogInfo
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
@@ -34,7 +34,7 @@ def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_jso
       scanchain info drive.bag --topic /lidar_front/points
       scanchain info https://host/log.mcap
     """
-    from pipeline.logs.info import describe
+    from scanchain.logs.info import describe
 
     chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
     found = describe(logs, load_settings(overrides=chosen).config.log)

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from pipeline.commands.override_command import OnceCommand
-from pipeline.errors import InputError
+from scanchain.commands.override_command import OnceCommand
+from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from pipeline.landmarks.dead_reckoning import OdometryNoise
-    from pipeline.landmarks.minimise import Optimiser
-    from pipeline.landmarks.study import Guess, Study
-    from pipeline.runs.recorder import Viewing
+    from scanchain.landmarks.dead_reckoning import OdometryNoise
+    from scanchain.landmarks.minimise import Optimiser
+    from scanchain.landmarks.study import Guess, Study
+    from scanchain.runs.recorder import Viewing
 
 
 @click.command(cls=OnceCommand)
@@ -102,16 +102,16 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --optimiser dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
-    from pipeline.commands.outputs import check_output
-    from pipeline.commands.terminal import Terminal
-    from pipeline.landmarks.npz import read_landmark_data
-    from pipeline.landmarks.solvers import parse_methods
-    from pipeline.landmarks.study import Options
-    from pipeline.landmarks.study_file import study_file
-    from pipeline.landmarks.study_log import study_log
-    from pipeline.landmarks.write import text_of, tree_of
-    from pipeline.runs.compiling import telling_of_compilation
-    from pipeline.runs.directory import RunDirectory
+    from scanchain.commands.outputs import check_output
+    from scanchain.commands.terminal import Terminal
+    from scanchain.landmarks.npz import read_landmark_data
+    from scanchain.landmarks.solvers import parse_methods
+    from scanchain.landmarks.study import Options
+    from scanchain.landmarks.study_file import study_file
+    from scanchain.landmarks.study_log import study_log
+    from scanchain.landmarks.write import text_of, tree_of
+    from scanchain.runs.compiling import telling_of_compilation
+    from scanchain.runs.directory import RunDirectory
 
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
     viewing: Viewing = ctx.obj
@@ -155,7 +155,7 @@ def _check_options(ctx: click.Context, kinds: Collection[str]) -> None:
 
 def _noise(text: str | None) -> OdometryNoise | None:
     """Four positive numbers with commas; None is to be estimated."""
-    from pipeline.landmarks.dead_reckoning import OdometryNoise
+    from scanchain.landmarks.dead_reckoning import OdometryNoise
 
     if text is None:
         return None
@@ -170,7 +170,7 @@ def _noise(text: str | None) -> OdometryNoise | None:
 
 def _check_names(studies: Sequence[Study]) -> None:
     """Refuse problems whose files would overwrite each other."""
-    from pipeline.landmarks.write import file_stem
+    from scanchain.landmarks.write import file_stem
 
     stems = [file_stem(study.name) for study in studies]
     for study, stem in zip(studies, stems, strict=True):
@@ -182,8 +182,8 @@ def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree
     """The estimates, the figures, and how they came about."""
     from msgspec.structs import replace
 
-    from pipeline.landmarks.write import write_estimate
-    from pipeline.runs.provenance import describe_start
+    from scanchain.landmarks.write import write_estimate
+    from scanchain.runs.provenance import describe_start
 
     for study in studies:
         write_estimate(directory, study)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from pipeline.source import Source, source_of
+from scanchain.source import Source, source_of
 
 
 class _LogType(click.ParamType):

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from pipeline.commands.graph_answer import Answer
-from pipeline.commands.outputs import check_output
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.errors import InputError, told
-from pipeline.settings import Override, load_settings
+from scanchain.commands.graph_answer import Answer
+from scanchain.commands.outputs import check_output
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.errors import InputError, told
+from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
-    from pipeline.config import GraphConfig
-    from pipeline.graph.g2o import G2oFile, Indefinite
-    from pipeline.graph.initialise import Initialisation
-    from pipeline.runs.recorder import Viewing
+    from scanchain.config import GraphConfig
+    from scanchain.graph.g2o import G2oFile, Indefinite
+    from scanchain.graph.initialise import Initialisation
+    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
@@ -124,7 +124,7 @@ class Outputs:
     @property
     def rejected(self) -> Path | None:
         """Where the edges go that are not in force, if there are any."""
-        from pipeline.graph.g2o_write import rejected_path
+        from scanchain.graph.g2o_write import rejected_path
 
         return rejected_path(self.graph) if self.graph else None
 
@@ -132,7 +132,7 @@ class Outputs:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        from pipeline.graph.g2o_write import GRAPH_SUFFIXES
+        from scanchain.graph.g2o_write import GRAPH_SUFFIXES
 
         endings = {self.graph: GRAPH_SUFFIXES, self.picture: (".png",), self.recording: (".rrd",)}
         for path in (*self.paths, *filter(None, [self.rejected])):
@@ -140,8 +140,8 @@ class Outputs:
 
     def write(self, answer: Answer, viewing: Viewing) -> list[Path]:
         """Write them all; which those are."""
-        from pipeline.graph.covariance_table import chosen_poses, write_covariances
-        from pipeline.graph.g2o_write import write_graph
+        from scanchain.graph.covariance_table import chosen_poses, write_covariances
+        from scanchain.graph.g2o_write import write_graph
 
         file = answer.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
@@ -193,7 +193,7 @@ def _config(settings: Sequence[Override]) -> GraphConfig:
 
 def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
     """The graph, with a warning where it is not taken as it stands."""
-    from pipeline.graph.g2o import read_g2o
+    from scanchain.graph.g2o import read_g2o
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -206,7 +206,7 @@ def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
 
 def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialisation) -> Answer:
     """Optimise and certify."""
-    from pipeline.graph.optimisation import GraphChange
+    from scanchain.graph.optimisation import GraphChange
 
     before = file.graph.state()
     done = file.graph.optimise(config, initialise=initialise)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import InputError
+from scanchain.errors import InputError
 
 
 def check_output(path: Path, *, force: bool, endings: Sequence[str] = ()) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from pipeline.settings import Override
+from scanchain.settings import Override
 
 
 class OnceCommand(click.Command):
@@ -78,4 +78,4 @@ def alias(key: str, value: Any, flag: str) -> tuple[Override, ...]:
     return () if value is None else (Override(key, str(value), flag),)
 
 
-_KEY = "pipeline.commands.overrides"
+_KEY = "scanchain.commands.overrides"

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.ground_truth import ground_truth, max_gap_option
-from pipeline.commands.log_type import LOG
-from pipeline.commands.override_command import OverrideCommand, alias, overrides
-from pipeline.errors import InputError, ScanchainError
-from pipeline.settings import Override
-from pipeline.source import Source
+from scanchain.commands.ground_truth import ground_truth, max_gap_option
+from scanchain.commands.log_type import LOG
+from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.errors import InputError, ScanchainError
+from scanchain.settings import Override
+from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from pipeline.runs.recorder import SinkName, Viewing
+    from scanchain.runs.recorder import SinkName, Viewing
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look through them often costs a twentieth
@@ -91,10 +91,10 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     gc.set_threshold(_GARBAGE_EVERY)
-    from pipeline.commands.terminal import Terminal
-    from pipeline.runs.job import Job
-    from pipeline.runs.rescue import how_to_resume
-    from pipeline.runs.run import run as run_log
+    from scanchain.commands.terminal import Terminal
+    from scanchain.runs.job import Job
+    from scanchain.runs.rescue import how_to_resume
+    from scanchain.runs.run import run as run_log
 
     truth_file, truth_topic = ground_truth(gt)
     job = Job(

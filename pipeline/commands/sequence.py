@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.override_command import OnceCommand
+from scanchain.commands.override_command import OnceCommand
 
 
 @click.group()
@@ -33,7 +33,7 @@ def list_sequences(as_json: bool) -> None:
     """
     from msgspec import to_builtins
 
-    from pipeline import catalogue
+    from scanchain import catalogue
 
     entries = {name: catalogue.load(name) for name in catalogue.names()}
     if as_json:
@@ -68,8 +68,8 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
       scanchain sequence get demo-town --out logs --force
       scanchain sequence get intel
     """
-    from pipeline import catalogue
-    from pipeline.commands.terminal import Terminal
+    from scanchain import catalogue
+    from scanchain.commands.terminal import Terminal
 
     unit = "MiB" if isinstance(catalogue.load(name).source, catalogue.Download) else "scans"
     with Terminal(unit) as terminal:

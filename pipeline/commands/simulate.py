@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.override_command import OnceCommand
-from pipeline.errors import InputError
-from pipeline.words import counted
+from scanchain.commands.override_command import OnceCommand
+from scanchain.errors import InputError
+from scanchain.words import counted
 
 
 @click.command(cls=OnceCommand)
@@ -59,8 +59,8 @@ def simulate(
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
-    from pipeline.commands.terminal import Terminal
-    from pipeline.simulate import simulate as simulate_log
+    from scanchain.commands.terminal import Terminal
+    from scanchain.simulation import simulate as simulate_log
 
     with Terminal("scans") as terminal:
         truth = simulate_log(

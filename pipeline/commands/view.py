@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.outputs import check_output
-from pipeline.commands.override_command import OnceCommand
-from pipeline.errors import InputError
+from scanchain.commands.outputs import check_output
+from scanchain.commands.override_command import OnceCommand
+from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from pipeline.runs.recorder import Viewing
+    from scanchain.runs.recorder import Viewing
 
 
 @click.command(cls=OnceCommand)
@@ -37,7 +37,7 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None, force
       scanchain view runs/log --web
       scanchain view runs/log --png log.png
     """
-    from pipeline.commands.terminal import Terminal
+    from scanchain.commands.terminal import Terminal
 
     if not directory.exists():
         raise InputError(

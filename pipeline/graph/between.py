@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyse
-from pipeline.kernels import graph_between_se2, graph_between_se3, graph_scatter
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyse
+from scanchain.kernels import graph_between_se2, graph_between_se3, graph_scatter
 
 
 @dataclass(frozen=True, slots=True)

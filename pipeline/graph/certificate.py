@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.clock import working_s
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
-from pipeline.graph.minorant import Minorants, minorise
-from pipeline.graph.soundness import is_connected
-from pipeline.kernels.graph_dual import scatter_dual
-from pipeline.words import counted
+from scanchain.clock import working_s
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
+from scanchain.graph.minorant import Minorants, minorise
+from scanchain.graph.soundness import is_connected
+from scanchain.kernels.graph_dual import scatter_dual
+from scanchain.words import counted
 
 _NOTHING = 1e-9  # χ² that is zero but for rounding; this share of the largest information where that is below 1
 _SHARES = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other

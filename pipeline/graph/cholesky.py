@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spilu
 
-from pipeline.data import Matrix
-from pipeline.kernels import graph_cholesky, graph_fronts, graph_inverse, graph_scatter, graph_symbolic
+from scanchain.data import Matrix
+from scanchain.kernels import graph_cholesky, graph_fronts, graph_inverse, graph_scatter, graph_symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 

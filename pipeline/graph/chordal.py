@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import BlockPattern, SparseCholesky
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import BlockPattern, SparseCholesky
 
 
 def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
 
 
 def own_covariances(problem: BetweenProblem) -> Matrix:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.runs.whole_file import write_whole
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.whole_file import write_whole
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 

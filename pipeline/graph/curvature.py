@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem, NormalEquations
-from pipeline.graph.estimate import Estimate
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem, NormalEquations
+from scanchain.graph.estimate import Estimate
 
 _STEP = 1e-6  # m or rad, of the central differences
 

@@ -7,8 +7,8 @@ from typing import Generic, Protocol
 
 import numpy as np
 
-from pipeline.graph.steps import E, LocalModel, StepRule, Vector
-from pipeline.words import counted
+from scanchain.graph.steps import E, LocalModel, StepRule, Vector
+from scanchain.words import counted
 
 
 class Landscape(Protocol[E]):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
+from scanchain.data import Matrix
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipeline.graph.cholesky import SparseCholesky
-from pipeline.kernels.graph_fronts import Fronts
+from scanchain.graph.cholesky import SparseCholesky
+from scanchain.kernels.graph_fronts import Fronts
 
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:

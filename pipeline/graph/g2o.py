@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.graph.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
-from pipeline.graph.initialise import follow_odometry
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.soundness import nearest_semidefinite, positive_semidefinite
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.graph.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
+from scanchain.graph.initialise import follow_odometry
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.soundness import nearest_semidefinite, positive_semidefinite
 
 Indefinite = Literal["project", "refuse"]
 

@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.errors import InputError, shown
-from pipeline.graph.soundness import LARGEST
-from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
-from pipeline.words import counted
+from scanchain.data import Matrix
+from scanchain.errors import InputError, shown
+from scanchain.graph.soundness import LARGEST
+from scanchain.graph.toro import TORO_EDGES, TORO_VERTICES, from_toro
+from scanchain.words import counted
 
 VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}

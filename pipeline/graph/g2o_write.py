@@ -9,13 +9,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.graph.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
-from pipeline.runs.whole_file import write_whole
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.graph.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
+from scanchain.whole_file import write_whole
 
 TORO_SUFFIXES = (".graph", ".toro")
 GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import REJECTED_WEIGHT, Matrix
-from pipeline.graph.estimate import Estimate, Minimum
-from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import GRADUATED, RobustLoss, rejection_limit
-from pipeline.graph.soundness import is_connected
-from pipeline.graph.verdicts import Verdicts, contradictions, fair_price
+from scanchain.data import REJECTED_WEIGHT, Matrix
+from scanchain.graph.estimate import Estimate, Minimum
+from scanchain.graph.optimiser import Minimiser
+from scanchain.graph.robust import GRADUATED, RobustLoss, rejection_limit
+from scanchain.graph.soundness import is_connected
+from scanchain.graph.verdicts import Verdicts, contradictions, fair_price
 
 Judgement = Literal["graduated", "mended"]
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import SingularMatrixError
-from pipeline.graph.chordal import relax_chordally
-from pipeline.kernels.graph_tree import follow_tree
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.chordal import relax_chordally
+from scanchain.kernels.graph_tree import follow_tree
 
 Initialisation = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 

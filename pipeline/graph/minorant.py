@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
 
 _SLOPE = 0.9311  # of V(φ)⁻¹, at most, for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, in θ*², up to 1 rad

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.cholesky import SingularMatrixError
-from pipeline.graph.soundness import is_connected, listed, loose
-from pipeline.words import counted
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.soundness import is_connected, listed, loose
+from scanchain.words import counted
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # directions of the null space that are looked for

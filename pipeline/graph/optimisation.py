@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import GraphState, fit_text
-from pipeline.graph.initialise import Initialisation
-from pipeline.graph.soundness import has_loop
-from pipeline.words import counted
+from scanchain.data import GraphState, fit_text
+from scanchain.graph.initialise import Initialisation
+from scanchain.graph.soundness import has_loop
+from scanchain.words import counted
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem, NormalEquations
-from pipeline.graph.curvature import full_curvature
-from pipeline.graph.descent import descend
-from pipeline.graph.estimate import Estimate, Minimum
-from pipeline.graph.robust import RobustLoss
-from pipeline.graph.steps import Optimiser, Vector, step_rule
-from pipeline.graph.verdicts import Verdicts
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem, NormalEquations
+from scanchain.graph.curvature import full_curvature
+from scanchain.graph.descent import descend
+from scanchain.graph.estimate import Estimate, Minimum
+from scanchain.graph.robust import RobustLoss
+from scanchain.graph.steps import Optimiser, Vector, step_rule
+from scanchain.graph.verdicts import Verdicts
 
 Loss = RobustLoss | Verdicts
 

@@ -7,19 +7,19 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import checks, lie
-from pipeline.clock import working_s
-from pipeline.config import GraphConfig
-from pipeline.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
-from pipeline.errors import InputError
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.certificate import Certificate, certify
-from pipeline.graph.cholesky import SingularMatrixError
-from pipeline.graph.covariance import own_covariances, relative_covariance
-from pipeline.graph.graduation import Judgement
-from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.initialise import Initialisation
-from pipeline.graph.observability import (
+from scanchain import checks, lie
+from scanchain.clock import working_s
+from scanchain.config import GraphConfig
+from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.certificate import Certificate, certify
+from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.covariance import own_covariances, relative_covariance
+from scanchain.graph.graduation import Judgement
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.initialise import Initialisation
+from scanchain.graph.observability import (
     FreePose,
     free_poses,
     free_text,
@@ -28,10 +28,10 @@ from pipeline.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from pipeline.graph.optimisation import Optimisation
-from pipeline.graph.solve import solve
-from pipeline.graph.soundness import check_connected, check_edges, ranks
-from pipeline.words import counted
+from scanchain.graph.optimisation import Optimisation
+from scanchain.graph.solve import solve
+from scanchain.graph.soundness import check_connected, check_edges, ranks
+from scanchain.words import counted
 
 
 class PoseGraph:

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import GraphConfig
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.estimate import Minimum
-from pipeline.graph.graduation import Judgement, minimise
-from pipeline.graph.initialise import Initialisation, first_guess
-from pipeline.graph.optimiser import Minimiser
-from pipeline.graph.robust import robust_loss
+from scanchain.config import GraphConfig
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.estimate import Minimum
+from scanchain.graph.graduation import Judgement, minimise
+from scanchain.graph.initialise import Initialisation, first_guess
+from scanchain.graph.optimiser import Minimiser
+from scanchain.graph.robust import robust_loss
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.kernels.graph_soundness import judge_matrices
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.kernels.graph_soundness import judge_matrices
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits

@@ -9,7 +9,7 @@ from typing import Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.graph.cholesky import SingularMatrixError
+from scanchain.graph.cholesky import SingularMatrixError
 
 Optimiser = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
 Vector = NDArray[np.float64]

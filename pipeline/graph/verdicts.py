@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from pipeline.data import Matrix
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.covariance import difference_covariance
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.covariance import difference_covariance
 
 _MARGIN = 6.0  # over what a pessimistic noise model would allow: residuals have longer tails than the normal law
 _FEWEST = 10  # kept edges that say something about the noise model

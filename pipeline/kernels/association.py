@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.hashing import find_row, pack
-from pipeline.kernels.voxels import move
+from scanchain.kernels.hashing import find_row, pack
+from scanchain.kernels.voxels import move
 
 
 @njit(cache=True, nogil=True)

@@ -2,7 +2,7 @@
 
 from numba import njit
 
-from pipeline.kernels.voxels import move
+from scanchain.kernels.voxels import move
 
 
 @njit(cache=True, nogil=True)

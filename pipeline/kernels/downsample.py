@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.hashing import EMPTY, find, pack
-from pipeline.kernels.twist import perturb
+from scanchain.kernels.hashing import EMPTY, find, pack
+from scanchain.kernels.twist import perturb
 
 _BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
 

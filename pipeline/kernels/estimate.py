@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.descent import NEWTON
-from pipeline.kernels.residuals import normal_equations, robust_sums
-from pipeline.kernels.voxels import POINT, SHAPE, Voxels
+from scanchain.kernels.descent import NEWTON
+from scanchain.kernels.residuals import normal_equations, robust_sums
+from scanchain.kernels.voxels import POINT, SHAPE, Voxels
 
 COST, WEIGHTS, SQUARES, DAMPING = 0, 1, 2, 3
 

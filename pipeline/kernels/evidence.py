@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.descent import solve
-from pipeline.kernels.eigen import eigensystem
-from pipeline.kernels.poses import adjoint, centred
+from scanchain.kernels.descent import solve
+from scanchain.kernels.eigen import eigensystem
+from scanchain.kernels.poses import adjoint, centred
 
 WEAK = 10.0  # times the limits, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction

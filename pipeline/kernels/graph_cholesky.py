@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.graph_fronts import Blocks, Fronts
+from scanchain.kernels.graph_fronts import Blocks, Fronts
 
 _Array = NDArray[np.float64]
 _PANEL = 32  # pivots eliminated before the rest of the front is touched

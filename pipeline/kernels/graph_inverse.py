@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.graph_fronts import Blocks, Fronts
+from scanchain.kernels.graph_fronts import Blocks, Fronts
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.association import associate
-from pipeline.kernels.estimate import leave_out_points
-from pipeline.kernels.evidence import (
+from scanchain.kernels.association import associate
+from scanchain.kernels.estimate import leave_out_points
+from scanchain.kernels.evidence import (
     WEAK,
     add,
     congruent,
@@ -21,12 +21,12 @@ from pipeline.kernels.evidence import (
     spectrum_of,
     worst,
 )
-from pipeline.kernels.pose_log import twist_3d
-from pipeline.kernels.poses import adjoint, between, centred, inverse, twist_2d
-from pipeline.kernels.registration import NO_PARTNERS, align, position_of
-from pipeline.kernels.residuals import information, robust_sums
-from pipeline.kernels.signal import listen, weakest_signal
-from pipeline.kernels.trust import weigh
+from scanchain.kernels.pose_log import twist_3d
+from scanchain.kernels.poses import adjoint, between, centred, inverse, twist_2d
+from scanchain.kernels.registration import NO_PARTNERS, align, position_of
+from scanchain.kernels.residuals import information, robust_sums
+from scanchain.kernels.signal import listen, weakest_signal
+from scanchain.kernels.trust import weigh
 
 _DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 

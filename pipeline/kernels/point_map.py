@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.hashing import find, key_of
+from scanchain.kernels.hashing import find, key_of
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.ray_extents import extents_of
-from pipeline.kernels.ray_ground import hit_ground
-from pipeline.kernels.ray_solids import hit_solid
+from scanchain.kernels.ray_extents import extents_of
+from scanchain.kernels.ray_ground import hit_ground
+from scanchain.kernels.ray_solids import hit_solid
 
 SECTORS = 720  # of azimuth; a ray tests only the solids that overlap its own
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.matching import root_mean_square_range
-from pipeline.kernels.registration import CONVERGED, align
+from scanchain.kernels.matching import root_mean_square_range
+from scanchain.kernels.registration import CONVERGED, align
 
 
 @njit(cache=True, nogil=True)

@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.association import associate
-from pipeline.kernels.descent import LEVENBERG_MARQUARDT, predicted_decrease, relax, step
-from pipeline.kernels.estimate import (
+from scanchain.kernels.association import associate
+from scanchain.kernels.descent import LEVENBERG_MARQUARDT, predicted_decrease, relax, step
+from scanchain.kernels.estimate import (
     COST,
     DAMPING,
     SQUARES,
@@ -21,9 +21,9 @@ from pipeline.kernels.estimate import (
     take,
     weigh_up,
 )
-from pipeline.kernels.residuals import information
-from pipeline.kernels.trust import weigh
-from pipeline.kernels.twist import orthonormalise, perturb
+from scanchain.kernels.residuals import information
+from scanchain.kernels.trust import weigh
+from scanchain.kernels.twist import orthonormalise, perturb
 
 CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 

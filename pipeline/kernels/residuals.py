@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
+from scanchain.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
 
 
 @njit(cache=True, nogil=True)

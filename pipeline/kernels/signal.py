@@ -3,9 +3,9 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.evidence import WEAK, is_below
-from pipeline.kernels.hashing import unpack
-from pipeline.kernels.voxels import (
+from scanchain.kernels.evidence import WEAK, is_below
+from scanchain.kernels.hashing import unpack
+from scanchain.kernels.voxels import (
     ACROSS,
     BORN,
     DIRECTION,

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.graph_fronts import Fronts
+from scanchain.kernels.graph_fronts import Fronts
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

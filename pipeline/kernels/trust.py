@@ -2,7 +2,7 @@
 
 from numba import njit
 
-from pipeline.kernels.voxels import (
+from scanchain.kernels.voxels import (
     ACROSS,
     DIRECTION,
     LINE,

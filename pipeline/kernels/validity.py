@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.voxels import move
+from scanchain.kernels.voxels import move
 
 
 @njit(cache=True, nogil=True)

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeline.kernels.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
-from pipeline.kernels.hashing import find_row, key_of, pack, unpack
+from scanchain.kernels.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
+from scanchain.kernels.hashing import find_row, key_of, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8

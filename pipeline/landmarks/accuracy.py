@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix, Pose, Trajectory
-from pipeline.evaluate import Alignment, absolute_error, pair
-from pipeline.landmarks.mrclam import RangeLog
-from pipeline.landmarks.problem import LandmarkData, State
+from scanchain import lie
+from scanchain.data import Matrix, Pose, Trajectory
+from scanchain.evaluation import Alignment, absolute_error, pair
+from scanchain.landmarks.mrclam import RangeLog
+from scanchain.landmarks.problem import LandmarkData, State
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 

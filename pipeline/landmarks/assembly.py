@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.landmarks.system import Layout, Pattern
+from scanchain.data import Matrix
+from scanchain.landmarks.system import Layout, Pattern
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.kernels import landmark_factors
-from pipeline.landmarks.assembly import landmark_columns, pattern_of, pose_columns, whitening
-from pipeline.landmarks.problem import LandmarkData, State
-from pipeline.landmarks.system import Layout, LinearSystem
+from scanchain.data import Matrix
+from scanchain.kernels import landmark_factors
+from scanchain.landmarks.assembly import landmark_columns, pattern_of, pose_columns, whitening
+from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.system import Layout, LinearSystem
 
 _ANCHOR = 0.01  # noise of the first pose, in shares of a step's
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.landmarks.bearing_range import BearingRangeProblem
-from pipeline.landmarks.minimise import Optimiser, minimise
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
-from pipeline.landmarks.system import Layout, LinearSystem, Pattern
+from scanchain.landmarks.bearing_range import BearingRangeProblem
+from scanchain.landmarks.minimise import Optimiser, minimise
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
+from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
 _SLOW_S = 1.0  # what takes longer is not repeated
 

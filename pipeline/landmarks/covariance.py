@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.kernels import arrow
-from pipeline.landmarks.solvers.schur import factor_arrow
-from pipeline.landmarks.system import LinearSystem
+from scanchain.data import Matrix
+from scanchain.kernels import arrow
+from scanchain.landmarks.solvers.schur import factor_arrow
+from scanchain.landmarks.system import LinearSystem
 
 
 class Covariance:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.kernels import dead_reckoning
-from pipeline.landmarks.bearing_range import Calibration
-from pipeline.landmarks.mrclam import RangeLog
+from scanchain.data import Matrix
+from scanchain.kernels import dead_reckoning
+from scanchain.landmarks.bearing_range import Calibration
+from scanchain.landmarks.mrclam import RangeLog
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot is told to move
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible

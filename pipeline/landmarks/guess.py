@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.graph.robust import RobustLoss
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
-from pipeline.landmarks.dead_reckoning import chain
-from pipeline.landmarks.minimise import minimise
-from pipeline.landmarks.problem import LandmarkData, State
-from pipeline.landmarks.solvers import LinearSolver
+from scanchain.data import Matrix
+from scanchain.graph.robust import RobustLoss
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
+from scanchain.landmarks.dead_reckoning import chain
+from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.solvers import LinearSolver
 
 _FIRST, _GROWTH = 16, 2  # poses to begin with, and how much further each part reaches
 _STEPS = 2

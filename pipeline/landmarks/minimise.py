@@ -8,15 +8,15 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.graph.cholesky import SingularMatrixError
-from pipeline.graph.descent import descend
-from pipeline.graph.robust import RobustLoss
-from pipeline.graph.steps import step_rule
-from pipeline.kernels import normal_equations
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Linearisation
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import LinearSolver, UndeterminedError
-from pipeline.landmarks.system import LinearSystem
+from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.descent import descend
+from scanchain.graph.robust import RobustLoss
+from scanchain.graph.steps import step_rule
+from scanchain.kernels import normal_equations
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearisation
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
+from scanchain.landmarks.system import LinearSystem
 
 Optimiser = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 

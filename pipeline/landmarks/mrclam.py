@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.words import counted
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.words import counted
 
 _ROBOTS = 5  # subjects 1 to 5 are robots, the others landmarks (Leung et al. 2011)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
-from pipeline.errors import InputError
-from pipeline.landmarks.problem import Kind, LandmarkData
-from pipeline.words import counted
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.landmarks.problem import Kind, LandmarkData
+from scanchain.words import counted
 
 _SHAPES = {
     "gt_traj": "(poses, 2)",

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix
+from scanchain.data import Matrix
 
 Kind = Literal["linear", "bearing-range"]
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.landmarks.bearing_range import BearingRangeProblem, Measurements
-from pipeline.landmarks.covariance import Covariance
-from pipeline.landmarks.dead_reckoning import OWN, OdometryNoise, Reckoning, reckon
-from pipeline.landmarks.guess import from_odometry, growing
-from pipeline.landmarks.likeness import Likeness
-from pipeline.landmarks.minimise import Minimum, minimise
-from pipeline.landmarks.mrclam import RangeLog
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.solvers import LinearSolver
-from pipeline.landmarks.student import StudentLoss
-from pipeline.landmarks.variances import Consistency, consistency
+from scanchain.errors import InputError
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
+from scanchain.landmarks.covariance import Covariance
+from scanchain.landmarks.dead_reckoning import OWN, OdometryNoise, Reckoning, reckon
+from scanchain.landmarks.guess import from_odometry, growing
+from scanchain.landmarks.likeness import Likeness
+from scanchain.landmarks.minimise import Minimum, minimise
+from scanchain.landmarks.mrclam import RangeLog
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.solvers import LinearSolver
+from scanchain.landmarks.student import StudentLoss
+from scanchain.landmarks.variances import Consistency, consistency
 
 _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.clock import working_s
-from pipeline.data import Matrix
-from pipeline.landmarks.assembly import landmark_columns, pose_columns
-from pipeline.landmarks.bearing_range import BearingRangeProblem
-from pipeline.landmarks.dead_reckoning import OdometryNoise
-from pipeline.landmarks.mrclam import RangeLog
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.range_fit import LogModel, fit_log
-from pipeline.landmarks.solvers import ESTIMATOR, create_solver
-from pipeline.landmarks.student import StudentLoss
+from scanchain.clock import working_s
+from scanchain.data import Matrix
+from scanchain.landmarks.assembly import landmark_columns, pose_columns
+from scanchain.landmarks.bearing_range import BearingRangeProblem
+from scanchain.landmarks.dead_reckoning import OdometryNoise
+from scanchain.landmarks.mrclam import RangeLog
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.range_fit import LogModel, fit_log
+from scanchain.landmarks.solvers import ESTIMATOR, create_solver
+from scanchain.landmarks.student import StudentLoss
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.landmarks.assembly import (
+from scanchain.landmarks.assembly import (
     Rows,
     difference_rows,
     landmark_columns,
@@ -12,8 +12,8 @@ from pipeline.landmarks.assembly import (
     pose_columns,
     whitening,
 )
-from pipeline.landmarks.problem import LandmarkData, State
-from pipeline.landmarks.system import Layout, LinearSystem
+from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.system import Layout, LinearSystem
 
 _ANCHOR = 100.0  # times the weight of a step
 

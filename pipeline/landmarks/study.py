@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix, Pose, Trajectory
-from pipeline.landmarks.accuracy import Accuracy
-from pipeline.landmarks.compare import MethodResult
-from pipeline.landmarks.dead_reckoning import OdometryNoise
-from pipeline.landmarks.minimise import Optimiser
-from pipeline.landmarks.problem import State
+from scanchain.data import Matrix, Pose, Trajectory
+from scanchain.landmarks.accuracy import Accuracy
+from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.dead_reckoning import OdometryNoise
+from scanchain.landmarks.minimise import Optimiser
+from scanchain.landmarks.problem import State
 
 Guess = Literal["odometry", "disturbed", "origin"]
 

@@ -6,21 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.clock import working_s
-from pipeline.landmarks import guess as guesses
-from pipeline.landmarks.accuracy import of_positions
-from pipeline.landmarks.assembly import landmark_columns, pose_columns
-from pipeline.landmarks.bearing_range import BearingRangeProblem, world_referenced
-from pipeline.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
-from pipeline.landmarks.covariance import Covariance
-from pipeline.landmarks.minimise import minimise
-from pipeline.landmarks.problem import LandmarkData, State
-from pipeline.landmarks.relative_position import linear_system, state_of
-from pipeline.landmarks.solvers import create_solver, methods_for
-from pipeline.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
-from pipeline.landmarks.system import LinearSystem
-from pipeline.words import FREEDOM, counted
+from scanchain import lie
+from scanchain.clock import working_s
+from scanchain.landmarks import guess as guesses
+from scanchain.landmarks.accuracy import of_positions
+from scanchain.landmarks.assembly import landmark_columns, pose_columns
+from scanchain.landmarks.bearing_range import BearingRangeProblem, world_referenced
+from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
+from scanchain.landmarks.covariance import Covariance
+from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.relative_position import linear_system, state_of
+from scanchain.landmarks.solvers import create_solver, methods_for
+from scanchain.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
+from scanchain.landmarks.system import LinearSystem
+from scanchain.words import FREEDOM, counted
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.clock import working_s
-from pipeline.data import Trajectory
-from pipeline.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
-from pipeline.landmarks.compare import compare_linear
-from pipeline.landmarks.dead_reckoning import OWN, OWN_UNITS
-from pipeline.landmarks.mrclam import RangeLog, read_mrclam
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.range_slam import RangeSolution, solve_range_log
-from pipeline.landmarks.solvers import methods_for
-from pipeline.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
-from pipeline.words import counted
+from scanchain import lie
+from scanchain.clock import working_s
+from scanchain.data import Trajectory
+from scanchain.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
+from scanchain.landmarks.compare import compare_linear
+from scanchain.landmarks.dead_reckoning import OWN, OWN_UNITS
+from scanchain.landmarks.mrclam import RangeLog, read_mrclam
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.range_slam import RangeSolution, solve_range_log
+from scanchain.landmarks.solvers import methods_for
+from scanchain.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
+from scanchain.words import counted
 
 _DOUBTED = 0.25  # of the weight of an observation as expected
 _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data import Matrix
-from pipeline.landmarks.accuracy import Accuracy
-from pipeline.landmarks.compare import MethodResult
-from pipeline.landmarks.study import Study
-from pipeline.trajectory import write_tum
-from pipeline.words import counted
+from scanchain.data import Matrix
+from scanchain.landmarks.accuracy import Accuracy
+from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.study import Study
+from scanchain.trajectory import write_tum
+from scanchain.words import counted
 
 _HEADINGS = (
     "method",

@@ -13,7 +13,7 @@ from io import BytesIO
 import lz4.frame
 import zstandard
 
-from pipeline.logs.records import (
+from scanchain.logs.records import (
     CHANNEL,
     MESSAGE,
     MESSAGE_HEAD,
@@ -24,7 +24,7 @@ from pipeline.logs.records import (
     FileIndex,
     Message,
 )
-from pipeline.words import counted
+from scanchain.words import counted
 
 
 class DamagedBlockError(Exception):

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.words import counted
+from scanchain.words import counted
 
 
 class MalformedMessageError(Exception):

@@ -10,13 +10,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import PreprocessConfig
-from pipeline.logs.finding import Finding, Severity
-from pipeline.logs.rest import LEAST_S, Rest
-from pipeline.logs.surfaces import weakest_motion
-from pipeline.logs.survey import Survey
-from pipeline.logs.tally import most_bad_scans
-from pipeline.words import counted
+from scanchain.config import PreprocessConfig
+from scanchain.logs.finding import Finding, Severity
+from scanchain.logs.rest import LEAST_S, Rest
+from scanchain.logs.surfaces import weakest_motion
+from scanchain.logs.survey import Survey
+from scanchain.logs.tally import most_bad_scans
+from scanchain.words import counted
 
 _MANY_LOST = 0.5
 _MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use

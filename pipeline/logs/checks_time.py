@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import MatchingConfig
-from pipeline.logs.finding import Finding, Severity
-from pipeline.logs.point_times import UNITS_S
-from pipeline.logs.readers import is_scan
-from pipeline.logs.survey import Survey
-from pipeline.words import counted
+from scanchain.config import MatchingConfig
+from scanchain.logs.finding import Finding, Severity
+from scanchain.logs.point_times import UNITS_S
+from scanchain.logs.readers import is_scan
+from scanchain.logs.survey import Survey
+from scanchain.words import counted
 
 _GAP_PERIODS = 2.5
 _MOST_MISSING = 10  # scans in a row, beyond which a step of the stamps tells nothing of their jitter

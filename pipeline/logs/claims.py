@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from pipeline.logs.records import FileIndex
-from pipeline.words import counted
+from scanchain.logs.records import FileIndex
+from scanchain.words import counted
 
 
 def check_claims(index: FileIndex, chunks_told: int, private: Sequence[int]) -> None:

@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs.opening import HAS_STAMPS, index_files
-from pipeline.logs.records import FileIndex, name_of
-from pipeline.logs.selection import EVERYTHING, chosen_span, whole_span
-from pipeline.logs.stream import Decoded, decoded_messages
-from pipeline.logs.topics import find_lidar, is_lidar, topics_of
-from pipeline.logs.write import LogWriter
-from pipeline.source import Source
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs.opening import HAS_STAMPS, index_files
+from scanchain.logs.records import FileIndex, name_of
+from scanchain.logs.selection import EVERYTHING, chosen_span, whole_span
+from scanchain.logs.stream import Decoded, decoded_messages
+from scanchain.logs.topics import find_lidar, is_lidar, topics_of
+from scanchain.logs.write import LogWriter
+from scanchain.source import Source
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)

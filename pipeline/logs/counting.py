@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.blocks import DamagedBlockError, read_block
-from pipeline.logs.records import Block, FileIndex, Message
+from scanchain.logs.blocks import DamagedBlockError, read_block
+from scanchain.logs.records import Block, FileIndex, Message
 
 
 def complete(index: FileIndex) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from pipeline.config import Config, LogConfig
-from pipeline.logs.checks_scans import check_scans
-from pipeline.logs.checks_time import check_time
-from pipeline.logs.finding import Finding, Severity
-from pipeline.logs.log import Log, open_log
-from pipeline.logs.survey import survey
-from pipeline.logs.topics import other_sensors
-from pipeline.source import Source
+from scanchain.config import Config, LogConfig
+from scanchain.logs.checks_scans import check_scans
+from scanchain.logs.checks_time import check_time
+from scanchain.logs.finding import Finding, Severity
+from scanchain.logs.log import Log, open_log
+from scanchain.logs.survey import survey
+from scanchain.logs.topics import other_sensors
+from scanchain.source import Source
 
 _ORDER = tuple(reversed(Severity))
 

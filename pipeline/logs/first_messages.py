@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.counting import messages_of
-from pipeline.logs.records import Block, FileIndex
-from pipeline.logs.selection import EVERYTHING, Span
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.counting import messages_of
+from scanchain.logs.records import Block, FileIndex
+from scanchain.logs.selection import EVERYTHING, Span
 
 T = TypeVar("T")
 

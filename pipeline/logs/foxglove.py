@@ -10,11 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
-from pipeline.data import Pose
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.laser_scan import LaserScanMessage
-from pipeline.logs.point_cloud import PointCloudMessage, PointField
-from pipeline.logs.poses import StampedPose, pose_matrix
+from scanchain.data import Pose
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.laser_scan import LaserScanMessage
+from scanchain.logs.point_cloud import PointCloudMessage, PointField
+from scanchain.logs.poses import StampedPose, pose_matrix
 
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 

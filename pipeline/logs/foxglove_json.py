@@ -8,7 +8,7 @@ from typing import TypeVar
 import msgspec
 from msgspec import Struct, field
 
-from pipeline.logs.cdr import MalformedMessageError
+from scanchain.logs.cdr import MalformedMessageError
 
 T = TypeVar("T")
 

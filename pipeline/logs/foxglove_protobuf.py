@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.records import Channel
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.records import Channel
 
 
 def parser(channel: Channel) -> Callable[[memoryview], Any]:

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Pose
-from pipeline.logs.first_messages import first_messages
-from pipeline.logs.mounting import in_plane, root_frame, static_transforms
-from pipeline.logs.poses import StampedPose, chain
-from pipeline.logs.readers import cloud_reader, is_scan, scan_reader
+from scanchain import lie
+from scanchain.data import Pose
+from scanchain.logs.first_messages import first_messages
+from scanchain.logs.mounting import in_plane, root_frame, static_transforms
+from scanchain.logs.poses import StampedPose, chain
+from scanchain.logs.readers import cloud_reader, is_scan, scan_reader
 
 if TYPE_CHECKING:
-    from pipeline.logs.log import Log
+    from scanchain.logs.log import Log
 
 
 class MovingFrame(NamedTuple):

@@ -10,11 +10,11 @@ from __future__ import annotations
 import mmap
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.logs.records import MAGIC, FileIndex
-from pipeline.logs.resync import Resync, is_end, record_end, vouches_for_itself
-from pipeline.logs.walk import Walk
-from pipeline.source import Source
+from scanchain.errors import InputError
+from scanchain.logs.records import MAGIC, FileIndex
+from scanchain.logs.resync import Resync, is_end, record_end, vouches_for_itself
+from scanchain.logs.walk import Walk
+from scanchain.source import Source
 
 
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:

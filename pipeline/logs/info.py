@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs.counting import times_of
-from pipeline.logs.log import Log
-from pipeline.logs.opening import index_files
-from pipeline.logs.readers import kind
-from pipeline.logs.records import FileIndex
-from pipeline.logs.selection import whole_span
-from pipeline.logs.sizes import size_of
-from pipeline.logs.topics import OtherSensor, other_sensors, topics_of
-from pipeline.source import Source
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs.counting import times_of
+from scanchain.logs.log import Log
+from scanchain.logs.opening import index_files
+from scanchain.logs.readers import kind
+from scanchain.logs.records import FileIndex
+from scanchain.logs.selection import whole_span
+from scanchain.logs.sizes import size_of
+from scanchain.logs.topics import OtherSensor, other_sensors, topics_of
+from scanchain.source import Source
 
 
 @dataclass(frozen=True, slots=True)

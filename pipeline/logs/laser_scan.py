@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Pose
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.data import Pose
+from scanchain.logs.cdr import CdrReader, MalformedMessageError
+from scanchain.logs.limits import NO_TIMES, RangeLimits, Returns, moved
 
 _MOST_GEOMETRIES = 16
 _NEAREST_M = float(np.finfo(np.float32).tiny)

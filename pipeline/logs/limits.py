@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import PreprocessConfig
-from pipeline.data import Pose, RawPoints
-from pipeline.words import counted
+from scanchain.config import PreprocessConfig
+from scanchain.data import Pose, RawPoints
+from scanchain.words import counted
 
 
 class RangeLimits(NamedTuple):

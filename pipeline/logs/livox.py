@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.point_cloud import PointCloudMessage, PointField
+from scanchain.logs.cdr import CdrReader, MalformedMessageError
+from scanchain.logs.point_cloud import PointCloudMessage, PointField
 
 _POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
 _FIELDS = [

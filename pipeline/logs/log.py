@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.checks import LONGEST_SWEEP_S, instance
-from pipeline.clock import working_s
-from pipeline.config import LogConfig, PreprocessConfig
-from pipeline.data import Pose, Scan, Trajectory
-from pipeline.errors import InputError, shown
-from pipeline.logs.first_messages import first_messages
-from pipeline.logs.laser_scan import LaserScanDecoder
-from pipeline.logs.limits import RangeLimits, Returns, none_retained
-from pipeline.logs.mounting import (
+from scanchain import lie
+from scanchain.checks import LONGEST_SWEEP_S, instance
+from scanchain.clock import working_s
+from scanchain.config import LogConfig, PreprocessConfig
+from scanchain.data import Pose, Scan, Trajectory
+from scanchain.errors import InputError, shown
+from scanchain.logs.first_messages import first_messages
+from scanchain.logs.laser_scan import LaserScanDecoder
+from scanchain.logs.limits import RangeLimits, Returns, none_retained
+from scanchain.logs.mounting import (
     find_mounting,
     in_plane,
     is_moved,
@@ -27,19 +27,19 @@ from pipeline.logs.mounting import (
     joint_topics,
     leaves_plane,
 )
-from pipeline.logs.opening import HAS_STAMPS, index_files
-from pipeline.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
-from pipeline.logs.point_times import PointTimes
-from pipeline.logs.poses import StampedPose
-from pipeline.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
-from pipeline.logs.records import FileIndex, name_of
-from pipeline.logs.selection import chosen_span, count_scans, whole_span
-from pipeline.logs.stream import Decoded, Decoders, decoded_messages
-from pipeline.logs.tally import Tally, most_bad_scans
-from pipeline.logs.told_poses import Beside, ToldPoses
-from pipeline.logs.topics import find_ground_truth, find_lidar, find_odometry
-from pipeline.source import Source, source_of
-from pipeline.words import counted
+from scanchain.logs.opening import HAS_STAMPS, index_files
+from scanchain.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
+from scanchain.logs.point_times import PointTimes
+from scanchain.logs.poses import StampedPose
+from scanchain.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
+from scanchain.logs.records import FileIndex, name_of
+from scanchain.logs.selection import chosen_span, count_scans, whole_span
+from scanchain.logs.stream import Decoded, Decoders, decoded_messages
+from scanchain.logs.tally import Tally, most_bad_scans
+from scanchain.logs.told_poses import Beside, ToldPoses
+from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.source import Source, source_of
+from scanchain.words import counted
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it

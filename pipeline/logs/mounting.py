@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Matrix, Pose
-from pipeline.logs.first_messages import first_messages, spread_messages
-from pipeline.logs.poses import StampedPose, chain, frames_between
-from pipeline.logs.readers import (
+from scanchain import lie
+from scanchain.data import Matrix, Pose
+from scanchain.logs.first_messages import first_messages, spread_messages
+from scanchain.logs.poses import StampedPose, chain, frames_between
+from scanchain.logs.readers import (
     cloud_reader,
     has_transforms,
     is_odometry,
@@ -22,9 +22,9 @@ from pipeline.logs.readers import (
     scan_reader,
     transforms_reader,
 )
-from pipeline.logs.records import Channel, FileIndex
-from pipeline.logs.selection import Span
-from pipeline.logs.topics import topics_of
+from scanchain.logs.records import Channel, FileIndex
+from scanchain.logs.selection import Span
+from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still

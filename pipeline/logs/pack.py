@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix, Pose
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # stamps of ROS end there
 _FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField

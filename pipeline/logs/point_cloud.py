@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Pose
-from pipeline.kernels.point_cloud import keep_valid
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
-from pipeline.logs.limits import NO_TIMES, RangeLimits, Returns, moved
-from pipeline.logs.point_times import NAMES, PointTimes
+from scanchain.data import Pose
+from scanchain.kernels.point_cloud import keep_valid
+from scanchain.logs.cdr import CdrReader, MalformedMessageError
+from scanchain.logs.limits import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.point_times import NAMES, PointTimes
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import LogConfig
-from pipeline.data import RawPoints
-from pipeline.logs.limits import NO_TIMES
+from scanchain.config import LogConfig
+from scanchain.data import RawPoints
+from scanchain.logs.limits import NO_TIMES
 
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Pose
-from pipeline.logs.cdr import CdrReader, MalformedMessageError
+from scanchain import lie
+from scanchain.data import Pose
+from scanchain.logs.cdr import CdrReader, MalformedMessageError
 
 _MOST_TRANSFORMS = 65536
 

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from pipeline.logs import foxglove, foxglove_json, foxglove_protobuf
-from pipeline.logs.cdr import CdrReader
-from pipeline.logs.laser_scan import LaserScanMessage, read_laser_scan, read_multi_echo_scan
-from pipeline.logs.livox import read_livox
-from pipeline.logs.point_cloud import PointCloudMessage, read_point_cloud
-from pipeline.logs.poses import StampedPose, decode_odometry, decode_pose, decode_transforms
-from pipeline.logs.records import Channel
-from pipeline.logs.ros1 import Ros1Reader
+from scanchain.logs import foxglove, foxglove_json, foxglove_protobuf
+from scanchain.logs.cdr import CdrReader
+from scanchain.logs.laser_scan import LaserScanMessage, read_laser_scan, read_multi_echo_scan
+from scanchain.logs.livox import read_livox
+from scanchain.logs.point_cloud import PointCloudMessage, read_point_cloud
+from scanchain.logs.poses import StampedPose, decode_odometry, decode_pose, decode_transforms
+from scanchain.logs.records import Channel
+from scanchain.logs.ros1 import Ros1Reader
 
 Read = Callable[..., Any]
 _Bind = Callable[[Channel], Read]  # the reader of one channel

@@ -7,8 +7,8 @@ from functools import cached_property
 from time import sleep
 from typing import Any, TypeVar
 
-from pipeline.errors import InputError, MissingExtraError
-from pipeline.source import Address
+from scanchain.errors import InputError, MissingExtraError
+from scanchain.source import Address
 
 T = TypeVar("T")
 

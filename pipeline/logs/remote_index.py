@@ -11,8 +11,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 
-from pipeline.logs.read_ahead import ReadAhead
-from pipeline.logs.records import (
+from scanchain.logs.read_ahead import ReadAhead
+from scanchain.logs.records import (
     CHANNEL,
     CHUNK_INDEX,
     FOOTER,
@@ -25,8 +25,8 @@ from pipeline.logs.records import (
     FileIndex,
     read_string,
 )
-from pipeline.logs.remote import RemoteFile
-from pipeline.logs.walk import FOOTER_BODY, is_believable
+from scanchain.logs.remote import RemoteFile
+from scanchain.logs.walk import FOOTER_BODY, is_believable
 
 _TAIL_BYTES = 65_536  # read at first; most summaries lie in it
 _FOOTER_BYTES = RECORD.size + FOOTER_BODY.size

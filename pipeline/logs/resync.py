@@ -8,7 +8,7 @@ from collections.abc import Set as AbstractSet
 
 import numpy as np
 
-from pipeline.logs.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, SCHEMA
+from scanchain.logs.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, SCHEMA
 
 PRIVATE = 0x80  # opcodes from here on are those of applications
 CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC-32

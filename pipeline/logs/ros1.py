@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from functools import cache
 
-from pipeline.logs.cdr import CdrReader
+from scanchain.logs.cdr import CdrReader
 
 _ORDER = "<"
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import RawPoints
-from pipeline.logs.laser_scan import LaserScanDecoder, LaserScanMessage
-from pipeline.logs.limits import Returns
-from pipeline.logs.point_cloud import PointCloudDecoder, PointCloudMessage, column
+from scanchain.data import RawPoints
+from scanchain.logs.laser_scan import LaserScanDecoder, LaserScanMessage
+from scanchain.logs.limits import Returns
+from scanchain.logs.point_cloud import PointCloudDecoder, PointCloudMessage, column
 
 RING_FIELDS = ("ring", "line", "channel")
 _AZIMUTHS, _ELEVATIONS = 72, 64  # cells of an outline

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config import LogConfig
-from pipeline.errors import InputError
-from pipeline.logs.counting import log_times
-from pipeline.logs.records import Block, FileIndex, name_of
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs.counting import log_times
+from scanchain.logs.records import Block, FileIndex, name_of
 
 
 class Span(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pipeline.logs.remote import RemoteFile
-from pipeline.source import Source
+from scanchain.logs.remote import RemoteFile
+from scanchain.source import Source
 
 
 def files_of(path: Path) -> list[Path]:

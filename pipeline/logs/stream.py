@@ -9,10 +9,10 @@ from heapq import heappop, heappush
 from itertools import pairwise
 from typing import NamedTuple
 
-from pipeline.logs.blocks import DamagedBlockError, read_block, release
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.records import Block, Channel, FileIndex
-from pipeline.logs.selection import Span
+from scanchain.logs.blocks import DamagedBlockError, read_block, release
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.records import Block, Channel, FileIndex
+from scanchain.logs.selection import Span
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
 

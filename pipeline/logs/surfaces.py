@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config import PreprocessConfig
-from pipeline.data import Points, RawPoints
+from scanchain.config import PreprocessConfig
+from scanchain.data import Points, RawPoints
 
 _VOXEL_M = 0.5  # at most one point in each, in 3D: else the ground near the lidar outweighs all else
 _POINTS = 1500  # whose normals are estimated, at most

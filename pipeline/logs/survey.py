@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import RawPoints
-from pipeline.errors import InputError
-from pipeline.logs.cdr import MalformedMessageError
-from pipeline.logs.log import Log
-from pipeline.logs.point_times import PointTimes
-from pipeline.logs.poses import StampedPose
-from pipeline.logs.readers import is_scan
-from pipeline.logs.rest import Rest, RestWatch
-from pipeline.logs.scan_facts import ScanFacts, facts_of
-from pipeline.logs.selection import whole_span
-from pipeline.logs.stream import decoded_messages
+from scanchain.data import RawPoints
+from scanchain.errors import InputError
+from scanchain.logs.cdr import MalformedMessageError
+from scanchain.logs.log import Log
+from scanchain.logs.point_times import PointTimes
+from scanchain.logs.poses import StampedPose
+from scanchain.logs.readers import is_scan
+from scanchain.logs.rest import Rest, RestWatch
+from scanchain.logs.scan_facts import ScanFacts, facts_of
+from scanchain.logs.selection import whole_span
+from scanchain.logs.stream import decoded_messages
 
 _FORGOTTEN = np.empty(0)
 _NO_POINTS = np.empty((0, 2), np.float32)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from pipeline.config import LogConfig
-from pipeline.data import Scan
-from pipeline.words import counted
+from scanchain.config import LogConfig
+from scanchain.data import Scan
+from scanchain.words import counted
 
 
 def most_bad_scans(scans: int, config: LogConfig) -> float:

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.data import Pose, Trajectory
-from pipeline.logs.limits import Returns
-from pipeline.logs.mounting import Mounting, edge
-from pipeline.logs.poses import StampedPose
-from pipeline.logs.stream import Decoded
-from pipeline.logs.wheels import WheelTrack
-from pipeline.words import counted
+from scanchain.data import Pose, Trajectory
+from scanchain.logs.limits import Returns
+from scanchain.logs.mounting import Mounting, edge
+from scanchain.logs.poses import StampedPose
+from scanchain.logs.stream import Decoded
+from scanchain.logs.wheels import WheelTrack
+from scanchain.words import counted
 
 
 class Beside(NamedTuple):

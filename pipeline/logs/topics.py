@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from pipeline.errors import InputError
-from pipeline.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
-from pipeline.logs.records import Channel, FileIndex, name_of
-from pipeline.words import counted
+from scanchain.errors import InputError
+from scanchain.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
+from scanchain.logs.records import Channel, FileIndex, name_of
+from scanchain.words import counted
 
 _MOST_LISTED = 8
 _IMU = ("sensor_msgs/Imu",)

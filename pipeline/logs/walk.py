@@ -6,8 +6,8 @@ import struct
 import zlib
 from dataclasses import replace
 
-from pipeline.logs.claims import check_claims
-from pipeline.logs.records import (
+from scanchain.logs.claims import check_claims
+from scanchain.logs.records import (
     CHANNEL,
     CHUNK,
     DATA_END,
@@ -25,7 +25,7 @@ from pipeline.logs.records import (
     FileIndex,
     read_string,
 )
-from pipeline.logs.resync import CHUNK_HEAD, PRIVATE, is_end
+from scanchain.logs.resync import CHUNK_HEAD, PRIVATE, is_end
 
 FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
 

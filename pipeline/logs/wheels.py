@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 
-from pipeline import lie
-from pipeline.data import Pose
+from scanchain import lie
+from scanchain.data import Pose
 
 _REMEMBERED = 512  # readings
 _NEAREST_NS = 500_000_000

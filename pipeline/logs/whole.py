@@ -7,9 +7,9 @@ import shutil
 from pathlib import Path
 from tempfile import mkdtemp
 
-from pipeline.download import fetch
-from pipeline.errors import InputError
-from pipeline.logs.remote import RemoteFile
+from scanchain.download import fetch
+from scanchain.errors import InputError
+from scanchain.logs.remote import RemoteFile
 
 _PIECE_BYTES = 8_000_000
 

@@ -11,11 +11,11 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from pipeline.data import Matrix, Pose
-from pipeline.errors import InputError
-from pipeline.logs.pack import Link, pack_cloud, pack_laser_scan, pack_odometry, pack_transforms, place
-from pipeline.logs.records import Channel
-from pipeline.logs.ros2_definitions import schema_text
+from scanchain.data import Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.logs.pack import Link, pack_cloud, pack_laser_scan, pack_odometry, pack_transforms, place
+from scanchain.logs.records import Channel
+from scanchain.logs.ros2_definitions import schema_text
 
 CHUNK_BYTES = 4 * 1024 * 1024
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Points, Pose
-from pipeline.kernels.free_space import compare_ranges, nearest_ranges
-from pipeline.loops.local_map import LocalMap
+from scanchain import lie
+from scanchain.data import Points, Pose
+from scanchain.kernels.free_space import compare_ranges, nearest_ranges
+from scanchain.loops.local_map import LocalMap
 
 _VIEWS = 8  # of each map that are held against the other
 _BINS = (90, 180)  # of elevation and azimuth: 2°

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.loops.near_closer import NearCloser
-from pipeline.loops.pieces import Pieces
+from scanchain import lie
+from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.near_closer import NearCloser
+from scanchain.loops.pieces import Pieces
 
 _FIRST_M = 3.0  # of the way in a new piece, before it is sought
 _PATIENCE = 0.2  # of the way since then, between two searches: one in a place that is new costs less and less

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.config import Config
-from pipeline.data import Closure, Keyframe
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.loops.anywhere_closer import AnywhereCloser
-from pipeline.loops.near_closer import NearCloser
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.place_closer import PlaceCloser
+from scanchain.config import Config
+from scanchain.data import Closure, Keyframe
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.anywhere_closer import AnywhereCloser
+from scanchain.loops.near_closer import NearCloser
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.place_closer import PlaceCloser
 
 
 class LoopCloser:

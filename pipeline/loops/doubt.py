@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.kernels.shortest_ways import shortest_ways
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.shortest_ways import shortest_ways
 
 _CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two places
 _LOOP_M = 1e-3  # length of such an edge

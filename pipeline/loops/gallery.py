@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pipeline.data import Matrix
-from pipeline.loops.place import Place
+from scanchain.data import Matrix
+from scanchain.loops.place import Place
 
 _GROWTH = 1.25  # of the number of places, before the tree is built anew
 _SLACK = 16  # places that may wait outside the tree in any case

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Keyframe, Points, Pose
-from pipeline.loops.pieces import Pieces
+from scanchain import lie
+from scanchain.data import Keyframe, Points, Pose
+from scanchain.loops.pieces import Pieces
 
 FUTURE = 1.0  # radii of the way after the anchor
 PAST = 2.0  # and before it: a lidar that looks ahead sees a place from far off

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Match, Pose, Proposal, Verdict
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.loops.doubt import Doubt
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.planar_search import PlanarSearch
-from pipeline.loops.submaps import Submaps
-from pipeline.loops.verification import overlap as overlap_of
-from pipeline.matching import PointToShapeMatcher
-from pipeline.preprocess import downsample
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Closure, Keyframe, Match, Pose, Proposal, Verdict
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.doubt import Doubt
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.planar_search import PlanarSearch
+from scanchain.loops.submaps import Submaps
+from scanchain.loops.verification import overlap as overlap_of
+from scanchain.matching import PointToShapeMatcher
+from scanchain.preprocess import downsample
 
 _SURE_OVERLAP = 0.8  # asked of a match for which nothing else speaks
 

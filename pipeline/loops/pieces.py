@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.graph.pose_graph import PoseGraph
+from scanchain.graph.pose_graph import PoseGraph
 
 _CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two pieces
 

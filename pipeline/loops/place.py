@@ -9,10 +9,10 @@ from numpy import fft
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter, map_coordinates
 
-from pipeline import lie
-from pipeline.data import Pose
-from pipeline.kernels.place import count_heights, mark_heights
-from pipeline.loops.local_map import LocalMap
+from scanchain import lie
+from scanchain.data import Pose
+from scanchain.kernels.place import count_heights, mark_heights
+from scanchain.loops.local_map import LocalMap
 
 SIZE = 128  # cells along each side of a view
 _ANGLES = 64  # steps of half a turn

@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import Config
-from pipeline.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
-from pipeline.loops.local_map import FUTURE, PAST, LocalMap, local_map
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.place import describe
-from pipeline.loops.recognition import Candidate, Recognition
-from pipeline.loops.upright import level_frame
-from pipeline.loops.verification import Measurement, Verifier
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
+from scanchain.loops.local_map import FUTURE, PAST, LocalMap, local_map
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.place import describe
+from scanchain.loops.recognition import Candidate, Recognition
+from scanchain.loops.upright import level_frame
+from scanchain.loops.verification import Measurement, Verifier
 
 _SPACING = 1.0 / 3.0  # radii of the way between two places
 

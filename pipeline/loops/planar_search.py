@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Keyframe, Matrix, Points, Pose
-from pipeline.loops.submaps import Submaps
-from pipeline.matching import CorrelativeMap, Seed, VoxelMap
+from scanchain import lie
+from scanchain.data import Keyframe, Matrix, Points, Pose
+from scanchain.loops.submaps import Submaps
+from scanchain.matching import CorrelativeMap, Seed, VoxelMap
 
 _BASIN_M = 0.5  # of doubt, up to which matching needs no search
 _SHARE_OF_DOUBT = 0.2  # that is travelled between two searches: wide windows cost most and run out last

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.config import LoopsConfig
-from pipeline.data import Keyframe, Matrix, Pose, Proposal
-from pipeline.loops.gallery import Gallery
-from pipeline.loops.place import Likeness, Place, compare
+from scanchain import lie
+from scanchain.config import LoopsConfig
+from scanchain.data import Keyframe, Matrix, Pose, Proposal
+from scanchain.loops.gallery import Gallery
+from scanchain.loops.place import Likeness, Place, compare
 
 _CANDIDATES = 10  # compared in full, of the places whose keys are alike
 _NEAREST = 3  # compared in full, of those near to where odometry has the place

@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import Config, MatchingConfig
-from pipeline.data import Keyframe, Matrix, Points
-from pipeline.kernels.refinement import refine
-from pipeline.matching import VoxelMap
-from pipeline.matching.matcher import terms_of
-from pipeline.point_store import PointStore
+from scanchain import lie
+from scanchain.config import Config, MatchingConfig
+from scanchain.data import Keyframe, Matrix, Points
+from scanchain.kernels.refinement import refine
+from scanchain.matching import VoxelMap
+from scanchain.matching.matcher import terms_of
+from scanchain.point_store import PointStore
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
 _THREADS = 2

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix
+from scanchain import lie
+from scanchain.data import Matrix
 
 
 def spread(T_world_keyframes: Matrix, numbers: NDArray[np.int64], odometry: Matrix) -> Matrix:

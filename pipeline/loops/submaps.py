@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig
-from pipeline.data import Keyframe
-from pipeline.loops.pieces import Pieces
-from pipeline.matching import VoxelMap
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.data import Keyframe
+from scanchain.loops.pieces import Pieces
+from scanchain.matching import VoxelMap
 
 _HELD = 64  # submaps in memory; the one unused for longest goes first
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import LocalMapConfig
-from pipeline.data import Keyframe, Pose
-from pipeline.kernels.voxels import DIRECTION, PLANE, SHAPE
-from pipeline.matching import VoxelMap
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.data import Keyframe, Pose
+from scanchain.kernels.voxels import DIRECTION, PLANE, SHAPE
+from scanchain.matching import VoxelMap
 
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
 _ENOUGH = 10  # voxels with such a normal

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.config import Config
-from pipeline.data import Match, Points, Pose
-from pipeline.kernels.association import associate
-from pipeline.loops.agreement import free_space_agreement
-from pipeline.loops.local_map import LocalMap
-from pipeline.matching import PointToShapeMatcher, VoxelMap
-from pipeline.preprocess import downsample
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Match, Points, Pose
+from scanchain.kernels.association import associate
+from scanchain.loops.agreement import free_space_agreement
+from scanchain.loops.local_map import LocalMap
+from scanchain.matching import PointToShapeMatcher, VoxelMap
+from scanchain.preprocess import downsample
 
 _COARSE = 2.0  # times the usual voxels, for the first alignment
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data import Points
+from scanchain.data import Points
 
 _SCALE_M = 0.001  # LAZ holds whole multiples of it
 

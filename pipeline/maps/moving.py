@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Points, Pose
-from pipeline.kernels.free_space import nearest_ranges, weigh_points
+from scanchain import lie
+from scanchain.data import Points, Pose
+from scanchain.kernels.free_space import nearest_ranges, weigh_points
 
 _THREADS = 2
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import MapsConfig
-from pipeline.data import Matrix, Pose
-from pipeline.errors import InputError
-from pipeline.kernels import ray_grid
+from scanchain.config import MapsConfig
+from scanchain.data import Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.kernels import ray_grid
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown

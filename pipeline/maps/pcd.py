@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.data import Points
-from pipeline.maps.ply import as_rows
+from scanchain.data import Points
+from scanchain.maps.ply import as_rows
 
 _HEADER = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7

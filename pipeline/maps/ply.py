@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Points
-from pipeline.errors import InputError
+from scanchain.data import Points
+from scanchain.errors import InputError
 
 _HEADER = """ply
 format binary_little_endian 1.0

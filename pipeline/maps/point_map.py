@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Points, Pose
-from pipeline.errors import InputError
-from pipeline.kernels import point_map as kernels
-from pipeline.kernels.hashing import EMPTY
+from scanchain.data import Points, Pose
+from scanchain.errors import InputError
+from scanchain.kernels import point_map as kernels
+from scanchain.kernels.hashing import EMPTY
 
 MAX_VOXELS = 16_000_000  # a gigabyte
 _FIRST_VOXELS = 1 << 14

@@ -2,14 +2,14 @@
 
 from typing import Protocol
 
-from pipeline import checks
-from pipeline.config import MatchingConfig
-from pipeline.data import Match, Points, Pose, Prior
-from pipeline.matching.correlative import CorrelativeMap, Seed
-from pipeline.matching.matcher import PointToShapeMatcher
-from pipeline.matching.svd import DegeneratePairsError, rigid_transform
-from pipeline.matching.svd_icp import SvdMatcher
-from pipeline.matching.voxel_map import VoxelMap
+from scanchain import checks
+from scanchain.config import MatchingConfig
+from scanchain.data import Match, Points, Pose, Prior
+from scanchain.matching.correlative import CorrelativeMap, Seed
+from scanchain.matching.matcher import PointToShapeMatcher
+from scanchain.matching.svd import DegeneratePairsError, rigid_transform
+from scanchain.matching.svd_icp import SvdMatcher
+from scanchain.matching.voxel_map import VoxelMap
 
 __all__ = [
     "CorrelativeMap",

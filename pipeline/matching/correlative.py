@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Points, Pose
-from pipeline.kernels.branch_and_bound import draw_hits, fill_pyramid, search
-from pipeline.matching.voxel_map import VoxelMap
-from pipeline.preprocess.sweep import downsample
+from scanchain import lie
+from scanchain.data import Points, Pose
+from scanchain.kernels.branch_and_bound import draw_hits, fill_pyramid, search
+from scanchain.matching.voxel_map import VoxelMap
+from scanchain.preprocess.sweep import downsample
 
 _POINTS = 120  # of the scan that are scored, one a voxel, evenly spread
 _TOP = 5  # levels of the pyramid above the grid itself; windows start with 2⁵ cells

@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from pipeline import checks, lie
-from pipeline.config import MatchingConfig
-from pipeline.data import LEAST_FIT, Match, Points, Pose, Prior
-from pipeline.kernels import registration
-from pipeline.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
-from pipeline.kernels.estimate import Terms
-from pipeline.kernels.matching import Answer, Expectation, match
-from pipeline.kernels.validity import largest_magnitude
-from pipeline.matching.voxel_map import VoxelMap
-from pipeline.words import counted
+from scanchain import checks, lie
+from scanchain.config import MatchingConfig
+from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior
+from scanchain.kernels import registration
+from scanchain.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
+from scanchain.kernels.estimate import Terms
+from scanchain.kernels.matching import Answer, Expectation, match
+from scanchain.kernels.validity import largest_magnitude
+from scanchain.matching.voxel_map import VoxelMap
+from scanchain.words import counted
 
 OPTIMISERS = {
     "gradient-descent": GRADIENT_DESCENT,

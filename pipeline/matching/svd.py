@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import checks
-from pipeline.data import Points, Pose
-from pipeline.errors import InputError, ScanchainError
-from pipeline.words import counted
+from scanchain import checks
+from scanchain.data import Points, Pose
+from scanchain.errors import InputError, ScanchainError
+from scanchain.words import counted
 
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
 _ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import MatchingConfig
-from pipeline.data import Match, Points, Pose, Prior
-from pipeline.kernels import registration
-from pipeline.kernels.association import associate
-from pipeline.kernels.cross_covariance import weighted_pairs
-from pipeline.kernels.matching import judge
-from pipeline.kernels.registration import SHRINK, Outcome
-from pipeline.matching.matcher import aligned, match_of, terms_of
-from pipeline.matching.svd import DegeneratePairsError, rigid_transform
-from pipeline.matching.voxel_map import VoxelMap
+from scanchain import lie
+from scanchain.config import MatchingConfig
+from scanchain.data import Match, Points, Pose, Prior
+from scanchain.kernels import registration
+from scanchain.kernels.association import associate
+from scanchain.kernels.cross_covariance import weighted_pairs
+from scanchain.kernels.matching import judge
+from scanchain.kernels.registration import SHRINK, Outcome
+from scanchain.matching.matcher import aligned, match_of, terms_of
+from scanchain.matching.svd import DegeneratePairsError, rigid_transform
+from scanchain.matching.voxel_map import VoxelMap
 
 
 class SvdMatcher:

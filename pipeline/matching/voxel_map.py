@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline import checks, lie
-from pipeline.config import LocalMapConfig
-from pipeline.data import Points, Pose
-from pipeline.kernels.voxels import CELL, Voxels, insert, keep
+from scanchain import checks, lie
+from scanchain.config import LocalMapConfig
+from scanchain.data import Points, Pose
+from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting

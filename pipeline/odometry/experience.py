@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
+from scanchain import lie
 
 _MEMORY = 0.9  # of the squared errors, per scan
 _SUDDEN = 0.25  # share of the last squared error that counts at once

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.config import Config
-from pipeline.data import Points, Pose, Scan, State
-from pipeline.odometry.odometry import Odometry
-from pipeline.odometry.tracked import Tracked
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Points, Pose, Scan, State
+from scanchain.odometry.odometry import Odometry
+from scanchain.odometry.tracked import Tracked
 
 
 @dataclass(frozen=True, slots=True)

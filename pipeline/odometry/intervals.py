@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.data import Scan
+from scanchain.data import Scan
 
 _GAP = 5.0  # times the usual interval, from which on scans are missing
 _ALIKE = 1.4  # ratio up to which two intervals agree

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix, Pose
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 
 
 class MotionFilter:

@@ -8,17 +8,17 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import checks, lie
-from pipeline.clock import working_s
-from pipeline.config import Config
-from pipeline.data import Match, Points, Pose, Scan, State
-from pipeline.errors import InputError
-from pipeline.kernels.validity import largest_magnitude
-from pipeline.matching import CorrelativeMap, VoxelMap, create_matcher
-from pipeline.odometry.prediction import Prediction, Predictor
-from pipeline.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
-from pipeline.preprocess import Resolution, Sweep
-from pipeline.settings import check_order
+from scanchain import checks, lie
+from scanchain.clock import working_s
+from scanchain.config import Config
+from scanchain.data import Match, Points, Pose, Scan, State
+from scanchain.errors import InputError
+from scanchain.kernels.validity import largest_magnitude
+from scanchain.matching import CorrelativeMap, VoxelMap, create_matcher
+from scanchain.odometry.prediction import Prediction, Predictor
+from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
+from scanchain.preprocess import Resolution, Sweep
+from scanchain.settings import check_order
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction

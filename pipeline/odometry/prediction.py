@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import OdometryConfig
-from pipeline.data import Match, Matrix, Pose, Prior, Scan, State
-from pipeline.errors import InputError
-from pipeline.kernels.evidence import definite_inverse
-from pipeline.odometry.experience import Experience
-from pipeline.odometry.intervals import Intervals
-from pipeline.odometry.motion_filter import MotionFilter
+from scanchain import lie
+from scanchain.config import OdometryConfig
+from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
+from scanchain.errors import InputError
+from scanchain.kernels.evidence import definite_inverse
+from scanchain.odometry.experience import Experience
+from scanchain.odometry.intervals import Intervals
+from scanchain.odometry.motion_filter import MotionFilter
 
 _EVEN = 2.0  # intervals whose ratio is below this tell an acceleration
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # for stamps that lie too close

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import MatchingConfig, PreprocessConfig
-from pipeline.data import Match, Points, Pose, Scan, State
-from pipeline.odometry.prediction import Prediction
+from scanchain import lie
+from scanchain.config import MatchingConfig, PreprocessConfig
+from scanchain.data import Match, Points, Pose, Scan, State
+from scanchain.odometry.prediction import Prediction
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pipeline.config import PreprocessConfig
-from pipeline.data import Points, Scan
-from pipeline.preprocess.sweep import Sweep, sweep_of
+from scanchain.config import PreprocessConfig
+from scanchain.data import Points, Scan
+from scanchain.preprocess.sweep import Sweep, sweep_of
 
 _HYSTERESIS = 0.75  # powers of two between the present scale and the wanted one, from which on it changes
 _STEP = 2.0  # by which the voxels of matching shrink or grow from one scan to the next, at most

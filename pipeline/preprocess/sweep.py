@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import PreprocessConfig
-from pipeline.data import Points, Scan
-from pipeline.kernels import downsample as kernels
+from scanchain.config import PreprocessConfig
+from scanchain.data import Points, Scan
+from scanchain.kernels import downsample as kernels
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,43 +8,43 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
-import pipeline
-from pipeline import config, data
-from pipeline.clock import working_s
-from pipeline.graph.growing_array import GrowingArray
-from pipeline.graph.pose_graph import PoseGraph
-from pipeline.kernels.voxels import Voxels
-from pipeline.loops.anywhere_closer import AnywhereCloser
-from pipeline.loops.closer import LoopCloser
-from pipeline.loops.doubt import Doubt
-from pipeline.loops.gallery import Gallery
-from pipeline.loops.near_closer import NearCloser
-from pipeline.loops.pieces import Pieces
-from pipeline.loops.place import Place
-from pipeline.loops.place_closer import PlaceCloser
-from pipeline.loops.planar_search import PlanarSearch
-from pipeline.loops.recognition import Recognition
-from pipeline.loops.submaps import Submaps
-from pipeline.loops.verification import Verifier
-from pipeline.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
-from pipeline.odometry import FrontEnd, Odometry
-from pipeline.odometry.experience import Experience
-from pipeline.odometry.intervals import Intervals
-from pipeline.odometry.motion_filter import MotionFilter
-from pipeline.odometry.prediction import Predictor
-from pipeline.point_store import PointStore, StoredPoints
-from pipeline.preprocess import Resolution, Sweep
-from pipeline.runs.directory import CHECKPOINT_FILE
-from pipeline.runs.provenance import package_version
-from pipeline.runs.snapshot import Classes, read_snapshot, write_snapshot
-from pipeline.slam import Slam
+import scanchain
+from scanchain import config, data
+from scanchain.clock import working_s
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.voxels import Voxels
+from scanchain.loops.anywhere_closer import AnywhereCloser
+from scanchain.loops.closer import LoopCloser
+from scanchain.loops.doubt import Doubt
+from scanchain.loops.gallery import Gallery
+from scanchain.loops.near_closer import NearCloser
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.place import Place
+from scanchain.loops.place_closer import PlaceCloser
+from scanchain.loops.planar_search import PlanarSearch
+from scanchain.loops.recognition import Recognition
+from scanchain.loops.submaps import Submaps
+from scanchain.loops.verification import Verifier
+from scanchain.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
+from scanchain.odometry import FrontEnd, Odometry
+from scanchain.odometry.experience import Experience
+from scanchain.odometry.intervals import Intervals
+from scanchain.odometry.motion_filter import MotionFilter
+from scanchain.odometry.prediction import Predictor
+from scanchain.point_store import PointStore, StoredPoints
+from scanchain.preprocess import Resolution, Sweep
+from scanchain.runs.directory import CHECKPOINT_FILE
+from scanchain.runs.provenance import package_version
+from scanchain.runs.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.slam import Slam
 
 _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
 
 
 def _version() -> str:
     """That of the package and a checksum of its code: other code would not go on to the same bits."""
-    package = Path(pipeline.__file__).parent
+    package = Path(scanchain.__file__).parent
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})"
 

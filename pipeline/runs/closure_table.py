@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data import Keyframe
-from pipeline.runs.step_table import pose_columns
-from pipeline.runs.verdicts import JudgedClosure
+from scanchain.data import Keyframe
+from scanchain.runs.step_table import pose_columns
+from scanchain.runs.verdicts import JudgedClosure
 
 
 def write_closures(

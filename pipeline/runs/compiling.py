@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from pipeline.runs.progress import Progress
+from scanchain.runs.progress import Progress
 
 
 @contextmanager
@@ -26,12 +26,12 @@ def telling_of_compilation(progress: Progress, rehearsal: Sequence[str] = ()) ->
 
         def on_start(self, event: Any) -> None:
             module = event.data["dispatcher"].py_func.__module__
-            if module.startswith("pipeline.") and module not in self.modules:
+            if module.startswith("scanchain.") and module not in self.modules:
                 if not self.modules:
                     progress.say("compiling, once after the installation:")
                     self.beside = _started(rehearsal)
                 self.modules.add(module)
-                progress.say(f"  {module.removeprefix('pipeline.')}")
+                progress.say(f"  {module.removeprefix('scanchain.')}")
 
         def on_end(self, event: Any) -> None:
             pass
@@ -51,4 +51,4 @@ def _started(words: Sequence[str]) -> subprocess.Popen[bytes] | None:
     if not words:
         return None
     nothing = subprocess.DEVNULL
-    return subprocess.Popen([sys.executable, "-m", *words], stdin=nothing, stdout=nothing, stderr=nothing)
+    return subprocess.Popen([sys.executable, "-P", "-m", *words], stdin=nothing, stdout=nothing, stderr=nothing)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Trajectory
-from pipeline.evaluate import motion_nees, pair
+from scanchain import lie
+from scanchain.data import Trajectory
+from scanchain.evaluation import motion_nees, pair
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,7 +13,7 @@ from typing import Self
 
 import psutil
 
-from pipeline.errors import InputError
+from scanchain.errors import InputError
 
 RUN_FILE = "run.json"
 TRUTH_FILE = "ground_truth.tum"  # true poses during the run, as they were given

@@ -6,10 +6,10 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.runs.recorder import SinkName
-from pipeline.settings import Override
-from pipeline.source import Source
+from scanchain.errors import InputError
+from scanchain.runs.recorder import SinkName
+from scanchain.settings import Override
+from scanchain.source import Source
 
 
 @dataclass(frozen=True, slots=True)

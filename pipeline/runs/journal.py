@@ -12,7 +12,7 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 
-from pipeline.runs.step_table import StepRow, StepTable
+from scanchain.runs.step_table import StepRow, StepTable
 
 JOURNAL_FILE = "steps.journal"
 _HEAD = struct.Struct("<II")  # bytes of the record that follows, and their CRC-32

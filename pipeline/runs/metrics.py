@@ -11,15 +11,15 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from pipeline.data import State, Trajectory, fit_text
-from pipeline.errors import InputError
-from pipeline.evaluate import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
-from pipeline.evaluate.absolute import path_length
-from pipeline.runs.results import Cloud
-from pipeline.runs.step_table import STAGES, StepTable
-from pipeline.runs.verdicts import BACK_END, VERIFICATION, JudgedClosure
-from pipeline.slam import SlamResult
-from pipeline.words import counted
+from scanchain.data import State, Trajectory, fit_text
+from scanchain.errors import InputError
+from scanchain.evaluation import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
+from scanchain.evaluation.absolute import path_length
+from scanchain.runs.results import Cloud
+from scanchain.runs.step_table import STAGES, StepTable
+from scanchain.runs.verdicts import BACK_END, VERIFICATION, JudgedClosure
+from scanchain.slam import SlamResult
+from scanchain.words import counted
 
 _FEW_POINTS = 100  # of a scan; lidars, planar ones included, have more
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth

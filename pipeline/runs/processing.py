@@ -11,24 +11,24 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config
-from pipeline.data import Scan, Trajectory
-from pipeline.errors import InputError
-from pipeline.evaluate import on_the_estimate
-from pipeline.logs import Log
-from pipeline.runs.checkpoint import Checkpoints
-from pipeline.runs.closure_table import write_closures
-from pipeline.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
-from pipeline.runs.job import Job
-from pipeline.runs.journal import JOURNAL_FILE, Journal
-from pipeline.runs.progress import Progress
-from pipeline.runs.recorder import OpenRecorder, Recorder
-from pipeline.runs.results import Cloud, write_results
-from pipeline.runs.results_mcap import write_results_mcap
-from pipeline.runs.resuming import Left, after, go_on_recording, set_aside
-from pipeline.runs.step_table import StepTable
-from pipeline.runs.verdicts import JudgedClosure, final_verdicts
-from pipeline.slam import Slam, SlamResult
+from scanchain.config import Config
+from scanchain.data import Scan, Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import on_the_estimate
+from scanchain.logs import Log
+from scanchain.runs.checkpoint import Checkpoints
+from scanchain.runs.closure_table import write_closures
+from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
+from scanchain.runs.job import Job
+from scanchain.runs.journal import JOURNAL_FILE, Journal
+from scanchain.runs.progress import Progress
+from scanchain.runs.recorder import OpenRecorder, Recorder
+from scanchain.runs.results import Cloud, write_results
+from scanchain.runs.results_mcap import write_results_mcap
+from scanchain.runs.resuming import Left, after, go_on_recording, set_aside
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.verdicts import JudgedClosure, final_verdicts
+from scanchain.slam import Slam, SlamResult
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 

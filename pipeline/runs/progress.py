@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-from pipeline.data import Scan
+from scanchain.data import Scan
 
 
 class Progress(Protocol):

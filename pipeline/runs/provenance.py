@@ -14,11 +14,11 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from pipeline.errors import InputError
-from pipeline.logs.remote import RemoteFile
-from pipeline.logs.sizes import files_of, size_of
-from pipeline.runs.whole_file import write_whole
-from pipeline.source import Source, without_keys
+from scanchain.errors import InputError
+from scanchain.logs.remote import RemoteFile
+from scanchain.logs.sizes import files_of, size_of
+from scanchain.source import Source, without_keys
+from scanchain.whole_file import write_whole
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22

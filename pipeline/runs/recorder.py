@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import RecordingConfig
-from pipeline.data import Closure, GraphState, Matrix, Step
+from scanchain.config import RecordingConfig
+from scanchain.data import Closure, GraphState, Matrix, Step
 
 if TYPE_CHECKING:
-    from pipeline.batch.task import Row
-    from pipeline.graph.optimisation import GraphChange
-    from pipeline.landmarks.study import Study
-    from pipeline.runs.step_table import StepRow
-    from pipeline.runs.verdicts import JudgedClosure
+    from scanchain.batch.task import Row
+    from scanchain.graph.optimisation import GraphChange
+    from scanchain.landmarks.study import Study
+    from scanchain.runs.step_table import StepRow
+    from scanchain.runs.verdicts import JudgedClosure
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 

@@ -1,6 +1,6 @@
 """What comes after odometry, done with a few made-up scans: its kernels are compiled, once and for all.
 
-    python -m pipeline.runs.rehearsal 3
+    python -m scanchain.runs.rehearsal 3
 
 A run whose kernels have to be compiled first starts this beside itself, on a core that it does not need yet.
 """
@@ -11,13 +11,13 @@ import sys
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Points, Pose, Scan, State
-from pipeline.odometry import Located
-from pipeline.odometry.tracked import Tracked, first_match
-from pipeline.runs.results import cloud_of, grid_of
-from pipeline.settings import load_settings
-from pipeline.slam import Slam
+from scanchain import lie
+from scanchain.data import Points, Pose, Scan, State
+from scanchain.odometry import Located
+from scanchain.odometry.tracked import Tracked, first_match
+from scanchain.runs.results import cloud_of, grid_of
+from scanchain.settings import load_settings
+from scanchain.slam import Slam
 
 _SCANS = 3
 _STEP_M = 1.0

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.errors import InputError, ScanchainError, told
-from pipeline.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
-from pipeline.runs.journal import JOURNAL_FILE
-from pipeline.runs.provenance import Provenance
-from pipeline.runs.step_table import StepTable
-from pipeline.source import without_keys
-from pipeline.trajectory import write_tum
-from pipeline.words import counted
+from scanchain.errors import InputError, ScanchainError, told
+from scanchain.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
+from scanchain.runs.journal import JOURNAL_FILE
+from scanchain.runs.provenance import Provenance
+from scanchain.runs.step_table import StepTable
+from scanchain.source import without_keys
+from scanchain.trajectory import write_tum
+from scanchain.words import counted
 
 
 class PartialRunError(ScanchainError):

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config, MapsConfig
-from pipeline.data import Points, Pose
-from pipeline.graph.g2o_write import rejected_path, write_g2o
-from pipeline.maps import (
+from scanchain.config import Config, MapsConfig
+from scanchain.data import Points, Pose
+from scanchain.graph.g2o_write import rejected_path, write_g2o
+from scanchain.maps import (
     OccupancyGrid,
     View,
     build_point_map,
@@ -25,10 +25,10 @@ from pipeline.maps import (
     write_pcd,
     write_ply,
 )
-from pipeline.runs.recorder import Recorder
-from pipeline.runs.verdicts import JudgedClosure
-from pipeline.slam import SlamResult
-from pipeline.trajectory import write_kitti, write_tum
+from scanchain.runs.recorder import Recorder
+from scanchain.runs.verdicts import JudgedClosure
+from scanchain.slam import SlamResult
+from scanchain.trajectory import write_kitti, write_tum
 
 GRAPH_FILE = "graph.g2o"  # what is in force; rejected edges stand in graph_rejected.g2o, if there are any
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.data import Matrix, Points, Pose
-from pipeline.logs import Log
-from pipeline.logs.frames import MovingFrame, moving_frame
-from pipeline.logs.pack import (
+from scanchain import lie
+from scanchain.data import Matrix, Points, Pose
+from scanchain.logs import Log
+from scanchain.logs.frames import MovingFrame, moving_frame
+from scanchain.logs.pack import (
     ORIGIN,
     Link,
     pack_cloud,
@@ -21,10 +21,10 @@ from pipeline.logs.pack import (
     pack_transforms,
     place,
 )
-from pipeline.logs.write import LogWriter
-from pipeline.maps import read_map, read_ply
-from pipeline.runs.step_table import StepTable
-from pipeline.slam import SlamResult
+from scanchain.logs.write import LogWriter
+from scanchain.maps import read_map, read_ply
+from scanchain.runs.step_table import StepTable
+from scanchain.slam import SlamResult
 
 FILE = "results.mcap"
 _WORLD, _ODOM = "world", "odom"

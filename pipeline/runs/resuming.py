@@ -7,14 +7,14 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.data import Scan
-from pipeline.errors import InputError
-from pipeline.runs.checkpoint import Checkpoint, Checkpoints, read_checkpoint
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
-from pipeline.runs.journal import JOURNAL_FILE, read_journal
-from pipeline.runs.recorder import Recorder
-from pipeline.runs.step_table import StepRow, StepTable
-from pipeline.words import counted
+from scanchain.data import Scan
+from scanchain.errors import InputError
+from scanchain.runs.checkpoint import Checkpoint, Checkpoints, read_checkpoint
+from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
+from scanchain.runs.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.recorder import Recorder
+from scanchain.runs.step_table import StepRow, StepTable
+from scanchain.words import counted
 
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)

@@ -11,30 +11,30 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.clock import compiled_s, working_s
-from pipeline.config import Config, RecordingConfig
-from pipeline.data import Trajectory
-from pipeline.errors import InputError
-from pipeline.evaluate import TruthFile, check_overlap, during, read_truth
-from pipeline.logs import Log, open_log
-from pipeline.runs.compiling import telling_of_compilation
-from pipeline.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
-from pipeline.runs.job import Job
-from pipeline.runs.journal import JOURNAL_FILE
-from pipeline.runs.metrics import GroundTruth, Metrics, judge, measure, summary
-from pipeline.runs.processing import TruePoses, process
-from pipeline.runs.progress import Progress
-from pipeline.runs.provenance import Hashing, Provenance, describe_start
-from pipeline.runs.recorder import OpenRecorder
-from pipeline.runs.rescue import rescued
-from pipeline.runs.resuming import Left, find_left
-from pipeline.runs.step_table import StepTable
-from pipeline.runs.whole_file import write_whole
-from pipeline.settings import dump, load_settings, named
-from pipeline.slam import SlamResult
-from pipeline.trajectory import write_tum
-from pipeline.words import counted
+from scanchain import lie
+from scanchain.clock import compiled_s, working_s
+from scanchain.config import Config, RecordingConfig
+from scanchain.data import Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
+from scanchain.logs import Log, open_log
+from scanchain.runs.compiling import telling_of_compilation
+from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
+from scanchain.runs.job import Job
+from scanchain.runs.journal import JOURNAL_FILE
+from scanchain.runs.metrics import GroundTruth, Metrics, judge, measure, summary
+from scanchain.runs.processing import TruePoses, process
+from scanchain.runs.progress import Progress
+from scanchain.runs.provenance import Hashing, Provenance, describe_start
+from scanchain.runs.recorder import OpenRecorder
+from scanchain.runs.rescue import rescued
+from scanchain.runs.resuming import Left, find_left
+from scanchain.runs.step_table import StepTable
+from scanchain.settings import dump, load_settings, named
+from scanchain.slam import SlamResult
+from scanchain.trajectory import write_tum
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
 
 _RECORDING_KEYS = RecordingConfig.__struct_fields__
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
@@ -80,7 +80,7 @@ def run(
     steps = StepTable() if left is None else left.steps
     started -= 0.0 if left is None else left.checkpoint.run_s
     _tell_beginning(job, left, progress)
-    rehearsal = ("pipeline.runs.rehearsal", str(log.dimension))
+    rehearsal = ("scanchain.runs.rehearsal", str(log.dimension))
     with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress, rehearsal):
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from scipy.spatial import KDTree
 
-from pipeline.errors import InputError
+from scanchain.errors import InputError
 
 _MAGIC = b"scanchain snapshot 1\n"
 _PLAIN = {"list": list, "tuple": tuple, "set": set}

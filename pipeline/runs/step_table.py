@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
+from scanchain import lie
+from scanchain.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix that is not inverted
 

@@ -6,7 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.data import REJECTED_WEIGHT, Closure, GraphState, Verdict
+from scanchain.data import REJECTED_WEIGHT, Closure, GraphState, Verdict
 
 VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
 

@@ -15,13 +15,13 @@ from time import perf_counter
 
 import numpy as np
 
-from pipeline.data import Trajectory
-from pipeline.evaluate import absolute_error, pair, read_relations, relation_error
-from pipeline.logs import open_log
-from pipeline.settings import Override, load_settings
-from pipeline.simulate import simulate
-from pipeline.slam import Slam, SlamResult
-from pipeline.trajectory import read_tum
+from scanchain.data import Trajectory
+from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
+from scanchain.logs import open_log
+from scanchain.settings import Override, load_settings
+from scanchain.simulation import simulate
+from scanchain.slam import Slam, SlamResult
+from scanchain.trajectory import read_tum
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 MATCHERS = ("plicp", "svd")

@@ -9,8 +9,8 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from pipeline.batch.batch import Batch, run_batch
-from pipeline.simulate import simulate
+from scanchain.batch.batch import Batch, run_batch
+from scanchain.simulation import simulate
 
 ROUNDS = 3
 

@@ -19,13 +19,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.compare.methods import Method, resolve
-from pipeline.compare.runner import Runner, start
-from pipeline.compare.worker import warm_up
-from pipeline.config import LogConfig
-from pipeline.data import Pose, Scan, Trajectory
-from pipeline.errors import InputError
-from pipeline.logs import open_log
+from scanchain.comparison.methods import Method, resolve
+from scanchain.comparison.runner import Runner, start
+from scanchain.comparison.worker import warm_up
+from scanchain.config import LogConfig
+from scanchain.data import Pose, Scan, Trajectory
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 
 OURS = ("plicp", "svd")
 

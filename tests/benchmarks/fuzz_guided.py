@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import atheris
 
-with atheris.instrument_imports(include=["pipeline.logs"]):
+with atheris.instrument_imports(include=["scanchain.logs"]):
     import fuzzing
 
 

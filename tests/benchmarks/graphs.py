@@ -14,11 +14,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.graph.between import BetweenProblem
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.g2o_write import write_g2o
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.g2o_write import write_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))

@@ -14,17 +14,17 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pipeline.graph.robust import RobustLoss
-from pipeline.landmarks.accuracy import against_truth, truth_at
-from pipeline.landmarks.bearing_range import BearingRangeProblem, no_calibration
-from pipeline.landmarks.dead_reckoning import OWN, OdometryNoise
-from pipeline.landmarks.guess import from_odometry
-from pipeline.landmarks.minimise import minimise
-from pipeline.landmarks.mrclam import read_mrclam
-from pipeline.landmarks.problem import State
-from pipeline.landmarks.range_fit import LogModel
-from pipeline.landmarks.range_slam import solve_range_log
-from pipeline.landmarks.solvers import create_solver
+from scanchain.graph.robust import RobustLoss
+from scanchain.landmarks.accuracy import against_truth, truth_at
+from scanchain.landmarks.bearing_range import BearingRangeProblem, no_calibration
+from scanchain.landmarks.dead_reckoning import OWN, OdometryNoise
+from scanchain.landmarks.guess import from_odometry
+from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.mrclam import read_mrclam
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.range_fit import LogModel
+from scanchain.landmarks.range_slam import solve_range_log
+from scanchain.landmarks.solvers import create_solver
 
 ROOT = Path(__file__).resolve().parents[2]
 HUBER = 1.345

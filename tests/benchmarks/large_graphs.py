@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.graph.g2o import read_g2o
-from pipeline.graph.g2o_write import write_g2o
-from pipeline.graph.pose_graph import PoseGraph
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.g2o_write import write_g2o
+from scanchain.graph.pose_graph import PoseGraph
 from tests.benchmarks.graphs import certify, compare, report
 
 SIGHT_M = 2.1  # how far apart two poses may be that see each other

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.logs import open_log
-from pipeline.memory import resident_mib
-from pipeline.odometry import Odometry
-from pipeline.settings import load_settings
-from pipeline.simulate import SENSORS, simulate
+from scanchain.logs import open_log
+from scanchain.memory import resident_mib
+from scanchain.odometry import Odometry
+from scanchain.settings import load_settings
+from scanchain.simulation import SENSORS, simulate
 
 
 def main() -> None:

@@ -13,11 +13,11 @@ import tempfile
 from pathlib import Path
 from time import thread_time
 
-from pipeline import Slam
-from pipeline.logs import open_log
-from pipeline.memory import resident_mib
-from pipeline.settings import load_settings
-from pipeline.simulate import SENSORS, simulate
+from scanchain import Slam
+from scanchain.logs import open_log
+from scanchain.memory import resident_mib
+from scanchain.settings import load_settings
+from scanchain.simulation import SENSORS, simulate
 
 
 def main() -> None:

@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Trajectory, Verdict
-from pipeline.evaluate import absolute_error, pair
-from pipeline.logs import open_log
-from pipeline.runs.verdicts import final_verdicts
-from pipeline.settings import load_settings
-from pipeline.simulate import simulate
-from pipeline.slam import SlamResult
+from scanchain import lie
+from scanchain.data import Trajectory, Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.logs import open_log
+from scanchain.runs.verdicts import final_verdicts
+from scanchain.settings import load_settings
+from scanchain.simulation import simulate
+from scanchain.slam import SlamResult
 from tests.drifting import drifting_slam, stretched
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))

@@ -25,13 +25,13 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import lie
-from pipeline.config import LogConfig
-from pipeline.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
-from pipeline.evaluate import absolute_error, pair
-from pipeline.logs import open_log
-from pipeline.runs.verdicts import JudgedClosure, final_verdicts
-from pipeline.settings import load_settings
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.logs import open_log
+from scanchain.runs.verdicts import JudgedClosure, final_verdicts
+from scanchain.settings import load_settings
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
 from tests.drifting import drifting_slam, off_by

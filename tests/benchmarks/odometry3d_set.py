@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.odometry3d_set [--worlds town,...] [--sensors vlp-16,...] [--scans N] [--cache DIR]
 
-Every world of pipeline.simulate that is driven with a 3D lidar, with every 3D sensor, is simulated into a cache
+Every world of scanchain.simulation that is driven with a 3D lidar, with every 3D sensor, is simulated into a cache
 folder unless it lies there already; the cache is named after the simulator's source, so that worlds which changed
 are made anew. Every log has a process of its own.
 
@@ -23,11 +23,11 @@ from pathlib import Path
 
 import numpy as np
 
-import pipeline
-from pipeline import lie
-from pipeline.data import Trajectory
-from pipeline.evaluate import SHORT_LENGTHS_M, Pairs, absolute_error, kitti_error, pair
-from pipeline.simulate import SENSORS, WORLDS, simulate
+import scanchain
+from scanchain import lie
+from scanchain.data import Trajectory
+from scanchain.evaluation import SHORT_LENGTHS_M, Pairs, absolute_error, kitti_error, pair
+from scanchain.simulation import SENSORS, WORLDS, simulate
 from tests.benchmarks.contest import OURS, Run, default_methods, in_fresh_process, read, run_all
 
 INDOORS = frozenset({"corridor", "staircase", "hall"})  # where others' settings for indoors are taken
@@ -142,7 +142,7 @@ def _is_lost_alone(row: Sequence[Score], first_rival: int, place: int) -> bool:
 
 def _version() -> str:
     """A name for the simulator as it is now."""
-    root = Path(pipeline.__file__).parent
+    root = Path(scanchain.__file__).parent
     sources = sorted([*root.glob("simulate/*.py"), root / "kernels" / "raycast.py"])
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 

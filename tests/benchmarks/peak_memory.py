@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from pipeline.config import LogConfig
-from pipeline.logs import open_log
-from pipeline.memory import peak_mib
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+from scanchain.memory import peak_mib
 from tests.benchmarks.contest import create
 
 ROOT = Path(__file__).resolve().parents[2]

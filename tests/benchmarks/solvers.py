@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.landmarks.compare import compare_linear
-from pipeline.landmarks.npz import read_landmark_data
-from pipeline.landmarks.relative_position import linear_system
-from pipeline.landmarks.solvers import METHODS
+from scanchain.landmarks.compare import compare_linear
+from scanchain.landmarks.npz import read_landmark_data
+from scanchain.landmarks.relative_position import linear_system
+from scanchain.landmarks.solvers import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")

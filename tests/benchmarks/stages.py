@@ -15,11 +15,11 @@ from time import perf_counter
 
 import numpy as np
 
-from pipeline.config import LogConfig
-from pipeline.data import Pose, Scan
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import load_settings
+from scanchain.config import LogConfig
+from scanchain.data import Pose, Scan
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.settings import load_settings
 from tests.benchmarks.odometry3d import DATA, DEFAULT_LOGS
 
 

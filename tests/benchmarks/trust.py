@@ -6,7 +6,7 @@ Worlds, sensors and cache are those of tests.benchmarks.odometry3d_set; the odom
 
   NEES/6    squared error of the motion between two scans over its covariance, mean, divided by its dimension:
             1 is exact, more is overconfident; from scans that are not degenerate
-  blind     scans whose true geometry says next to nothing along some direction (pipeline.simulate.information)
+  blind     scans whose true geometry says next to nothing along some direction (scanchain.simulation.information)
   flagged   share of those that are called degenerate; in brackets the median angle between the direction that is
             named and the blind ones
   sound     scans whose true geometry says enough along every direction
@@ -21,14 +21,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import LogConfig
-from pipeline.data import Matrix, State
-from pipeline.evaluate import motion_nees
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import Override, load_settings
-from pipeline.simulate import Drive, plan
-from pipeline.simulate.information import information, spectrum
+from scanchain.config import LogConfig
+from scanchain.data import Matrix, State
+from scanchain.evaluation import motion_nees
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.settings import Override, load_settings
+from scanchain.simulation import Drive, plan
+from scanchain.simulation.information import information, spectrum
 from tests.benchmarks.odometry3d_set import SEED, log_of, parser_of
 
 BLIND_SHARE, SOUND_SHARE = 1e-6, 1e-3  # of the returns that speak about the worst direction

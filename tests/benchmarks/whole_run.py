@@ -22,9 +22,9 @@ from pathlib import Path
 from time import perf_counter, time
 from typing import Any
 
-from pipeline.logs import open_log
-from pipeline.odometry import Odometry
-from pipeline.settings import load_settings
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.settings import load_settings
 from tests.benchmarks.odometry3d import DATA, DEFAULT_LOGS
 from tests.benchmarks.peak_memory import ROOT
 from tests.benchmarks.stopwatch import Stopwatch
@@ -54,7 +54,7 @@ def show(path: Path, repeats: int) -> None:
     runs, alone, tracking = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(repeats + 1):
-            runs.append(timed("pipeline", "run", str(path), "--out", f"{folder}/run", "--force")[0])
+            runs.append(timed("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")[0])
             seconds, answer = timed("tests.benchmarks.whole_run", str(path), "--track")
             alone.append(seconds)
             tracking.append(float(answer))
@@ -74,7 +74,7 @@ def show(path: Path, repeats: int) -> None:
 def show_cold(path: Path) -> None:
     """A run without compiled kernels, and the one after it."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ("pipeline", "run", str(path), "--out", f"{folder}/run", "--force")
+        words = ("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")
         cold_s, warm_s = (timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2))
     print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
 
@@ -107,13 +107,13 @@ def track(path: Path) -> float:
 
 def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
     """A run in this process, which was begun at that time, with a watch over what it consists of."""
-    from pipeline import __main__ as command
-    from pipeline.graph.pose_graph import PoseGraph
-    from pipeline.loops import LoopCloser
-    from pipeline.point_store import PointStore
-    from pipeline.runs import processing, results, run
-    from pipeline.runs.journal import Journal
-    from pipeline.runs.step_table import StepTable
+    from scanchain import __main__ as command
+    from scanchain.graph.pose_graph import PoseGraph
+    from scanchain.loops import LoopCloser
+    from scanchain.point_store import PointStore
+    from scanchain.runs import processing, results, run
+    from scanchain.runs.journal import Journal
+    from scanchain.runs.step_table import StepTable
 
     watch = Stopwatch()
     watch.add("start and imports", time() - began)
@@ -134,7 +134,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     def record(*arguments: Any, **options: Any) -> Any:
         recording = open_recording(*arguments, **options)
         watch.over("recording", type(recording), "__enter__", "close", "log", "log_trajectory", "log_map")
-        watch.over("recording", sys.modules["viz.messages"].Message, "send")
+        watch.over("recording", sys.modules["scanchain.viz.messages"].Message, "send")
         return recording
 
     command._record = watch.timed("recording", record)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.config import GraphConfig
-from pipeline.data import Trajectory
-from pipeline.evaluate import Alignment, absolute_error, pair
-from pipeline.graph.g2o import read_g2o
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.data import Trajectory
+from scanchain.evaluation import Alignment, absolute_error, pair
+from scanchain.graph.g2o import read_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("anywhere", "nearby", "groups")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.errors import InputError
-from pipeline.landmarks.solvers.cholesky import CholeskySolver
-from pipeline.landmarks.solvers.qr import QrSolver
-from pipeline.landmarks.solvers.schur import SchurSolver
-from pipeline.landmarks.solvers.scipy_direct import PINV_BELOW, DefaultSolver, LuSolver, PinvSolver, check_pinv
-from pipeline.landmarks.solvers.solution import Factor, LinearSolver, Solution, UndeterminedError
-from pipeline.landmarks.solvers.suitesparse import SuiteSparseQrSolver
+from scanchain.errors import InputError
+from scanchain.landmarks.solvers.cholesky import CholeskySolver
+from scanchain.landmarks.solvers.qr import QrSolver
+from scanchain.landmarks.solvers.schur import SchurSolver
+from scanchain.landmarks.solvers.scipy_direct import PINV_BELOW, DefaultSolver, LuSolver, PinvSolver, check_pinv
+from scanchain.landmarks.solvers.solution import Factor, LinearSolver, Solution, UndeterminedError
+from scanchain.landmarks.solvers.suitesparse import SuiteSparseQrSolver
 
 __all__ = [
     "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver",

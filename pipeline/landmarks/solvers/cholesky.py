@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
-from pipeline.graph.factor_matrix import upper_factor
-from pipeline.kernels import normal_equations
-from pipeline.landmarks.solvers.solution import Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem, Pattern
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.factor_matrix import upper_factor
+from scanchain.kernels import normal_equations
+from scanchain.landmarks.solvers.solution import Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem, Pattern
 
 
 class NormalEquations:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bmat, bsr_matrix, coo_matrix, csc_matrix
 
-from pipeline.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
-from pipeline.graph.factor_matrix import upper_factor
-from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.factor_matrix import upper_factor
+from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from pipeline.graph.factor_matrix import front_rows
-from pipeline.kernels import column_order, graph_fronts, graph_symbolic, normal_equations, sparse_qr
-from pipeline.kernels.graph_fronts import Fronts
-from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem, Pattern
+from scanchain.graph.factor_matrix import front_rows
+from scanchain.kernels import column_order, graph_fronts, graph_symbolic, normal_equations, sparse_qr
+from scanchain.kernels.graph_fronts import Fronts
+from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem, Pattern
 
 Ordering = Literal["natural", "colamd"]
 

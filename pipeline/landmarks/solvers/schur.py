@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from pipeline.kernels import arrow
-from pipeline.landmarks.solvers.eliminate_landmarks import LandmarkElimination
-from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem, Pattern
+from scanchain.kernels import arrow
+from scanchain.landmarks.solvers.eliminate_landmarks import LandmarkElimination
+from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem, Pattern
 
 _WIDEST_BAND = 64  # scalars; beyond it poses are joined by more than odometry
 _LARGEST_BORDER = 25_000_000  # numbers of the dense border, 200 MB

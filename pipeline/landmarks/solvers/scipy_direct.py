@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve
 
-from pipeline.errors import InputError
-from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem
+from scanchain.errors import InputError
+from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem
 
 PINV_BELOW = 3_000  # unknowns: their inverse is all but dense, 110 MB with its indices, and takes seconds
 

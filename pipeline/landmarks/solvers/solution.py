@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags_array, identity
 from scipy.sparse.linalg import splu
 
-from pipeline.clock import working_s
-from pipeline.errors import InputError
-from pipeline.landmarks.system import Layout, LinearSystem
+from scanchain.clock import working_s
+from scanchain.errors import InputError
+from scanchain.landmarks.system import Layout, LinearSystem
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
 _NAMED = 6

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import spsolve_triangular
 
-from pipeline.errors import MissingExtraError
-from pipeline.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from pipeline.landmarks.system import LinearSystem
+from scanchain.errors import MissingExtraError
+from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.system import LinearSystem
 
 _ORDERINGS = {"natural": 0, "colamd": 2}  # SPQR_ORDERING_FIXED, SPQR_ORDERING_COLAMD
 

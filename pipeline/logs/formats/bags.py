@@ -11,13 +11,13 @@ from rosbags import rosbag2
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from pipeline.errors import InputError
-from pipeline.logs.formats.made import made_index
-from pipeline.logs.formats.ros1_bag import index_ros1_bag
-from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
-from pipeline.logs.ros2_definitions import schema_text
-from pipeline.logs.sizes import size_of
-from pipeline.words import counted
+from scanchain.errors import InputError
+from scanchain.logs.formats.made import made_index
+from scanchain.logs.formats.ros1_bag import index_ros1_bag
+from scanchain.logs.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.ros2_definitions import schema_text
+from scanchain.logs.sizes import size_of
+from scanchain.words import counted
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
 _MOST_BLOCKS = 4096

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
-from pipeline.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
-from pipeline.logs.formats.made import made_block, made_channel, made_index, unknown
-from pipeline.logs.formats.packed_text import read_text
-from pipeline.logs.pack import Link, pack_transforms
-from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
-from pipeline.source import Source
-from pipeline.words import counted
+from scanchain.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
+from scanchain.logs.formats.made import made_block, made_channel, made_index, unknown
+from scanchain.logs.formats.packed_text import read_text
+from scanchain.logs.pack import Link, pack_transforms
+from scanchain.logs.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.source import Source
+from scanchain.words import counted
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.formats.pcd import read_pcd
-from pipeline.logs.formats.ply import read_ply
-from pipeline.logs.formats.point_rows import CloudFileError
+from scanchain.logs.formats.pcd import read_pcd
+from scanchain.logs.formats.ply import read_ply
+from scanchain.logs.formats.point_rows import CloudFileError
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 _MOST_COLUMNS = 16

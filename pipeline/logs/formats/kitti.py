@@ -11,21 +11,21 @@ from pathlib import Path
 
 from numpy.linalg import LinAlgError
 
-from pipeline.data import Pose
-from pipeline.errors import InputError
-from pipeline.logs.formats.cloud_file import read_xyzi
-from pipeline.logs.formats.kitti_truth import (
+from scanchain.data import Pose
+from scanchain.errors import InputError
+from scanchain.logs.formats.cloud_file import read_xyzi
+from scanchain.logs.formats.kitti_truth import (
     read_calibration,
     read_camera_poses,
     read_oxts,
     read_seconds,
     read_times,
 )
-from pipeline.logs.formats.made import made_block, made_channel, made_index, natural_order
-from pipeline.logs.formats.point_rows import CloudFileError
-from pipeline.logs.pack import pack_cloud, pack_odometry, place
-from pipeline.logs.records import Block, Channel, Contents, FileIndex, Message
-from pipeline.words import counted
+from scanchain.logs.formats.made import made_block, made_channel, made_index, natural_order
+from scanchain.logs.formats.point_rows import CloudFileError
+from scanchain.logs.pack import pack_cloud, pack_odometry, place
+from scanchain.logs.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.words import counted
 
 _TRUTH = -1  # the block of the ground truth
 _POSE_BYTES = 720

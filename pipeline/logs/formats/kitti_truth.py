@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import lie
-from pipeline.data import Matrix, Pose
-from pipeline.errors import InputError
-from pipeline.logs.pack import LATEST_NS
-from pipeline.words import counted
+from scanchain import lie
+from scanchain.data import Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.logs.pack import LATEST_NS
+from scanchain.words import counted
 
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles

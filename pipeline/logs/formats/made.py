@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import InputError
-from pipeline.logs.records import Block, Channel, Entry, FileIndex
-from pipeline.logs.ros2_definitions import schema_text
+from scanchain.errors import InputError
+from scanchain.logs.records import Block, Channel, Entry, FileIndex
+from scanchain.logs.ros2_definitions import schema_text
 
 KNOWN = (
     "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "

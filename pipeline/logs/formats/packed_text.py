@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol
 
-from pipeline.errors import InputError
+from scanchain.errors import InputError
 
 _MOST_BYTES = 2 << 30  # of text
 _PLAIN_BYTES = 1 << 20  # read at once

@@ -10,7 +10,7 @@ import lzf
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.formats.point_rows import CloudFileError, ascii_rows, binary_rows
+from scanchain.logs.formats.point_rows import CloudFileError, ascii_rows, binary_rows
 
 _TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
     (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)

@@ -9,7 +9,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs.formats.point_rows import CloudFileError, ascii_rows, binary_rows
+from scanchain.logs.formats.point_rows import CloudFileError, ascii_rows, binary_rows
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.logs.blocks import unpack
-from pipeline.logs.counting import messages_of
-from pipeline.logs.formats.ros1_bag_records import (
+from scanchain.errors import InputError
+from scanchain.logs.blocks import unpack
+from scanchain.logs.counting import messages_of
+from scanchain.logs.formats.ros1_bag_records import (
     CHUNK,
     CHUNK_INFO,
     CONNECTION,
@@ -32,9 +32,9 @@ from pipeline.logs.formats.ros1_bag_records import (
     read_record,
     whole_records,
 )
-from pipeline.logs.records import Block, Channel, Contents, Entry, FileIndex, Message
-from pipeline.logs.walk import is_believable
-from pipeline.words import counted
+from scanchain.logs.records import Block, Channel, Contents, Entry, FileIndex, Message
+from scanchain.logs.walk import is_believable
+from scanchain.words import counted
 
 _INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
 

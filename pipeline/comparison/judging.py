@@ -1,0 +1,209 @@
+"""Figures of what methods did: against the truth, against relations, against each other, and by the clock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from scanchain.comparison.figures import Figures
+from scanchain.comparison.outcome import STEPS_FILE, Outcome
+from scanchain.data import Matrix, Pose, State, Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import (
+    RelationError,
+    Relations,
+    RelativeError,
+    absolute_error_on_any_course,
+    kitti_error_on_any_course,
+    pair,
+    relation_error,
+    relative_error_over_distance,
+    relative_error_over_time,
+)
+from scanchain.runs.consistency import COLUMNS, nees_of_steps
+from scanchain.runs.metrics import unreliable
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A method against the truth, scan by scan.
+
+    Attributes
+    ----------
+    figures : what it amounts to
+    T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
+        end; the identity without truth
+    errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
+    relations : the error over relations; None without any, or after a failure
+    definitions : what was computed, in words
+    """
+
+    figures: Figures
+    T_reference_estimate: Pose
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    nees: NDArray[np.float64]
+    relations: RelationError | None
+    definitions: tuple[str, ...]
+
+
+def judge(
+    outcomes: Sequence[Outcome],
+    stamps_ns: NDArray[np.int64],
+    truth: Trajectory | None,
+    relations: Relations | None,
+) -> Judged:
+    """A method's runs over scans of these stamps; the first whole one stands for all, times are those of all."""
+    outcome = representative(outcomes)
+    figures = _speed(outcomes)
+    blank = np.full(len(outcome.seconds), np.nan)
+    if not outcome.is_whole:
+        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
+    figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
+    error = None if relations is None else relation_error(outcome.trajectory, relations)
+    if error is not None:
+        figures = msgspec.structs.replace(
+            figures, relations_m=error.translation_m.mean, relations_rad=error.rotation_rad.mean
+        )
+    definitions = () if error is None else (error.definition,)
+    judged = Judged(figures, np.eye(4), blank, blank, blank, error, definitions)
+    return judged if truth is None else _against(truth, outcome, judged)
+
+
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """The first whole run, else the first."""
+    return next((outcome for outcome in outcomes if outcome.is_whole), outcomes[0])
+
+
+def observability(outcome: Outcome) -> NDArray[np.float64]:
+    """(N,) as in ``Match``; empty where the method does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.empty(0)
+    return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
+
+
+def doubt(outcome: Outcome) -> str:
+    """Why a method of ours is not reliable by its own account; empty where it is, or where it does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return ""
+    table = pq.read_table(path, columns=["state", "scan_points"])
+    return unreliable(Counter(map(State, table["state"].to_pylist())), table["scan_points"].to_pylist())
+
+
+def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
+    """Where a method that begins with the identity began."""
+    if truth is None:
+        return np.eye(4)
+    try:
+        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    except InputError:  # the truth begins later
+        return np.eye(4)
+
+
+def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
+    pairs = pair(outcome.trajectory, truth)
+    ate = absolute_error_on_any_course(pairs)
+    kitti = _or_none(lambda: kitti_error_on_any_course(pairs))
+    second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
+    over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
+    over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
+    nees = _nees(outcome, truth)
+    place = pairs.places
+    errors_m, errors_rad = judged.errors_m.copy(), judged.errors_rad.copy()
+    errors_m[place], errors_rad[place] = ate.errors_m, ate.errors_rad
+    figures = msgspec.structs.replace(
+        judged.figures,
+        ate_m=ate.translation_m.rmse,
+        ate_share=ate.share_of_path,
+        ate_rotation_rad=ate.rotation_rad.rmse,
+        rpe_1_s_m=_rmse_m(second),
+        rpe_10_m_m=_rmse_m(over_10_m),
+        rpe_100_m_m=_rmse_m(over_100_m),
+        kitti_share=None if kitti is None else kitti.translation_share,
+        kitti_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
+        paired_share=pairs.share,
+        nees=float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
+    )
+    found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
+    definitions = (*judged.definitions, *found, f"Paired: {pairs.description}")
+    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, judged.relations, definitions)
+
+
+def _rmse_m(error: RelativeError | None) -> float | None:
+    return None if error is None else error.translation_m.rmse
+
+
+def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
+    """(N,) of the motion up to each scan; NaN where the method does not tell."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.full(len(outcome.seconds), np.nan)
+    odometry = Trajectory(outcome.trajectory.stamps_ns, outcome.odometry)
+    return nees_of_steps(pq.read_table(path, columns=list(COLUMNS)), odometry, truth)
+
+
+def _speed(outcomes: Sequence[Outcome]) -> Figures:
+    """From all runs that came to their end; the first scan of each stands apart."""
+    whole = [outcome for outcome in outcomes if outcome.is_whole]
+    if not whole:
+        peak = max(outcome.report.peak_mib for outcome in outcomes)
+        return Figures(peak_mib=peak if outcomes[0].report.status.is_failure and peak else None)
+    first = min(1, len(whole[0].seconds) - 1)
+    rest = np.concatenate([outcome.seconds[first:] for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[first:] for outcome in whole])
+    stages = _stages(whole[0])
+    return Figures(
+        median_s=float(np.median(rest)),
+        p95_s=float(np.percentile(rest, 95.0)),
+        cpu_s=float(np.median(cpu)),
+        first_s=float(np.median([outcome.seconds[0] for outcome in whole])),
+        scans_per_s=float(len(rest) / rest.sum()),
+        preprocess_s=stages[0],
+        match_s=stages[1],
+        map_s=stages[2],
+        loops_s=stages[3],
+        start_s=float(np.median([outcome.report.start_s for outcome in whole])),
+        finish_s=float(np.median([outcome.report.finish_s for outcome in whole])),
+        peak_mib=max(outcome.report.peak_mib for outcome in whole),
+    )
+
+
+def _stages(outcome: Outcome) -> tuple[float | None, float | None, float | None, float | None]:
+    """Seconds by stage of a method that tells; the mean for loops, most scans of which take nothing."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return None, None, None, None
+    table = pq.read_table(path, columns=["preprocess_s", "match_s", "map_s", "loops_s"])
+    preprocess, match, extend, loops = (column.to_numpy()[1:] for column in table.itercolumns())
+    if not len(loops):
+        return None, None, None, None
+    closing = float(loops.mean()) if loops.any() else None
+    return float(np.median(preprocess)), float(np.median(match)), float(np.median(extend)), closing
+
+
+def _apart(outcomes: Sequence[Outcome]) -> float | None:
+    """Largest distance between the positions of a scan in two runs."""
+    whole: list[Matrix] = [outcome.trajectory.poses for outcome in outcomes if outcome.is_whole]
+    if len(whole) < 2:
+        return None
+    first = whole[0][:, :-1, -1]
+    return max(float(np.linalg.norm(poses[:, :-1, -1] - first, axis=1).max()) for poses in whole[1:])
+
+
+def _or_none(metric: Callable[[], Answer]) -> Answer | None:
+    """The metric, or None where the path is too short for it."""
+    try:
+        return metric()
+    except InputError:
+        return None

@@ -1,0 +1,147 @@
+"""What can be compared: ours, the baselines, and whatever class a user brings; each with its settings."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from scanchain.baselines import BASELINES
+from scanchain.errors import InputError
+from scanchain.settings import Override, load_settings
+
+OURS = ("plicp", "svd", "plicp+loops", "svd+loops")
+_ON_REQUEST = ("svd+loops", "genz-icp-indoor", "genz-icp-kitti")
+_BASE = "method"  # the key of a table that says what it is a variant of
+_SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
+
+
+class Method(Struct, frozen=True):
+    """One row of a comparison.
+
+    Attributes
+    ----------
+    name : what the tables call it
+    base : one of OURS or BASELINES, or MODULE:CLASS with the verb of a Baseline (in 2D of points (N, 2) and poses
+        (3, 3)), which is given the settings as keywords
+    settings : as TOML holds them; for ours the configuration but for what all methods share, by section
+    """
+
+    name: str
+    base: str
+    settings: dict[str, Any]
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is this project's."""
+        return self.base in OURS
+
+
+def default_names(dimension: int) -> tuple[str, ...]:
+    """All that make sense for a log of this dimension."""
+    ours = [name for name in OURS if name not in _ON_REQUEST]
+    others = [
+        name
+        for name, entry in BASELINES.items()
+        if name not in _ON_REQUEST and (dimension == 3 or entry.planar is not None)
+    ]
+    return (*ours, *others)
+
+
+def resolve(
+    names: Sequence[str], dimension: int, *, file: Path | None, overrides: Sequence[Override] = ()
+) -> tuple[Method, ...]:
+    """The methods of these names, settings checked.
+
+    file : TOML, one table a method; a table of another name is a variant and says of what by ``method``
+    overrides : keys of the configuration, for all of ours
+    Raises InputError for a name or a key that there is not.
+    """
+    tables = {} if file is None else _tables(file)
+    unused = [name for name in tables if name not in names]
+    if unused:
+        raise InputError(
+            f"{file}: [{unused[0]}] is not among the methods: {', '.join(names)}; add it to --methods"
+        )
+    if len(set(names)) < len(names):
+        raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --settings instead")
+    for override in overrides:
+        if override.key in ("matching.matcher", "loops.enabled"):
+            raise InputError(f"{override.flag} is what tells plicp, svd and +loops apart; choose by --methods")
+    return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
+
+
+def _method(
+    name: str, table: Mapping[str, Any], dimension: int, file: Path | None, overrides: Sequence[Override]
+) -> Method:
+    base, own = str(table.get(_BASE, name)), {key: value for key, value in table.items() if key != _BASE}
+    where = f"{file}: [{name}]"
+    if name.startswith("."):
+        raise InputError(f"{name!r} cannot be a folder's name; let the method's begin with a letter")
+    if base in OURS:
+        return Method(name, base, _our_settings(base, own, dimension, where, overrides))
+    if base in BASELINES:
+        return Method(name, base, _their_settings(name, base, own, dimension, where))
+    if base.count(":") == 1:
+        return Method(name, base, own)
+    known = ", ".join((*OURS, *BASELINES))
+    raise InputError(
+        f"there is no method {base!r}; choose among {known}, or say in --settings what [{name}] is a variant of"
+    )
+
+
+def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
+    """Those of a baseline, by key."""
+    defaults = BASELINES[base].settings if dimension == 3 else BASELINES[base].planar
+    if defaults is None:
+        raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")
+    try:
+        return msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(defaults) | own, type(defaults)))
+    except msgspec.ValidationError as error:
+        keys = ", ".join(type(defaults).__struct_fields__)
+        raise InputError(f"{where}: {error}; its keys are {keys}") from None
+
+
+def _our_settings(
+    base: str, own: Mapping[str, Any], dimension: int, where: str, overrides: Sequence[Override]
+) -> dict[str, Any]:
+    """The configuration of one of ours; no wheels unless they are asked for, since nobody else has them."""
+    wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")
+    kind = {"matching.matcher": base.partition("+")[0], "loops.enabled": str("+" in base).lower()}
+    table = [
+        Override(key, str(value), f"{where} {key}")
+        for section, keys in own.items()
+        for key, value in _by_key(section, keys).items()
+    ]
+    for each in table:
+        if each.key.partition(".")[0] in _SHARED:
+            raise InputError(f"{each.flag} holds for all methods; give it as --{each.key}")
+        if each.text.lower() != kind.get(each.key, each.text.lower()):
+            raise InputError(f"{each.flag} is {each.text}, but {base} has {kind[each.key]}; choose another method")
+    fixed = [Override(key, text, "scanchain compare") for key, text in kind.items()]
+    config = load_settings(dimension, overrides=(wheels, *table, *overrides, *fixed)).config
+    return {name: keys for name, keys in msgspec.to_builtins(config).items() if name not in _SHARED}
+
+
+def _by_key(section: str, keys: Any) -> dict[str, Any]:
+    """The values of a table, or of what should have been one, by the keys of the configuration."""
+    return (
+        {f"{section}.{key}": value for key, value in keys.items()} if isinstance(keys, dict) else {section: keys}
+    )
+
+
+def _tables(file: Path) -> dict[str, dict[str, Any]]:
+    try:
+        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); --settings takes a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: is not TOML: {' '.join(str(error).split())}") from None
+    for name, table in tree.items():
+        if not isinstance(table, dict):
+            raise InputError(f"{file}: {name} is no table; write [METHOD] above the keys of a method")
+    return tree

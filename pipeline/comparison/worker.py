@@ -1,0 +1,119 @@
+"""``python -m scanchain.comparison.worker SCANS FOLDER``: one method over all scans, in this process alone.
+
+FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Iterable
+from contextlib import nullcontext, suppress
+from itertools import islice
+from pathlib import Path
+from time import perf_counter, process_time
+
+import msgspec
+import numpy as np
+from numpy.lib.format import open_memmap
+
+from scanchain.comparison import runner
+from scanchain.comparison.methods import Method
+from scanchain.comparison.outcome import (
+    CPU_FILE,
+    POSES_FILE,
+    REPORT_FILE,
+    SECONDS_FILE,
+    TRAJECTORY_FILE,
+    EndReport,
+    Status,
+)
+from scanchain.comparison.scan_store import StoredScans, open_store
+from scanchain.data import Pose, Scan, Trajectory
+from scanchain.errors import MissingExtraError, ScanchainError
+from scanchain.memory import die_first, peak_mib
+from scanchain.runs.compiling import telling_of_compilation
+from scanchain.runs.progress import Unwatched
+
+METHOD_FILE = "method.msgpack"
+_WARM_UP_SCANS = 4
+_LONGEST = 300  # characters of an error that others raise
+
+
+def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
+    """Track every scan, then finish."""
+    began = perf_counter()
+    warm_up(scans.scans(), method, scans.T_base_lidar)
+    racer = runner.start(method, scans.T_base_lidar)
+    start_s = perf_counter() - began
+    size = scans.dimension + 1
+    poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
+    seconds = open_memmap(folder / SECONDS_FILE, "w+", np.float64, (len(scans),))
+    cpu_seconds = open_memmap(folder / CPU_FILE, "w+", np.float64, (len(scans),))
+    poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
+    for scan in scans.scans():
+        asked, cpu_asked = perf_counter(), process_time()
+        pose = racer.track(scan)
+        took_s, cpu_took_s = perf_counter() - asked, process_time() - cpu_asked
+        if not np.isfinite(pose).all():
+            raise ValueError("a pose that is not finite")
+        seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose
+    ended = perf_counter()
+    trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
+    np.save(folder / TRAJECTORY_FILE, trajectory.poses)
+    return EndReport(Status.OK, "", racer.description, start_s, perf_counter() - ended)
+
+
+def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
+    """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
+    if not runner.can_start_again(method):
+        return
+    racer = runner.start(method, T_base_lidar)
+    with suppress(Exception):
+        for scan in islice(scans, _WARM_UP_SCANS):
+            racer.track(scan)
+
+
+def main() -> None:
+    """Run, and say how it ended."""
+    store, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    die_first()
+    method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
+    compiler = _Compiler()
+    with telling_of_compilation(compiler) if method.is_ours else nullcontext():
+        report = _report(open_store(store), method, folder)
+    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=compiler.has_compiled)
+    (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
+
+
+class _Compiler(Unwatched):
+    """Hears that something is compiled."""
+
+    has_compiled = False
+
+    def say(self, line: str) -> None:
+        self.has_compiled = True
+
+
+def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
+    """Of the work, or of what came in between."""
+    try:
+        return work(scans, method, folder)
+    except MissingExtraError as error:
+        return EndReport(Status.MISSING, str(error))
+    except MemoryError as error:
+        return EndReport(Status.OUT_OF_MEMORY, _words(error))
+    except ScanchainError as error:
+        return EndReport(Status.CRASHED, str(error))
+    except Exception as error:  # others' code may raise anything
+        traceback.print_exc()
+        return EndReport(Status.CRASHED, _words(error))
+
+
+def _words(error: Exception) -> str:
+    """What it says, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:_LONGEST]}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
+
+from scanchain.evaluation.absolute import (
+    AbsoluteError,
+    absolute_error,
+    absolute_error_on_any_course,
+    on_the_estimate,
+)
+from scanchain.evaluation.alignment import Alignment, align
+from scanchain.evaluation.consistency import motion_nees
+from scanchain.evaluation.disagreement import disagreement
+from scanchain.evaluation.kitti import (
+    KITTI_LENGTHS_M,
+    SHORT_LENGTHS_M,
+    KittiError,
+    LengthError,
+    kitti_error,
+    kitti_error_on_any_course,
+)
+from scanchain.evaluation.pairing import Pairs, during, pair
+from scanchain.evaluation.reference import TruthFile, check_overlap, read_truth
+from scanchain.evaluation.relations import (
+    RELATION_LIMIT_S,
+    RelationError,
+    Relations,
+    read_relations,
+    relation_error,
+)
+from scanchain.evaluation.relative import (
+    RelativeError,
+    relative_error_over_distance,
+    relative_error_over_frames,
+    relative_error_over_time,
+)
+from scanchain.evaluation.sharpness import Sharpness, sampled_map, sampling_step, sharpness
+from scanchain.evaluation.statistics import Statistics
+
+__all__ = [
+    "KITTI_LENGTHS_M",
+    "RELATION_LIMIT_S",
+    "SHORT_LENGTHS_M",
+    "AbsoluteError",
+    "Alignment",
+    "KittiError",
+    "LengthError",
+    "Pairs",
+    "RelationError",
+    "Relations",
+    "RelativeError",
+    "Sharpness",
+    "Statistics",
+    "TruthFile",
+    "absolute_error",
+    "absolute_error_on_any_course",
+    "align",
+    "check_overlap",
+    "disagreement",
+    "during",
+    "kitti_error",
+    "kitti_error_on_any_course",
+    "motion_nees",
+    "on_the_estimate",
+    "pair",
+    "read_relations",
+    "read_truth",
+    "relation_error",
+    "relative_error_over_distance",
+    "relative_error_over_frames",
+    "relative_error_over_time",
+    "sampled_map",
+    "sampling_step",
+    "sharpness",
+]

@@ -1,0 +1,119 @@
+"""Absolute trajectory error: how far each pose is from where it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix, Pose, Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation.alignment import Alignment, align
+from scanchain.evaluation.pairing import Pairs, pair
+from scanchain.evaluation.statistics import Statistics
+
+_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+
+
+@dataclass(frozen=True, slots=True)
+class AbsoluteError:
+    """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
+
+    Attributes
+    ----------
+    definition : what was computed, in words; pairing : over which poses
+    alignment : how the frames were brought together
+    translation_m : of ‖t_ref − t_est‖
+    rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
+    path_length_m : of the reference, over the paired poses
+    T_reference_estimate : the alignment that was found
+    errors_m, errors_rad : (N,) pose by pose, in the order of the pairs
+    """
+
+    definition: str
+    pairing: str
+    alignment: Alignment
+    translation_m: Statistics
+    rotation_rad: Statistics
+    path_length_m: float
+    T_reference_estimate: Pose
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+
+    @property
+    def share_of_path(self) -> float | None:
+        """Root mean squared translational error over the length of the path; None where that is too short."""
+        return self.translation_m.rmse / self.path_length_m if self.path_length_m >= _SHORTEST_PATH_M else None
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        rotation, share = self.rotation_rad.scaled(np.degrees(1.0)), self.share_of_path
+        of_path = "" if share is None else f"; {100.0 * share:.3f} % of {self.path_length_m:.1f} m"
+        return (
+            f"ATE rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
+            f"max {self.translation_m.maximum:.4f}{of_path}), rotation rmse {rotation.rmse:.3f} deg"
+        )
+
+
+def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> AbsoluteError:
+    """Align the estimate to the reference and compare pose by pose."""
+    T = align(pairs.estimate, pairs.reference, alignment)
+    aligned = T @ pairs.estimate
+    errors_m = np.linalg.norm(pairs.reference[:, :3, 3] - aligned[:, :3, 3], axis=1)
+    rotations = "R_refᵀ R_est"
+    if alignment is Alignment.RIGID:
+        aligned = _turned(aligned, pairs.reference)
+        rotations += " turned by the best common rotation"
+    errors_rad = lie.rotation_angle(lie.between(pairs.reference, aligned))
+    return AbsoluteError(
+        definition=(
+            f"ATE: ‖t_ref − t_est‖ after alignment '{alignment}' ({alignment.description}) and the angle of "
+            f"{rotations}"
+        ),
+        pairing=pairs.description,
+        alignment=alignment,
+        translation_m=Statistics.of(errors_m),
+        rotation_rad=Statistics.of(errors_rad),
+        path_length_m=float(path_length(pairs.reference)[-1]),
+        T_reference_estimate=T,
+        errors_m=errors_m,
+        errors_rad=errors_rad,
+    )
+
+
+def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
+    """After rigid alignment or, where a straight course leaves that a free rotation, by the first pose."""
+    try:
+        return absolute_error(pairs)
+    except InputError:
+        return absolute_error(pairs, Alignment.FIRST)
+
+
+def on_the_estimate(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Trajectory:
+    """The reference at the stamps of the estimate, moved onto it by the alignment of the ATE.
+
+    Raises InputError where they have no pairs.
+    """
+    pairs = pair(estimate, reference, gap_s=gap_s)
+    T_reference_estimate = absolute_error_on_any_course(pairs).T_reference_estimate
+    return Trajectory(pairs.stamps_ns, lie.inverse(T_reference_estimate) @ pairs.reference)
+
+
+def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
+    """The estimate (N, 4, 4) turned by the one rotation R that minimises Σ ‖R_ref − R R_est‖² (Umeyama 1991).
+
+    Positions alone leave the roll about a straight course to the noise; a rotation error must not inherit that.
+    """
+    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3]))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return T @ estimate
+
+
+def path_length(poses: Matrix) -> NDArray[np.float64]:
+    """(N,) metres travelled up to each pose."""
+    steps_m = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
+    return np.append(0.0, np.cumsum(steps_m))

@@ -1,0 +1,28 @@
+"""Whether an odometry's covariances say how far off it is: the normalised squared error of its motions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix
+
+
+def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArray[np.float64]:
+    """(N−1,) ξᵀ Σ⁻¹ ξ / k of the motion between each pose and the next: 1 on average is exact, more overconfident.
+
+    poses, reference : (N, d+1, d+1) estimate and truth at the same instants
+    covariances : (N, k, k) of each pose by itself, of a twist in its own frame, T exp(ξ); where one is NaN so is
+        the answer. With M the motion, Σ = Σ_i+1 + Ad(M⁻¹) Σ_i Ad(M⁻¹)ᵀ, because both poses err independently.
+    """
+    motion = lie.between(poses[:-1], poses[1:])
+    true_motion = lie.between(reference[:-1], reference[1:])
+    error = lie.log(lie.between(true_motion, motion))
+    Ad = lie.adjoint(lie.inverse(motion))
+    covariance = covariances[1:] + Ad @ covariances[:-1] @ np.swapaxes(Ad, 1, 2)
+    result = np.full(len(motion), np.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    weighted = np.linalg.pinv(covariance[known], hermitian=True) @ error[known, :, None]
+    result[known] = np.einsum("ni,ni->n", error[known], weighted[..., 0]) / error.shape[1]
+    return result

@@ -1,0 +1,212 @@
+"""An estimated trajectory and the truth at the same stamps, interpolated where it has others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix, Trajectory
+from scanchain.errors import InputError
+from scanchain.words import counted
+
+_WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
+_INTERVALS = 5.0  # of the reference, at the median, that a gap may be wide by default
+_SAME_S = 1e-6  # what a stamp that was a floating-point number of seconds is off
+_ROUNDED_S = 5e-4  # what one written in milliseconds is off
+_FEW = 10  # poses, whose error says little
+_ROUNDING_SHARE = 0.1  # of the reference's median interval, that either is at most
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Estimate and reference, pose by pose, in the order and at the stamps of the estimate.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64, the estimate's
+    estimate, reference : (N, 4, 4) poses; SE(2) lifted into the plane z = 0
+    places : (N,) int64, of the poses among those of the estimate
+    estimate_count, reference_count : poses there were
+    interpolated : how many of the N reference poses lie between two of the reference's own
+    early, late, in_gap : estimated poses without a reference pose: before its begin, after its end, in gaps of it
+    gap_s : between true poses that may be interpolated over; widest_s : between those that were
+    """
+
+    stamps_ns: NDArray[np.int64]
+    estimate: Matrix
+    reference: Matrix
+    places: NDArray[np.int64]
+    estimate_count: int
+    reference_count: int
+    interpolated: int
+    early: int
+    late: int
+    in_gap: int
+    gap_s: float
+    widest_s: float
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def share(self) -> float:
+        """Share of the estimated poses that have a reference pose."""
+        return len(self) / self.estimate_count
+
+    @property
+    def missing(self) -> str:
+        """How many estimated poses have no reference pose and why; empty where all have one."""
+        reasons = ", ".join(self._reasons())
+        return f"{self.estimate_count - len(self):,} without a true pose: {reasons}" if reasons else ""
+
+    @property
+    def description(self) -> str:
+        """What was paired and how, in words."""
+        exact = len(self) - self.interpolated
+        how = ""
+        if self.interpolated:
+            how = (
+                f": {exact:,} as they are, {self.interpolated:,} interpolated (position linear, rotation by "
+                f"SLERP, gaps up to {self.gap_s:.3g} s), none extrapolated"
+            )
+        return (
+            f"{len(self):,} of {self.estimate_count:,} estimated poses ({100.0 * self.share:.1f} %), each with "
+            f"the reference (of {counted(self.reference_count, 'pose')}) at its stamp{how}"
+            + (f"; {self.missing}" if self.missing else "")
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        """Why figures over these pairs may mislead, a line each."""
+        lines = []
+        if 2 * len(self) < self.estimate_count:
+            lines.append(
+                f"accuracy is that of {len(self):,} of {self.estimate_count:,} scans alone: {self.missing}"
+            )
+        elif len(self) < _FEW:
+            lines.append(f"accuracy is that of {counted(len(self), 'pose')} alone")
+        if self.widest_s > _WIDEST_GAP_S:
+            lines.append(
+                f"true poses are up to {self.widest_s:.3g} s apart, and the path between them is taken as straight"
+            )
+        return lines
+
+    def _reasons(self) -> Iterator[str]:
+        if self.early:
+            yield f"{self.early:,} before the truth begins"
+        if self.late:
+            yield f"{self.late:,} after it ends"
+        if self.in_gap:
+            yield f"{self.in_gap:,} in gaps of it wider than {self.gap_s:.3g} s"
+
+
+def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Pairs:
+    """The reference at the stamps of the estimate: positions linear, rotations by SLERP between its neighbors.
+
+    A reference pose of the same stamp, to a microsecond, is taken as it is. Nothing is extrapolated: outside the
+    reference, and where its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within
+    the rounding of a stamp written in milliseconds. Neither trajectory's stamps need increase.
+
+    gap_s : None for five median intervals of the reference, at most 0.6 s
+    """
+    for name, trajectory in (("estimate", estimate), ("reference", reference)):
+        if not len(trajectory):
+            raise InputError(f"the {name} has no pose; nothing to compare")
+    order = np.argsort(reference.stamps_ns, kind="stable")
+    stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
+    interval_ns = _median_interval_ns(stamps_ns)
+    gap_ns = min(_INTERVALS * interval_ns, _WIDEST_GAP_S * 1e9) if gap_s is None else gap_s * 1e9
+    index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
+    after = np.searchsorted(stamps_ns, wanted_ns, side="right")
+    early, late = after == 0, after == len(stamps_ns)
+    before, after = np.maximum(after - 1, 0), np.minimum(after, len(stamps_ns) - 1)
+    interval = stamps_ns[after] - stamps_ns[before]
+    same_ns, rounded_ns = (
+        min(each * 1e9, _ROUNDING_SHARE * (interval_ns or np.inf)) for each in (_SAME_S, _ROUNDED_S)
+    )
+    between = ~early & ~late & (difference_ns > same_ns) & (interval <= gap_ns)
+    known = between | (difference_ns <= rounded_ns)
+    poses = reference.poses[index]
+    share = (wanted_ns - stamps_ns[before])[between] / interval[between]
+    poses[between] = _interpolated(
+        reference.poses[order[before[between]]], reference.poses[order[after[between]]], share
+    )
+    if not known.any():
+        raise InputError(_no_pairs(estimate, reference, gap_ns * 1e-9))
+    return Pairs(
+        stamps_ns=wanted_ns[known],
+        estimate=lie.lift(estimate.poses[known]),
+        reference=lie.lift(poses[known]),
+        places=np.flatnonzero(known),
+        estimate_count=len(estimate),
+        reference_count=len(reference),
+        interpolated=int(between.sum()),
+        early=int((early & ~known).sum()),
+        late=int((late & ~known).sum()),
+        in_gap=int((~early & ~late & ~known).sum()),
+        gap_s=gap_ns * 1e-9,
+        widest_s=float(interval[between].max(initial=0)) * 1e-9,
+    )
+
+
+def during(reference: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
+    """The reference from its last pose not after the first of these stamps to its first not before the last."""
+    there, first_ns, last_ns = reference.stamps_ns, stamps_ns.min(), stamps_ns.max()
+    begin_ns = np.max(there, where=there <= first_ns, initial=there.min())
+    end_ns = np.min(there, where=there >= last_ns, initial=there.max())
+    chosen = (there >= begin_ns) & (there <= end_ns)
+    return Trajectory(there[chosen], reference.poses[chosen])
+
+
+def nearest(
+    wanted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Index of the stamp nearest each wanted one, and the distance in ns.
+
+    Of equal stamps the first in the given order is taken, of two equally far ones the earlier.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    ordered = stamps_ns[order]
+    after = np.searchsorted(ordered, wanted_ns, side="left")
+    upper = np.minimum(after, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    lower = np.searchsorted(ordered, ordered[before], side="left")
+    to_upper, to_lower = np.abs(ordered[upper] - wanted_ns), np.abs(ordered[lower] - wanted_ns)
+    chosen = np.where(to_lower <= to_upper, lower, upper)
+    return order[chosen], np.minimum(to_lower, to_upper)
+
+
+def span(stamps_ns: NDArray[np.int64]) -> str:
+    """From the earliest stamp to the latest, in words."""
+    return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
+
+
+def _median_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
+    """Between successive different stamps; 0 where all are equal."""
+    intervals = np.diff(ordered_ns)
+    intervals = intervals[intervals > 0]
+    return float(np.median(intervals)) if len(intervals) else 0.0
+
+
+def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matrix:
+    """Poses (K, d+1, d+1) so far from a to b: position linear, rotation by SLERP."""
+    d = T_a.shape[-1] - 1
+    R_a, R_b = T_a.copy(), T_b.copy()
+    R_a[:, :d, d] = R_b[:, :d, d] = 0.0
+    result = lie.exp(share[:, None] * lie.log(R_b @ lie.inverse(R_a))) @ R_a
+    result[:, :d, d] = T_a[:, :d, d] + share[:, None] * (T_b[:, :d, d] - T_a[:, :d, d])
+    return result
+
+
+def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
+    here, there = estimate.stamps_ns, reference.stamps_ns
+    spans = f"the estimate ({span(here)}) has no pose with a true one beside it in the reference ({span(there)})"
+    if len(np.unique(there)) == 1:
+        return f"{spans}, which has poses at one instant alone; give true poses all along the trajectory"
+    if here.max() < there.min() or there.max() < here.min():
+        return f"{spans}; check that both keep the same clock"
+    return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"

@@ -1,0 +1,125 @@
+"""Relative pose error: how far a motion over a fixed stretch is from what it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.pairing import Pairs
+from scanchain.evaluation.statistics import Statistics
+from scanchain.words import counted
+
+_LARGEST = 2.0  # times the size asked for: a stretch that is longer is one of another size
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeError:
+    """RPE over stretches of one size (Sturm et al. 2012, eq. 1; Kümmerle et al. 2009).
+
+    Attributes
+    ----------
+    size : of the stretches, in words
+    definition : what was computed, in words; pairing : over which poses
+    translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
+    stretches : (M, 2) int64 places i, j among the pairs
+    errors_m, errors_rad : (M,) stretch by stretch
+    """
+
+    size: str
+    definition: str
+    pairing: str
+    translation_m: Statistics
+    rotation_rad: Statistics
+    stretches: NDArray[np.int64]
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        rotation = self.rotation_rad.scaled(np.degrees(1.0))
+        return (
+            f"RPE over {self.size}: rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
+            f"max {self.translation_m.maximum:.4f}), rotation rmse {rotation.rmse:.4f} deg "
+            f"over {counted(self.translation_m.count, 'stretch', 'stretches')}"
+        )
+
+
+def relative_error_over_frames(pairs: Pairs, frames: int = 1) -> RelativeError:
+    """RPE between each pair and the one ``frames`` later."""
+    if frames < 1:
+        raise InputError(f"RPE over {frames} frames is not defined; take at least 1")
+    end = np.arange(len(pairs)) + frames
+    return _relative_error(pairs, end, counted(frames, "paired pose"))
+
+
+def relative_error_over_distance(pairs: Pairs, distance_m: float) -> RelativeError:
+    """RPE from each pair to the first that lies at least ``distance_m`` further along the reference's path."""
+    if not distance_m > 0.0:
+        raise InputError(f"RPE over {distance_m:g} m is not defined; take more than 0")
+    travelled_m = path_length(pairs.reference)
+    end = _of_that_size(travelled_m, first_after(travelled_m, distance_m), distance_m)
+    return _relative_error(pairs, end, f"{distance_m:g} m along the reference")
+
+
+def relative_error_over_time(pairs: Pairs, duration_s: float) -> RelativeError:
+    """RPE from each pair to the first at least ``duration_s`` later; stamps that step back count as no time."""
+    if not duration_s > 0.0:
+        raise InputError(f"RPE over {duration_s:g} s is not defined; take more than 0")
+    elapsed_ns = np.maximum.accumulate(pairs.stamps_ns - pairs.stamps_ns[0])
+    duration_ns = round(duration_s * 1e9)
+    end = _of_that_size(
+        elapsed_ns, np.searchsorted(elapsed_ns, elapsed_ns + duration_ns, side="left"), duration_ns
+    )
+    return _relative_error(pairs, end, f"{duration_s:g} s")
+
+
+def first_after(travelled_m: NDArray[np.float64], distance_m: float) -> NDArray[np.int64]:
+    """(N,) index of the first pose at least ``distance_m`` further along, N where there is none."""
+    return np.searchsorted(travelled_m, travelled_m + distance_m, side="left")
+
+
+def _of_that_size(
+    along: NDArray[np.float64] | NDArray[np.int64], end: NDArray[np.int64], size: float
+) -> NDArray[np.int64]:
+    """The ends (N,) of stretches, N for one that has none, or whose pose after a gap makes it too large."""
+    reached = along[np.minimum(end, len(along) - 1)]
+    return np.where(reached - along <= _LARGEST * size, end, len(along))
+
+
+def motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> Matrix:
+    """E (M, 4, 4) = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each stretch (i, j)."""
+    i, j = stretches[:, 0], stretches[:, 1]
+    reference = lie.between(pairs.reference[i], pairs.reference[j])
+    estimate = lie.between(pairs.estimate[i], pairs.estimate[j])
+    return lie.between(reference, estimate)
+
+
+def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> RelativeError:
+    start = np.flatnonzero(end < len(pairs))
+    if not len(start):
+        raise InputError(
+            f"no stretch of {size} fits into {counted(len(pairs), 'paired pose')}; take a shorter one"
+        )
+    stretches = np.stack([start, end[start]], axis=1)
+    error = motion_errors(pairs, stretches)
+    errors_m, errors_rad = np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
+    return RelativeError(
+        size=size,
+        definition=(
+            f"RPE: translation and angle of (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) over {size}, from every start, "
+            f"{counted(len(stretches), 'stretch', 'stretches')}"
+        ),
+        pairing=pairs.description,
+        translation_m=Statistics.of(errors_m),
+        rotation_rad=Statistics.of(errors_rad),
+        stretches=stretches,
+        errors_m=errors_m,
+        errors_rad=errors_rad,
+    )

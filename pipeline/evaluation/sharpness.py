@@ -1,0 +1,105 @@
+"""How sharp the map is that a trajectory makes of a log, where there is no ground truth (Razlaw et al. 2015).
+
+The same points of the same scans are put where a trajectory has the lidar at their instants (between two stamps
+along the screw that joins the poses). Around the same query points, all neighbours within a radius make a
+covariance Σ (d, d) with smallest eigenvalue λ₁, and over the query points q
+
+    mean map entropy       1/Q Σ_q ½ ln det(2πe Σ(q))     in nats for Σ in m²
+    surface thickness      √(1/Q Σ_q λ₁(q))               in metres, the root of the mean variance across it
+
+A query point counts if in the map of every trajectory it has 10 neighbours at least and a covariance that is not
+flat by accident (λ₁ > 0). Lower is sharper. Moving objects blur all maps alike. It is not ground truth: a map that
+is bent but sharp scores well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.data import Points, Scan, Trajectory
+
+RADIUS_M = {2: 0.2, 3: 0.5}
+REACH_M = 40.0  # points further off are too sparse to judge by
+MIN_NEIGHBOURS = 10
+MAX_POINTS, MAX_QUERIES = 600_000, 15_000
+_HELD = 0.5  # share of the query points of the best map, below which a map has fallen apart
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """Lower is sharper."""
+
+    mean_map_entropy: float
+    thickness_m: float
+
+
+def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
+    """One answer a map of ``sampled_map``, all over the same query points.
+
+    None for a map that has fallen apart: it would leave too few points to judge the others by.
+    """
+    eigenvalues = np.array([_eigenvalues(points) for points in maps])
+    good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
+    held = good.sum(axis=1) >= _HELD * good.sum(axis=1).max(initial=0)
+    counts = good[held].all(axis=0)
+    if not counts.any():
+        return [None] * len(maps)
+    chosen = eigenvalues[:, counts]
+    return [_sharpness(each) if is_held else None for each, is_held in zip(chosen, held, strict=True)]
+
+
+def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Points:
+    """(M, d) every ``step``-th point within reach, in the frame of the trajectory, deskewed by it.
+
+    scans : one a pose of the trajectory
+    """
+    seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
+    motions = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
+    velocities = np.divide(motions, seconds, out=np.zeros_like(motions), where=seconds > 0.0)
+    rest = np.zeros((1, lie.twist_size(trajectory.poses[0])))
+    before = np.vstack([velocities[:1] if len(velocities) else rest, velocities])
+    after = np.vstack([velocities, velocities[-1:] if len(velocities) else rest])
+    rows = zip(scans, trajectory.poses, before, after, strict=True)
+    return np.concatenate([lie.transform(pose, _deskewed(scan, step, v, w)) for scan, pose, v, w in rows])
+
+
+def sampling_step(points: int) -> int:
+    """Of all points of a log every so many-th is taken."""
+    return max(1, points // MAX_POINTS)
+
+
+def _sharpness(eigenvalues: NDArray[np.float64]) -> Sharpness:
+    """Of eigenvalues (Q, d), ascending, m²."""
+    d = eigenvalues.shape[1]
+    entropy = 0.5 * (d * np.log(2.0 * np.pi * np.e) + np.log(eigenvalues).sum(axis=1)).mean()
+    return Sharpness(float(entropy), float(np.sqrt(eigenvalues[:, 0].mean())))
+
+
+def _deskewed(scan: Scan, step: int, before: NDArray[np.float64], after: NDArray[np.float64]) -> Points:
+    """Points as seen at the stamp, by the velocity up to it and the one from it on."""
+    near = np.linalg.norm(scan.points[::step], axis=1) < REACH_M
+    points = scan.points[::step][near].astype(np.float64)
+    if not len(scan.times_s):
+        return points
+    times_s = scan.times_s[::step][near].astype(np.float64)[:, None]
+    T_stamp_point = lie.exp(np.where(times_s < 0.0, before, after) * times_s)
+    d = points.shape[1]
+    return np.einsum("nij,nj->ni", T_stamp_point[:, :d, :d], points) + T_stamp_point[:, :d, d]
+
+
+def _eigenvalues(points: Points) -> NDArray[np.float64]:
+    """(Q, d) ascending, m², of the covariance around every query point; NaN where there are too few neighbours."""
+    d = points.shape[1]
+    queries = points[:: max(1, len(points) // MAX_QUERIES)]
+    neighbours = KDTree(points).query_ball_point(queries, RADIUS_M[d], return_sorted=False)
+    result = np.full((len(queries), d), np.nan)
+    for row, chosen in enumerate(neighbours):
+        if len(chosen) >= MIN_NEIGHBOURS:
+            result[row] = np.linalg.eigvalsh(np.cov(points[chosen].T))
+    return result

@@ -1,0 +1,9 @@
+"""Worlds with exact ground truth, written as MCAP."""
+
+from scanchain.simulation.drive import Drive, plan
+from scanchain.simulation.information import information, spectrum, undetermined
+from scanchain.simulation.log import simulate
+from scanchain.simulation.sensors import SENSORS
+from scanchain.simulation.worlds import WORLDS
+
+__all__ = ["SENSORS", "WORLDS", "Drive", "information", "plan", "simulate", "spectrum", "undetermined"]

@@ -1,0 +1,105 @@
+"""Furniture for the rooms of an office, put where nothing is in its way."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from scanchain.data import Matrix
+from scanchain.simulation.solids import Scenery
+
+_ROUTE_M = 0.5  # kept free beside the robot's route
+_DOOR_M = 1.0  # kept free around a doorway
+_TRIES = 12
+
+Kind = Literal["shelf", "desk", "bin", "plant"]
+_SIZES_M: dict[Kind, tuple[float, float]] = {
+    "shelf": (1.2, 0.35),
+    "desk": (1.6, 1.5),  # with its chair
+    "bin": (0.3, 0.3),
+    "plant": (0.4, 0.4),
+}
+
+
+class Room(NamedTuple):
+    """A rectangle between the middles of its walls, metres."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+
+class Furnisher:
+    """Fills rooms at random; a piece that finds no place after a few tries is left out."""
+
+    def __init__(self, scenery: Scenery, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
+        self._scenery = scenery
+        self._route = route
+        self._doors = doors
+        self._rng = rng
+        self._taken: list[tuple[Matrix, Matrix]] = []  # centre and half size
+
+    def furnish(self, room: Room) -> None:
+        """Shelves along the walls, a desk for every 5 m², bins and a plant."""
+        desks = int((room.x1 - room.x0) * (room.y1 - room.y0) / 5.0)
+        wishes: tuple[tuple[Kind, int], ...] = (("shelf", 3), ("desk", desks), ("bin", 2), ("plant", 1))
+        for kind, count in wishes:
+            for _ in range(count):
+                any(self._try(kind, room) for _ in range(_TRIES))
+
+    def _try(self, kind: Kind, room: Room) -> bool:
+        """Put one piece at a random place in the room, unless something is in its way."""
+        upright = int(self._rng.integers(2))
+        half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
+        low = np.array([room.x0, room.y0]) + 0.1 + half
+        high = np.array([room.x1, room.y1]) - 0.1 - half
+        centre = self._rng.uniform(low, high)
+        if kind == "shelf":  # its back to a wall
+            axis = 1 - upright
+            centre[axis] = (low, high)[int(self._rng.integers(2))][axis]
+        if not self._is_free(centre, half):
+            return False
+        self._taken.append((centre, half))
+        self._put(kind, float(centre[0]), float(centre[1]), 0.5 * np.pi * upright)
+        return True
+
+    def _is_free(self, centre: Matrix, half: Matrix) -> bool:
+        if any(np.all(np.abs(centre - other) < half + other_half + 0.05) for other, other_half in self._taken):
+            return False
+        free = ((self._route, _ROUTE_M), (self._doors, _DOOR_M))
+        return all(_distance_m(places, centre, half) >= limit for places, limit in free)
+
+    def _put(self, kind: Kind, x: float, y: float, yaw_rad: float) -> None:
+        match kind:
+            case "shelf":
+                self._scenery.box((x, y), _SIZES_M["shelf"], (0.0, self._rng.uniform(0.8, 2.0)), yaw_rad)
+            case "desk":
+                self._put_desk(x, y, yaw_rad + np.pi * int(self._rng.integers(2)))
+            case "bin":
+                self._scenery.cylinder((x, y), 0.14, (0.0, 0.35))
+            case "plant":
+                self._scenery.cylinder((x, y), 0.18, (0.0, 0.4))
+                self._scenery.ellipsoid((x, y, 0.9), (0.35, 0.35, 0.5))
+
+    def _put_desk(self, x: float, y: float, yaw_rad: float) -> None:
+        """A table on four legs, drawers beneath it, a chair on its foot in front."""
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+
+        def at(u: float, v: float) -> tuple[float, float]:
+            return float(x + c * u - s * v), float(y + s * u + c * v)
+
+        self._scenery.box(at(0.0, 0.35), (1.6, 0.8), (0.71, 0.74), yaw_rad)
+        for u, v in ((-0.76, 0.0), (0.76, 0.0), (-0.76, 0.7), (0.76, 0.7)):
+            self._scenery.box(at(u, v), (0.06, 0.06), (0.0, 0.71), yaw_rad)
+        self._scenery.box(at(0.5, 0.4), (0.42, 0.58), (0.05, 0.65), yaw_rad)
+        chair = at(self._rng.uniform(-0.35, 0.2), self._rng.uniform(-0.4, -0.1))
+        self._scenery.cylinder(chair, 0.05, (0.0, 0.45))
+        self._scenery.cylinder(chair, 0.24, (0.45, 0.52))
+
+
+def _distance_m(places: Matrix, centre: Matrix, half: Matrix) -> float:
+    """Distance from the nearest of (N, 2) places to an upright rectangle."""
+    outside = np.maximum(np.abs(places - centre) - half, 0.0)
+    return float(np.linalg.norm(outside, axis=1).min())

@@ -1,0 +1,140 @@
+"""A drive through a world, written as an MCAP log with its exact truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.data import Matrix, Trajectory
+from scanchain.errors import InputError
+from scanchain.logs.write import LogWriter
+from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
+from scanchain.simulation.motion import Motion
+from scanchain.simulation.sensors import Sensor
+from scanchain.simulation.sweep import Sweep, take_sweep
+from scanchain.simulation.wheels import wheel_odometry
+
+ODOMETRY_PERIOD_NS = 20_000_000
+
+
+def simulate(
+    world: str,
+    destination: Path,
+    *,
+    seed: int = 0,
+    duration_s: float | None = None,
+    sensor: str | None = None,
+    drift: float = 1.0,
+    noise_m: float | None = None,
+    dropout: float | None = None,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Write a log of a drive to ``destination`` and the truth beside it as .tum; the same seed, the same bytes.
+
+    A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
+    The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
+    of every scan, exact) and /tf_static (T_base_lidar); in the holes of a world, /odom alone goes on. ``drift``
+    multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
+    ``progress`` is told scans done and scans in all.
+
+    Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
+    """
+    check_range("drift", drift, 0.0, 100.0)
+    truth_file = destination.with_suffix(".tum")
+    if truth_file.exists() and not force:
+        raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
+    drive = plan(world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout)
+    truth = drive.truth()
+    period_ns = drive.sensor.period_ns
+    with LogWriter(destination, force=force) as log:
+        log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
+        end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
+        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
+        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
+            stamp_ns = int(truth.stamps_ns[done])
+            wheels.write_until(stamp_ns - 1)  # in a hole
+            log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
+            wheels.write_until(stamp_ns + period_ns)
+            _write_sweep(log, sweep, drive.sensor, stamp_ns)
+            if progress is not None:
+                progress(done + 1, len(truth))
+    write_tum(truth, truth_file)
+    return truth
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write ``stamp x y z qx qy qz qw`` lines; stamps in seconds with all nine decimals."""
+    poses = lie.lift(trajectory.poses)
+    rows = np.column_stack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
+    lines = []
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        lines.append(f"{seconds}.{nanoseconds:09d} " + " ".join(f"{value:.9f}" for value in row))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
+    """All recorded scans in order; the next is cast in a thread while the last is written."""
+
+    def take(index: int) -> Sweep:
+        start_s = index * drive.sensor.period_ns * 1e-9
+        return take_sweep(drive.solids, drive.motion, drive.sensor, index, start_s, rng)
+
+    with ThreadPoolExecutor(max_workers=1) as caster:
+        upcoming = caster.submit(take, int(drive.scans[0]))
+        for index in drive.scans[1:]:
+            sweep = upcoming.result()
+            upcoming = caster.submit(take, int(index))
+            yield sweep
+        yield upcoming.result()
+
+
+class _Wheels:
+    """Writes the wheel odometry as the log's clock goes on."""
+
+    def __init__(
+        self, log: LogWriter, motion: Motion, end_ns: int, drift: float, rng: np.random.Generator
+    ) -> None:
+        self._log = log
+        self._stamps_ns = EPOCH_NS + np.arange(0, end_ns + 1, ODOMETRY_PERIOD_NS)
+        times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
+        self._poses = wheel_odometry(motion.base(times_s), drift=drift, rng=rng)
+        self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drift, 1e-3) ** 2
+        self._next = 0
+
+    def write_until(self, time_ns: int) -> None:
+        while self._next < len(self._stamps_ns) and self._stamps_ns[self._next] <= time_ns:
+            stamp_ns = int(self._stamps_ns[self._next])
+            pose: Matrix = self._poses[self._next]
+            self._log.odometry("/odom", stamp_ns, "odom", "base_link", pose, self._covariance)
+            self._next += 1
+
+
+def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:
+    end_ns = stamp_ns + sensor.period_ns
+    if sensor.dimension == 3:
+        points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
+        log.point_cloud(
+            "/points", stamp_ns, "lidar", points, times_s=sweep.times_s(), ring=ring, log_time_ns=end_ns
+        )
+        return
+    first, second = sweep.rays.directions[:2]
+    angle_min = float(np.arctan2(first[1], first[0]))
+    log.laser_scan(
+        "/scan",
+        stamp_ns,
+        "lidar",
+        angle_min,
+        float(np.arctan2(second[1], second[0])) - angle_min,
+        float(sweep.rays.instants_ns[-1]) * 1e-9 / (len(sweep.ranges_m) - 1),
+        sweep.ranges_m,
+        range_min_m=sensor.min_range_m,
+        range_max_m=sensor.max_range_m,
+        scan_time_s=sensor.period_ns * 1e-9,
+        log_time_ns=end_ns,
+    )

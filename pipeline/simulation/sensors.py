@@ -1,0 +1,108 @@
+"""The lidars: where each ray points and when it is fired."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """The rays of one scan, in the order they are fired.
+
+    Attributes
+    ----------
+    directions : (N, 3) unit vectors, sensor frame
+    instants_ns : (P,) int64, the firing instants after the scan's stamp, from 0 up
+    instant_of_ray : (N,) int32
+    ring : (N,) uint16, 0 is the lowest; all 0 where there are no rings
+    """
+
+    directions: Matrix
+    instants_ns: NDArray[np.int64]
+    instant_of_ray: NDArray[np.int32]
+    ring: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A lidar: ``dimension`` 2 gives LaserScan, 3 PointCloud2; ``rays`` of the scan with a given index.
+
+    ``noise_m`` is the standard deviation of a range, ``dropout`` the share of returns that are lost.
+    """
+
+    dimension: int
+    period_ns: int
+    min_range_m: float
+    max_range_m: float
+    noise_m: float
+    dropout: float
+    rays: Callable[[int], Rays]
+
+
+def _planar(beams: int, step_deg: float, period_ns: int) -> Callable[[int], Rays]:
+    """One ring that turns counter-clockwise and looks ahead; its blind angle is behind."""
+    azimuth = np.deg2rad(step_deg) * (np.arange(beams) - 0.5 * (beams - 1))
+    rays = Rays(
+        directions=np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(beams)], axis=1),
+        instants_ns=np.rint(np.arange(beams) * (period_ns * step_deg / 360.0)).astype(np.int64),
+        instant_of_ray=np.arange(beams, dtype=np.int32),
+        ring=np.zeros(beams, dtype=np.uint16),
+    )
+    return lambda index: rays
+
+
+def _spinning(elevations_deg: NDArray[np.float64], columns: int, period_ns: int) -> Callable[[int], Rays]:
+    """Rings that turn clockwise from straight behind; the rays of a column are fired together."""
+    rings = len(elevations_deg)
+    azimuth = np.repeat(np.pi - 2.0 * np.pi * np.arange(columns) / columns, rings)
+    elevation = np.tile(np.deg2rad(elevations_deg), columns)
+    level = np.cos(elevation)
+    rays = Rays(
+        directions=np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1),
+        instants_ns=np.rint(np.arange(columns) * (period_ns / columns)).astype(np.int64),
+        instant_of_ray=np.repeat(np.arange(columns, dtype=np.int32), rings),
+        ring=np.tile(np.arange(rings, dtype=np.uint16), columns),
+    )
+    return lambda index: rays
+
+
+def _rosette(count: int, period_ns: int) -> Callable[[int], Rays]:
+    """Two wedges turning against each other draw a rosette that never repeats: other directions in every scan.
+
+    Half the field of view is 19.2°; the wedges turn at 7294 and −4664 rpm (Livox Mid-40: Brazeal et al. 2021).
+    """
+    instants_ns = np.rint(np.arange(count) * (period_ns / count)).astype(np.int64)
+
+    def rays(index: int) -> Rays:
+        times_s = (index * period_ns + instants_ns) * 1e-9
+        first, second = (2.0 * np.pi * rpm / 60.0 * times_s for rpm in (7294.0, -4664.0))
+        sideways = 0.5 * np.deg2rad(19.2) * (np.cos(first) + np.cos(second))
+        upwards = 0.5 * np.deg2rad(19.2) * (np.sin(first) + np.sin(second))
+        level = np.cos(upwards)
+        return Rays(
+            np.stack([level * np.cos(sideways), level * np.sin(sideways), np.sin(upwards)], axis=1),
+            instants_ns,
+            np.arange(count, dtype=np.int32),
+            np.zeros(count, dtype=np.uint16),
+        )
+
+    return rays
+
+
+_TENTH_S = 100_000_000  # ns
+_HDL64_DEG = np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
+
+SENSORS: dict[str, Sensor] = {
+    "lms-270": Sensor(2, _TENTH_S, 0.1, 30.0, 0.01, 0.01, _planar(541, 0.5, _TENTH_S)),
+    "utm-30": Sensor(2, 25_000_000, 0.1, 30.0, 0.01, 0.01, _planar(1081, 0.25, 25_000_000)),
+    "hdl-64": Sensor(3, _TENTH_S, 1.0, 100.0, 0.02, 0.02, _spinning(_HDL64_DEG, 2000, _TENTH_S)),
+    "os1-32": Sensor(3, _TENTH_S, 0.5, 100.0, 0.02, 0.02, _spinning(np.linspace(-22.5, 22.5, 32), 1024, _TENTH_S)),
+    "vlp-16": Sensor(3, _TENTH_S, 0.5, 100.0, 0.03, 0.02, _spinning(np.linspace(-15.0, 15.0, 16), 1800, _TENTH_S)),
+    "rosette": Sensor(3, _TENTH_S, 0.5, 100.0, 0.02, 0.02, _rosette(10_000, _TENTH_S)),
+}

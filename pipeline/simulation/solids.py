@@ -1,0 +1,134 @@
+"""What a world is made of, and the scenery it is built up in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Matrix
+from scanchain.kernels.raycast import cast_rays
+
+FLAT = np.zeros(7)
+
+
+@dataclass(frozen=True, slots=True)
+class Solids:
+    """Closed solids above a rolling ground, metres, world frame.
+
+    Attributes
+    ----------
+    boxes : (B, 8) centre x, y, half lengths x, y, bottom, top, cos and sin of the yaw
+    cylinders : (C, 5) upright: centre x, y, radius, bottom, top
+    ellipsoids : (E, 6) centre x, y, z, radii x, y, z
+    ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
+    """
+
+    boxes: Matrix
+    cylinders: Matrix
+    ellipsoids: Matrix
+    ground: NDArray[np.float64]
+
+    def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
+        """Height of the ground at (..., 2) places."""
+        return _height(self.ground, xy)
+
+    def ground_slope(self, xy: Matrix) -> Matrix:
+        """Gradient of the ground at (..., 2) places."""
+        g = self.ground
+        along_x = g[1] * g[2] * np.cos(g[2] * xy[..., 0] + g[3])
+        along_y = g[4] * g[5] * np.cos(g[5] * xy[..., 1] + g[6])
+        for a, b, c, d in g[7:].reshape(-1, 4):
+            steepness = a * np.cos(b * xy[..., 0] + c * xy[..., 1] + d)
+            along_x, along_y = along_x + b * steepness, along_y + c * steepness
+        return np.stack([along_x, along_y], axis=-1)
+
+    def cast(
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
+    ) -> NDArray[np.float64]:
+        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
+        return self.strike(T_world_sensor, pose_of_ray, directions, max_range_m)[0]
+
+    def strike(
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Range along each ray as in ``cast``, and which solid it hit, −1 where none.
+
+        Solids are counted through boxes, cylinders, ellipsoids, the ground last.
+        """
+        ranges_m = np.empty(len(directions))
+        solid_of_ray = np.empty(len(directions), dtype=np.int32)
+        origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
+        rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
+        cast_rays(
+            origins, rotations, pose_of_ray, directions,
+            self.boxes, self.cylinders, self.ellipsoids, self.ground, max_range_m, ranges_m, solid_of_ray,
+        )  # fmt: skip
+        return ranges_m, solid_of_ray
+
+    def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
+        """Distance in the plane from (N, 2) places to the nearest solid that begins less than ``below_m`` up."""
+        nearest = np.full(len(xy), np.inf)
+        for cx, cy, half_x, half_y, _, _, c, s in self._low(self.boxes, 4, below_m):
+            dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
+            outside_x = np.maximum(np.abs(c * dx + s * dy) - half_x, 0.0)
+            outside_y = np.maximum(np.abs(-s * dx + c * dy) - half_y, 0.0)
+            nearest = np.minimum(nearest, np.hypot(outside_x, outside_y))
+        for cx, cy, radius, _, _ in self._low(self.cylinders, 3, below_m):
+            nearest = np.minimum(nearest, np.hypot(xy[:, 0] - cx, xy[:, 1] - cy) - radius)
+        low = self.ellipsoids[:, 2] - self.ellipsoids[:, 5] - self.ground_height(self.ellipsoids[:, :2]) < below_m
+        for cx, cy, _, radius_x, radius_y, _ in self.ellipsoids[low]:
+            nearest = np.minimum(nearest, np.hypot(xy[:, 0] - cx, xy[:, 1] - cy) - max(radius_x, radius_y))
+        return nearest
+
+    def _low(self, solids: Matrix, bottom_column: int, below_m: float) -> Matrix:
+        return solids[solids[:, bottom_column] - self.ground_height(solids[:, :2]) < below_m]
+
+
+class Scenery:
+    """A world under construction: solids are put down one by one and keep off what must stay free."""
+
+    def __init__(self, ground: NDArray[np.float64] = FLAT) -> None:
+        self._ground = ground
+        self._boxes: list[tuple[float, ...]] = []
+        self._cylinders: list[tuple[float, ...]] = []
+        self._ellipsoids: list[tuple[float, ...]] = []
+
+    def box(
+        self, centre: tuple[float, float], size: tuple[float, float], z: tuple[float, float], yaw_rad: float = 0.0
+    ) -> None:
+        """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its centre."""
+        base = self._base(centre)
+        half = (0.5 * size[0], 0.5 * size[1])
+        self._boxes.append((*centre, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
+
+    def cylinder(self, centre: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
+        """Put down an upright cylinder, heights ``z`` above the ground at its centre."""
+        base = self._base(centre)
+        self._cylinders.append((*centre, radius, base + z[0], base + z[1]))
+
+    def ellipsoid(self, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
+        """Put down an ellipsoid; its centre's height counts from the ground there."""
+        x, y, z = centre
+        self._ellipsoids.append((x, y, z + self._base((x, y)), *radii))
+
+    def finish(self) -> Solids:
+        """The solids put down so far."""
+        return Solids(
+            boxes=np.array(self._boxes, dtype=np.float64).reshape(-1, 8),
+            cylinders=np.array(self._cylinders, dtype=np.float64).reshape(-1, 5),
+            ellipsoids=np.array(self._ellipsoids, dtype=np.float64).reshape(-1, 6),
+            ground=self._ground,
+        )
+
+    def _base(self, centre: tuple[float, float]) -> float:
+        return float(_height(self._ground, np.array(centre)))
+
+
+def _height(ground: NDArray[np.float64], xy: Matrix) -> NDArray[np.float64]:
+    g = ground
+    height = g[0] + g[1] * np.sin(g[2] * xy[..., 0] + g[3]) + g[4] * np.sin(g[5] * xy[..., 1] + g[6])
+    for a, b, c, d in g[7:].reshape(-1, 4):
+        height = height + a * np.sin(b * xy[..., 0] + c * xy[..., 1] + d)
+    return height
