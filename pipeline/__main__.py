@@ -1,4 +1,4 @@
-"""The command line; the one place where the pipeline meets its viewer."""
+"""The command line."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import errno
 import gc
 import os
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import click
 
@@ -27,14 +25,7 @@ from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
 from scanchain.commands.view import view
-from scanchain.config import RecordingConfig
 from scanchain.errors import InputError, ScanchainError, told
-from scanchain.runs.recorder import Recorder, SinkName, Viewing
-
-if TYPE_CHECKING:
-    from scanchain.batch.task import Row
-    from scanchain.graph.optimisation import GraphChange
-    from scanchain.landmarks.study import Study
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -62,14 +53,10 @@ for _command in _COMMANDS:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
-    viewing = Viewing(
-        _record, _show, _draw, _report, _present_batch, _present_comparison, _draw_graph, _record_graph,
-        _present_landmarks, _record_landmarks,
-    )  # fmt: skip
     words = list(sys.argv[1:] if arguments is None else arguments)
     atexit.register(gc.freeze)  # else garbage is sought once more, for half a second, before the interpreter goes
     try:
-        return scanchain.main(words, prog_name="scanchain", obj=viewing, standalone_mode=False) or 0
+        return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 2
@@ -112,70 +99,6 @@ def _with_near_options(error: click.NoSuchOption) -> click.NoSuchOption:
 def _fail(message: str, code: int) -> int:
     click.echo(f"error: {' '.join(message.split())}", err=True)
     return code
-
-
-def _record(
-    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
-) -> Recorder:
-    from scanchain.viz.recording import Recording
-
-    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
-
-
-def _show(path: Path, tell: Callable[[str], None], in_browser: bool) -> None:
-    from scanchain.viz.show import show
-
-    show(path, tell, in_browser=in_browser)
-
-
-def _draw(directory: Path, picture: Path) -> None:
-    from scanchain.viz.run_picture import draw_run
-
-    draw_run(directory, picture)
-
-
-def _draw_graph(change: GraphChange, picture: Path) -> None:
-    from scanchain.viz.graph_picture import draw_graph
-
-    draw_graph(change, picture)
-
-
-def _record_graph(change: GraphChange, path: Path) -> None:
-    from scanchain.viz.graph_recording import record_graph
-
-    record_graph(change, path)
-
-
-def _report(directory: Path) -> None:
-    from scanchain.viz.run_report import write_run_report
-
-    write_run_report(directory)
-
-
-def _present_batch(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
-    from scanchain.viz.batch_report import write_batch_report
-
-    write_batch_report(directory, rows, command)
-
-
-def _present_comparison(directory: Path) -> None:
-    from scanchain.viz.compare_recording import record_comparison
-    from scanchain.viz.compare_report import write_compare_report
-
-    write_compare_report(directory)
-    record_comparison(directory)
-
-
-def _present_landmarks(directory: Path, studies: Sequence[Study]) -> None:
-    from scanchain.viz.landmark_report import write_report
-
-    write_report(directory, studies)
-
-
-def _record_landmarks(studies: Sequence[Study], path: Path) -> None:
-    from scanchain.viz.landmark_recording import record_landmarks
-
-    record_landmarks(studies, path)
 
 
 if __name__ == "__main__":

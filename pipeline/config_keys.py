@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 import re
@@ -11,7 +10,6 @@ from numbers import Real
 from typing import Literal
 
 from msgspec import inspect
-from msgspec.structs import fields
 
 from scanchain.errors import InputError, shown
 
@@ -118,14 +116,6 @@ class ConfigKey:
 
 
 @functools.cache
-def config_keys() -> dict[str, ConfigKey]:
-    """All keys by name, in the order of the tree."""
-    from scanchain.config import Config
-
-    return {key.name: key for field in fields(Config) for key in section_keys(field.type)}
-
-
-@functools.cache
 def section_keys(section: type) -> tuple[ConfigKey, ...]:
     """The keys of one section, ``LocalMapConfig`` being that of ``local_map``, in the order of its fields."""
     tree = inspect.type_info(section)
@@ -134,27 +124,6 @@ def section_keys(section: type) -> tuple[ConfigKey, ...]:
     return tuple(
         _leaf(f"{'_'.join(words).lower()}.{field.name}", field.type, field.default) for field in tree.fields
     )
-
-
-def find_key(name: str, source: str) -> ConfigKey:
-    """The key of that name; else the error names the nearest one there is."""
-    keys = config_keys()
-    if name in keys:
-        return keys[name]
-    subject = source if name in source else f"{source}: {name}"
-    raise InputError(f"{subject} is not a configuration key; {_remedy(name, tuple(keys))}")
-
-
-def _remedy(name: str, keys: tuple[str, ...]) -> str:
-    section, _, leaf = name.rpartition(".")
-    same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
-    inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
-    near = difflib.get_close_matches(name, same_leaf, n=1, cutoff=0.0)
-    near = near or [inside[other] for other in difflib.get_close_matches(leaf, inside, n=1)]
-    if not near and not inside:
-        near = difflib.get_close_matches(name, keys, n=1)
-    listing = "all keys: scanchain config show"
-    return f"did you mean {near[0]}? ({listing})" if near else listing
 
 
 def _leaf(name: str, kind: inspect.Type, default: Value) -> ConfigKey:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,9 +11,10 @@ from pathlib import Path
 
 import msgspec
 import tomli_w
+from msgspec.structs import fields
 
 from scanchain.config import Config
-from scanchain.config_keys import Value, config_keys, find_key
+from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, shown
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
@@ -61,6 +64,21 @@ class Settings:
     config: Config
     source: str
     without_effect: tuple[str, ...] = ()
+
+
+@functools.cache
+def config_keys() -> dict[str, ConfigKey]:
+    """All keys by name, in the order of the tree."""
+    return {key.name: key for field in fields(Config) for key in section_keys(field.type)}
+
+
+def find_key(name: str, source: str) -> ConfigKey:
+    """The key of that name; else the error names the nearest one there is."""
+    keys = config_keys()
+    if name in keys:
+        return keys[name]
+    subject = source if name in source else f"{source}: {name}"
+    raise InputError(f"{subject} is not a configuration key; {_remedy(name, tuple(keys))}")
 
 
 def load_settings(
@@ -204,3 +222,15 @@ def _check_order(
         if isinstance(low, float) and isinstance(high, float) and not low < high:
             where = flags.get(lower) or flags.get(upper) or source
             raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")
+
+
+def _remedy(name: str, keys: tuple[str, ...]) -> str:
+    section, _, leaf = name.rpartition(".")
+    same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
+    inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
+    near = difflib.get_close_matches(name, same_leaf, n=1, cutoff=0.0)
+    near = near or [inside[other] for other in difflib.get_close_matches(leaf, inside, n=1)]
+    if not near and not inside:
+        near = difflib.get_close_matches(name, keys, n=1)
+    listing = "all keys: scanchain config show"
+    return f"did you mean {near[0]}? ({listing})" if near else listing

@@ -7,9 +7,8 @@ import pytest
 from scenes import ROOT, configured
 
 from scanchain.config import Config
-from scanchain.config_keys import config_keys
 from scanchain.errors import InputError
-from scanchain.settings import Override, dump, flatten, load_settings, preset_path, read_layer
+from scanchain.settings import Override, config_keys, dump, flatten, load_settings, preset_path, read_layer
 
 
 def flag(key, text):

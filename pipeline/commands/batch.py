@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -18,9 +17,6 @@ from scanchain.errors import InputError, ScanchainError
 from scanchain.settings import Override
 from scanchain.source import Source
 from scanchain.words import counted
-
-if TYPE_CHECKING:
-    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 _DAY_S = 86_400.0
@@ -110,11 +106,12 @@ def batch(
         memory_mib=memory_mib,
         retries=retries,
     )
+    from scanchain.viz.batch_report import write_batch_report
+
     with Terminal("logs") as terminal:
         batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
     click.echo(batched.summary, nl=False)
-    viewing: Viewing = ctx.obj
-    viewing.present_batch(job.out, batched.rows, sys.argv)
+    write_batch_report(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
     click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")
     if batched.failures:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,9 +13,6 @@ from scanchain.commands.log_type import LOG
 from scanchain.commands.override_command import OverrideCommand, alias, overrides
 from scanchain.errors import ScanchainError
 from scanchain.source import Source
-
-if TYPE_CHECKING:
-    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 
@@ -101,11 +97,19 @@ def compare(
         force=force,
         command=tuple(sys.argv),
     )
-    viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
-        compared = run_contest(contest, viewing.present_comparison, terminal)
+        compared = run_contest(contest, _present, terminal)
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
     if not as_json:
         click.echo(f"written {contest.out}: report.html, compare.rrd, tables")
     if compared.failures:
         raise ScanchainError(f"did not come to their end: {', '.join(compared.failures)}; the table says how")
+
+
+def _present(directory: Path) -> None:
+    """Add report and recording to a comparison's directory."""
+    from scanchain.viz.compare_recording import record_comparison
+    from scanchain.viz.compare_report import write_compare_report
+
+    write_compare_report(directory)
+    record_comparison(directory)

@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from scanchain.commands.override_command import OverrideCommand, overrides
-from scanchain.config_keys import Value, config_keys
-from scanchain.settings import Settings, dump, flatten, load_settings
+from scanchain.config_keys import Value
+from scanchain.settings import Settings, config_keys, dump, flatten, load_settings
 
 _FILE = click.option(
     "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset."

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from scanchain.landmarks.dead_reckoning import OdometryNoise
     from scanchain.landmarks.minimise import Optimiser
     from scanchain.landmarks.study import Guess, Study
-    from scanchain.runs.recorder import Viewing
 
 
 @click.command(cls=OnceCommand)
@@ -112,9 +111,9 @@ def landmarks(
     from scanchain.landmarks.write import text_of, tree_of
     from scanchain.runs.compiling import telling_of_compilation
     from scanchain.runs.directory import RunDirectory
+    from scanchain.viz.landmark_report import write_report
 
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
-    viewing: Viewing = ctx.obj
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
     _check_options(ctx, {"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
@@ -128,9 +127,11 @@ def landmarks(
         _check_names(studies)
         tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
         _write(directory.path, data, studies, tree)
-        viewing.present_landmarks(directory.path, studies)
+        write_report(directory.path, studies)
         if recording is not None:
-            viewing.record_landmarks(studies, recording)
+            from scanchain.viz.landmark_recording import record_landmarks
+
+            record_landmarks(studies, recording)
         directory.complete()
     click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
     if not as_json:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from scanchain.config import GraphConfig
     from scanchain.graph.g2o import G2oFile, Indefinite
     from scanchain.graph.initialise import Initialisation
-    from scanchain.runs.recorder import Viewing
 
 _PATH = click.Path(path_type=Path)
 _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
@@ -96,7 +95,7 @@ def optimize(
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     file = _read(source, cast("Indefinite", indefinite), is_suspicious)
     answer = _solved(file, source.name, config, cast("Initialisation", initialise))
-    written = outputs.write(answer, ctx.obj)
+    written = outputs.write(answer)
     click.echo(answer.json(written) if as_json else answer.text(written))
     if not answer.optimisation.converged:
         ctx.exit(1)
@@ -138,7 +137,7 @@ class Outputs:
         for path in (*self.paths, *filter(None, [self.rejected])):
             check_output(path, force=force, endings=endings.get(path, ()))
 
-    def write(self, answer: Answer, viewing: Viewing) -> list[Path]:
+    def write(self, answer: Answer) -> list[Path]:
         """Write them all; which those are."""
         from scanchain.graph.covariance_table import chosen_poses, write_covariances
         from scanchain.graph.g2o_write import write_graph
@@ -159,11 +158,15 @@ class Outputs:
             with _written(self.table):
                 write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
+            from scanchain.viz.graph_picture import draw_graph
+
             with _written(self.picture):
-                viewing.draw_graph(answer.change, self.picture)
+                draw_graph(answer.change, self.picture)
         if self.recording is not None:
+            from scanchain.viz.graph_recording import record_graph
+
             with _written(self.recording):
-                viewing.record_graph(answer.change, self.recording)
+                record_graph(answer.change, self.recording)
         return written
 
 

@@ -17,7 +17,8 @@ from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.recorder import SinkName, Viewing
+    from scanchain.config import RecordingConfig
+    from scanchain.runs.recorder import Recorder, SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look through them often costs a twentieth
@@ -110,9 +111,8 @@ def run(
         checkpoint_s=checkpoint,
         command=tuple(sys.argv),
     )
-    viewing: Viewing = ctx.obj
     with Terminal("scans") as terminal:
-        finished = run_log(job, viewing.record, terminal, viewing.report)
+        finished = run_log(job, _record, terminal, _report)
     unreliable = finished.metrics.unreliable
     if unreliable:
         click.echo(f"error: {finished.path}: {unreliable}", err=True)
@@ -152,3 +152,17 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
+
+
+def _record(
+    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
+) -> Recorder:
+    from scanchain.viz.recording import Recording  # takes half a second
+
+    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
+
+
+def _report(directory: Path) -> None:
+    from scanchain.viz.run_report import write_run_report
+
+    write_run_report(directory)

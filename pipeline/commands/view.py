@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from scanchain.commands.outputs import check_output
 from scanchain.commands.override_command import OnceCommand
 from scanchain.errors import InputError
-
-if TYPE_CHECKING:
-    from scanchain.runs.recorder import Viewing
 
 
 @click.command(cls=OnceCommand)
@@ -25,8 +21,7 @@ if TYPE_CHECKING:
     help="Draw trajectory, ground truth and map to a picture.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing picture.")
-@click.pass_context
-def view(ctx: click.Context, directory: Path, web: bool, png: Path | None, force: bool) -> None:
+def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map without one.
 
     DIR is a run directory, or a .rrd file.
@@ -43,10 +38,11 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None, force
         raise InputError(
             f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
         )
-    viewing: Viewing = ctx.obj
     if png is not None:
+        from scanchain.viz.run_picture import draw_run
+
         check_output(png, force=force, endings=(".png",))
-        viewing.draw(directory, png)
+        draw_run(directory, png)
         click.echo(png)
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
@@ -56,5 +52,7 @@ def view(ctx: click.Context, directory: Path, web: bool, png: Path | None, force
         )
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
+    from scanchain.viz.show import show
+
     with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
-        viewing.show(path, click.echo, web)
+        show(path, click.echo, in_browser=web)

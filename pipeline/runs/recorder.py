@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Protocol, Self
@@ -15,9 +14,6 @@ from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step
 
 if TYPE_CHECKING:
-    from scanchain.batch.task import Row
-    from scanchain.graph.optimisation import GraphChange
-    from scanchain.landmarks.study import Study
     from scanchain.runs.step_table import StepRow
     from scanchain.runs.verdicts import JudgedClosure
 
@@ -101,28 +97,3 @@ class OpenRecorder(Protocol):
     ) -> Recorder:
         """Make the recorder; it is entered before the first step."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Viewing:
-    """What the commands ask of a viewer.
-
-    ``record`` a run; ``show`` a recording, with the flag set in a browser whose address it tells;
-    ``draw`` a run directory to a PNG;
-    ``report`` on a run and ``present_comparison`` add their pages, and the latter a recording, to a directory;
-    ``present_batch`` adds a page on the rows that a command made;
-    ``draw_graph`` before and after to a PNG, ``record_graph`` to a recording;
-    ``present_landmarks`` studies of landmark problems, as pictures and a page, in a directory;
-    ``record_landmarks`` before and after to a recording.
-    """
-
-    record: OpenRecorder
-    show: Callable[[Path, Callable[[str], None], bool], None]
-    draw: Callable[[Path, Path], None]
-    report: Callable[[Path], None]
-    present_batch: Callable[[Path, Sequence[Row], Sequence[str]], None]
-    present_comparison: Callable[[Path], None]
-    draw_graph: Callable[[GraphChange, Path], None]
-    record_graph: Callable[[GraphChange, Path], None]
-    present_landmarks: Callable[[Path, Sequence[Study]], None]
-    record_landmarks: Callable[[Sequence[Study], Path], None]
