@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from scanchain.errors import InputError, ScanchainError
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.logs import open_log
-    from scanchain.matching import VoxelMap, create_matcher, rigid_transform
+    from scanchain.matching import VoxelMap, align, create_matcher, rigid_transform
     from scanchain.odometry import Odometry
     from scanchain.settings import load_settings
     from scanchain.slam import Slam, SlamResult
@@ -32,6 +32,7 @@ _HOMES = {
     "Step": "data",
     "Trajectory": "data",
     "VoxelMap": "matching",
+    "align": "matching",
     "create_matcher": "matching",
     "load_settings": "settings",
     "open_log": "logs",
@@ -40,7 +41,14 @@ _HOMES = {
     "write_tum": "trajectory",
 }
 
-_COMPILED = {"Odometry", "PoseGraph", "Slam", "VoxelMap", "create_matcher"}  # take a minute when first called
+_COMPILED = {
+    "Odometry",
+    "PoseGraph",
+    "Slam",
+    "VoxelMap",
+    "align",
+    "create_matcher",
+}  # a minute at first
 
 __all__ = [
     "Config",
@@ -56,6 +64,7 @@ __all__ = [
     "Step",
     "Trajectory",
     "VoxelMap",
+    "align",
     "create_matcher",
     "load_settings",
     "open_log",

@@ -33,6 +33,11 @@ def shape(value: object, name: str) -> tuple[int, ...]:
     return value.shape if isinstance(value, np.ndarray) else _array(value, name, "an array").shape
 
 
+def dimension_of(value: object, name: str) -> int:
+    """2 where points are (N, 2), else 3."""
+    return 2 if shape(value, name)[1:] == (2,) else 3
+
+
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
     array = _numbers(value, name, f"an (N, {d}) array of metres", dtype)

@@ -65,7 +65,7 @@ class Scan:
 
         for name, wanted, least in _WHOLE:
             object.__setattr__(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
-        d = 2 if checks.shape(self.points, "points")[1:] == (2,) else 3
+        d = checks.dimension_of(self.points, "points")
         points = checks.points(self.points, "points", d, dtype=np.float32)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))

@@ -7,8 +7,8 @@ from time import perf_counter
 import pytest
 from numba import njit
 
-from scanchain.__main__ import _record
 from scanchain.clock import compiled_s, working_s
+from scanchain.commands.run import _record
 from scanchain.matching import VoxelMap
 from scanchain.runs import results
 from scanchain.runs.compiling import telling_of_compilation

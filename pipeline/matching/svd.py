@@ -29,7 +29,7 @@ def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] 
     source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0, 1 where left out
     Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
     """
-    d = 2 if checks.shape(source, "source")[1:] == (2,) else 3
+    d = checks.dimension_of(source, "source")
     source = checks.points(source, "source", d)
     target = checks.points(target, "target", d)
     if len(target) != len(source):

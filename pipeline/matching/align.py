@@ -1,0 +1,138 @@
+"""Two clouds, aligned in one call: any unit, any origin, no configuration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from scanchain import checks, lie
+from scanchain.config import Config, PreprocessConfig
+from scanchain.data import Match, Points, Pose
+from scanchain.errors import InputError
+from scanchain.matching.correlative import CorrelativeMap
+from scanchain.matching.create import create_matcher
+from scanchain.matching.voxel_map import VoxelMap
+from scanchain.preprocess import downsample
+from scanchain.settings import Override, load_settings
+
+_RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most
+_WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
+_APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
+
+
+def align(
+    target: Points,
+    source: Points,
+    T_guess: Pose | None = None,
+    *,
+    voxel_size_m: float | None = None,
+    matcher: str = "plicp",
+) -> Match:
+    """The pose of a cloud in the frame of another.
+
+    Both clouds are moved to their centroids and scaled so that a voxel has the preset's size; the other lengths
+    (search radius, kernel scale, tolerance) are the preset's, too. The unit of the clouds is therefore free: where
+    the text says metres, read that unit.
+
+    target, source : (N, d) and (M, d), d = 2 or 3, metres
+    T_guess : (d+1, d+1), the identity where left out; motions of about three voxels are found from there, in the
+        plane of half the target's median range and 1 rad (branch and bound; Olson 2009, Hess et al. 2016)
+    voxel_size_m : of the map made of the target; where left out, a fraction of the target's extent such that about
+        a point lies in each voxel of a surface, or more
+    matcher : "plicp" or "svd"
+    Returns the match: ``T_target_source``, ``information`` (k, k) of a right perturbation of it, ``inliers``,
+    ``residual_m``, ``observability``, ``converged`` and ``reason``.
+    Raises InputError naming the argument that is no cloud, pose, size or matcher.
+    """
+    d = checks.dimension_of(target, "target")
+    target, source = checks.points(target, "target", d), checks.points(source, "source", d)
+    for name, cloud in (("target", target), ("source", source)):
+        if not len(cloud):
+            raise InputError(f"{name} has no points; wanted (N, {d}) with N of at least a few hundred")
+    T_guess = lie.identity(d) if T_guess is None else checks.pose(T_guess, "T_guess", d)
+    config = load_settings(d, overrides=(Override("matching.matcher", matcher, "matcher"),)).config
+    at_target, at_source = _translation(target.mean(axis=0)), _translation(source.mean(axis=0))
+    target = lie.transform(lie.inverse(at_target), target)
+    range_m = float(np.median(np.linalg.norm(target, axis=1)))
+    if not range_m > 0.0:
+        raise InputError(f"target: its {len(target):,} points lie on one point; wanted a cloud with an extent")
+    if voxel_size_m is None:
+        voxel_size_m = range_m / _range_voxels(len(target), d)
+    unit_m = checks.positive(voxel_size_m, "voxel_size_m") / config.local_map.voxel_size_m
+    source = lie.transform(lie.inverse(at_source), source)
+    T_first = lie.inverse(at_target) @ T_guess @ at_source
+    apart_m = float(np.linalg.norm(T_first[:-1, -1]))
+    if apart_m > _APART * (range_m + float(np.linalg.norm(source, axis=1).max())):
+        raise InputError(
+            f"T_guess puts the centroid of the source {apart_m:.3g} m from that of the target, which spans about "
+            f"{range_m:.3g} m; wanted clouds in one unit that overlap"
+        )
+    match = _matched(target / unit_m, source / unit_m, _scaled(T_first, 1.0 / unit_m), range_m / unit_m, config)
+    return _restored(match, at_target, at_source, unit_m)
+
+
+def _matched(target: Points, source: Points, T_first: Pose, range_m: float, config: Config) -> Match:
+    """The match of two clouds that fit the configuration; in the plane the better of two beginnings."""
+    local_map = VoxelMap(target.shape[1], config.local_map)
+    local_map.insert(downsample(target, config.preprocess.map_voxel_m), lie.identity(target.shape[1]))
+    sparse = _downsampled(source, config.preprocess)
+    matcher = create_matcher(config.matching)
+    match = matcher.align(sparse, local_map, T_first, wide=True)
+    if local_map.dimension == 3:
+        return match
+    seed = CorrelativeMap(local_map, T_first).best(
+        sparse, T_first, half_width_m=_WINDOW * range_m, half_width_rad=_WINDOW_RAD
+    )
+    return min(match, matcher.align(sparse, local_map, seed.T_target_source), key=lambda each: each.cost)
+
+
+def _range_voxels(points: int, d: int) -> float:
+    """Voxels from the centroid to the median point: fewer where the points are few."""
+    circumference = 2.0 * math.pi if d == 2 else 4.0 * math.pi
+    return min((points / circumference) ** (1.0 / (d - 1)), _RANGE_VOXELS[d])
+
+
+def _downsampled(points: Points, config: PreprocessConfig) -> Points:
+    """One point a voxel, of voxels so much finer than the coarsest that about ``match_points`` remain."""
+    coarse = downsample(points, config.match_voxel_m)
+    finer = math.sqrt(len(coarse) / config.match_points)
+    if finer >= 1.0:
+        return coarse
+    return downsample(points, max(finer * config.match_voxel_m, config.map_voxel_m))
+
+
+def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> Match:
+    """A match of centered, scaled clouds as one of the clouds that came.
+
+    With T = C_t T' C_s⁻¹ a right twist ξ' of T' is Ad(C_s) ξ' of T.
+    """
+    d = len(at_source) - 1
+    k = len(match.information)
+    scale = np.ones(k)
+    scale[:d] = unit_m
+    turned = lie.adjoint(at_source) * scale
+    back = np.linalg.inv(turned)
+    direction = turned @ match.degeneracy_direction
+    return replace(
+        match,
+        reason=match.reason if match.converged else f"{match.reason} (lengths in units of {unit_m:.3g} m)",
+        T_target_source=at_target @ _scaled(match.T_target_source, unit_m) @ lie.inverse(at_source),
+        information=back.T @ match.information @ back,
+        cost=match.cost * unit_m**2,
+        residual_m=match.residual_m * unit_m,
+        degeneracy_direction=direction / np.linalg.norm(direction),
+    )
+
+
+def _translation(shift: Points) -> Pose:
+    T = lie.identity(len(shift))
+    T[:-1, -1] = shift
+    return T
+
+
+def _scaled(T: Pose, factor: float) -> Pose:
+    scaled = T.copy()
+    scaled[:-1, -1] *= factor
+    return scaled
