@@ -7,14 +7,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scanchain.api import compare, downsample, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
+    from scanchain.graph.g2o import read_g2o
+    from scanchain.graph.g2o_write import write_g2o
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.logs import open_log
     from scanchain.matching import VoxelMap, align, create_matcher, rigid_transform
     from scanchain.odometry import Odometry
     from scanchain.settings import load_settings
+    from scanchain.simulation import simulate
     from scanchain.slam import Slam, SlamResult
     from scanchain.trajectory import read_tum, write_tum
 
@@ -33,11 +37,18 @@ _HOMES = {
     "Trajectory": "data",
     "VoxelMap": "matching",
     "align": "matching",
+    "compare": "api",
     "create_matcher": "matching",
+    "downsample": "api",
     "load_settings": "settings",
     "open_log": "logs",
+    "optimize": "api",
+    "read_g2o": "graph.g2o",
     "read_tum": "trajectory",
     "rigid_transform": "matching",
+    "run": "api",
+    "simulate": "simulation",
+    "write_g2o": "graph.g2o_write",
     "write_tum": "trajectory",
 }
 
@@ -47,8 +58,12 @@ _COMPILED = {
     "Slam",
     "VoxelMap",
     "align",
+    "compare",
     "create_matcher",
-}  # a minute at first
+    "downsample",
+    "run",
+    "simulate",
+}
 
 __all__ = [
     "Config",
@@ -65,11 +80,18 @@ __all__ = [
     "Trajectory",
     "VoxelMap",
     "align",
+    "compare",
     "create_matcher",
+    "downsample",
     "load_settings",
     "open_log",
+    "optimize",
+    "read_g2o",
     "read_tum",
     "rigid_transform",
+    "run",
+    "simulate",
+    "write_g2o",
     "write_tum",
 ]
 

@@ -18,6 +18,7 @@ from scanchain.kernels.validity import largest_magnitude, largest_moved, rigidit
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat
+_LATEST_S = 1e11  # of a stamp: the year 5138
 LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
 
 
@@ -152,6 +153,13 @@ def positive(value: object, name: str) -> float:
     if isinstance(value, int | float | np.number) and not isinstance(value, bool) and 0.0 < value < math.inf:
         return float(value)
     raise InputError(f"{name} is {shown(value)}; wanted a finite number > 0")
+
+
+def seconds(value: object, name: str) -> float:
+    """A stamp in seconds; nanoseconds of our time are refused."""
+    if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) < _LATEST_S:
+        return float(value)
+    raise InputError(f"{name} is {shown(value)}; wanted seconds, as a number below {_LATEST_S:.0e}")
 
 
 def weights(value: object, name: str, count: int) -> NDArray[np.float64]:

@@ -72,6 +72,29 @@ class Scan:
         if self.T_odom_base is not None:
             object.__setattr__(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 
+    @classmethod
+    def of(
+        cls,
+        points: RawPoints,
+        stamp_s: float,
+        times_s: NDArray[np.float32] | None = None,
+        *,
+        index: int = 0,
+        T_odom_base: Pose | None = None,
+    ) -> Scan:
+        """A scan as a driver gives it.
+
+        points : (N, d) metres, lidar frame, without NaN
+        stamp_s : seconds since any fixed instant; the pose holds then
+        times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
+        T_odom_base : pose of the robot by its wheels at ``stamp_s``
+        """
+        from scanchain import checks
+
+        stamp_ns = round(1e9 * checks.seconds(stamp_s, "stamp_s"))
+        times_s = np.empty(0, np.float32) if times_s is None else times_s
+        return cls(index, stamp_ns, stamp_ns, points, times_s, 0, T_odom_base)
+
 
 class State(StrEnum):
     """How far a pose can be trusted."""

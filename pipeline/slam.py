@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import working_s
@@ -18,6 +19,7 @@ from scanchain.data import (
     Match,
     Matrix,
     Pose,
+    RawPoints,
     Scan,
     State,
     Step,
@@ -30,7 +32,7 @@ from scanchain.graph.graduation import Judgement
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops import LoopCloser, refined, spread
-from scanchain.odometry import FrontEnd, Located, checked_mounting
+from scanchain.odometry import FrontEnd, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
@@ -61,16 +63,21 @@ class SlamResult:
 
 
 class Slam:
-    """Feeds on scans; every scan gives a step, the end gives the result."""
+    """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
 
     def __init__(
         self,
-        config: Config,
-        T_base_lidar: Pose,
+        config: Config | None = None,
+        T_base_lidar: Pose | None = None,
         points_file: Path | None = None,
+        *,
+        dimension: int | None = None,
     ) -> None:
-        """points_file : where points go, which stay out of memory; without one, into a temporary file."""
-        T_base_lidar = checked_mounting(config, T_base_lidar)
+        """Arguments as in ``Odometry``.
+
+        points_file : where points go, which stay out of memory; without one, into a temporary file
+        """
+        config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.points = PointStore(self.dimension, points_file)
@@ -90,6 +97,18 @@ class Slam:
         self.lost_scans = 0
         self.optimised_at = 0
         self.is_finished = False
+
+    def track(
+        self,
+        points: RawPoints,
+        stamp_s: float,
+        times_s: NDArray[np.float32] | None = None,
+        *,
+        T_odom_base: Pose | None = None,
+    ) -> Step:
+        """Place a scan as a driver gives it, and whatever it closes; arguments as in ``Scan.of``."""
+        scans = self.front_end.scans
+        return self.process(Scan.of(points, stamp_s, times_s, index=scans, T_odom_base=T_odom_base))
 
     def process(self, scan: Scan) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""

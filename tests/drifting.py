@@ -25,7 +25,7 @@ class DriftingOdometry:
         return self.odometry.first_points
 
     def track(self, scan):
-        tracked = self.odometry.track(scan)
+        tracked = self.odometry.process(scan)
         motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
         self.T_drifted = lie.normalise(self.T_drifted @ self.drifted(motion))

@@ -21,7 +21,7 @@ def real_pair(name, apart):
     """Two real scans, and the motion between them by odometry."""
     log = open_log(shared_data(name))
     odometry = Odometry(configured(log.dimension), np.eye(log.dimension + 1))
-    tracked = [odometry.track(scan) for scan in islice(log.scans(), FIRST[name] + apart + 1)]
+    tracked = [odometry.process(scan) for scan in islice(log.scans(), FIRST[name] + apart + 1)]
     target, source = tracked[FIRST[name]].scan.points, tracked[-1].scan.points
     motion = lie.between(tracked[FIRST[name]].T_odom_lidar, tracked[-1].T_odom_lidar)
     return target.astype(float), source.astype(float), motion

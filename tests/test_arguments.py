@@ -109,8 +109,8 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: open_log([None]), r"a log is \[None\]; wanted a path"),
         (lambda: scan(np.zeros((2, 2)), T_odom_base=I4), r"T_odom_base has the shape \(4, 4\); wanted a \(3, 3\)"),
         (lambda: replace(scan(I3), stamp_ns=1.7e9), "stamp_ns is 1700000000.0; wanted nanoseconds as int"),
-        (lambda: Odometry(Config(), I4).track(I3), "scan is an array of the shape .*; wanted a Scan"),
-        (lambda: Odometry(Config(), I4).track(scan(FLAT)), "scan 0 has 2D points; wanted"),
+        (lambda: Odometry(Config(), I4).process(I3), "scan is an array of the shape .*; wanted a Scan"),
+        (lambda: Odometry(Config(), I4).process(scan(FLAT)), "scan 0 has 2D points; wanted"),
         (lambda: Slam(Config(), I4).process(ROOM), "scan is an array"),
         (lambda: PoseGraph(4), "dimension is 4"),
         (lambda: PoseGraph(2).add_pose(I4, 0), r"T_world has the shape \(4, 4\); wanted a \(3, 3\) pose"),
@@ -388,7 +388,7 @@ def test_a_scan_of_anything_is_tracked_or_refused(points, times_s, T_odom_base, 
     if made is not None:
         config = load_settings(made.points.shape[1]).config
         odometry = Odometry(config, lie.identity(made.points.shape[1]))
-        tracked = [tried(lambda: odometry.track(made)) for _ in range(2)]
+        tracked = [tried(lambda: odometry.process(made)) for _ in range(2)]
         assert all(np.isfinite(each.T_odom_lidar).all() for each in tracked if each is not None)
 
 

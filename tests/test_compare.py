@@ -247,7 +247,7 @@ def test_ours_is_our_odometry_to_the_last_bit(office, good):
     odometry = Odometry(
         load_settings(2, overrides=(Override("odometry.prior", "constant-velocity", ""),)).config, log.T_base_lidar
     )
-    poses = np.array([odometry.track(scan).T_odom_lidar for scan in log.scans()])
+    poses = np.array([odometry.process(scan).T_odom_lidar for scan in log.scans()])
     scans = pq.read_table(good[1] / "per_scan.parquet").to_pandas()
     ours = scans[(scans.method == "plicp") & (scans.repeat == 1)]
     np.testing.assert_array_equal(ours[["x", "y"]], poses[:, :2, 2])

@@ -7,8 +7,8 @@ from time import perf_counter
 import pytest
 from numba import njit
 
+from scanchain.api import open_recorder
 from scanchain.clock import compiled_s, working_s
-from scanchain.commands.run import _record
 from scanchain.matching import VoxelMap
 from scanchain.runs import results
 from scanchain.runs.compiling import telling_of_compilation
@@ -122,7 +122,7 @@ def office(tmp_path_factory):
 
 def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     def finished(name):
-        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), _record, Unwatched())
+        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), open_recorder, Unwatched())
         return done, json.loads((done.path / "metrics.json").read_text())
 
     finished("to compile what the cache on disk lacks")

@@ -165,7 +165,7 @@ def published():
     """A real drive: the positions of a GPS/INS and what our odometry makes of the first 30 sweeps."""
     odometry = Odometry(configured(3), np.eye(4))
     scans = kitti_scans(30)
-    poses = np.array([odometry.track(scan).T_odom_lidar for scan in scans])
+    poses = np.array([odometry.process(scan).T_odom_lidar for scan in scans])
     estimate = Trajectory(np.array([scan.stamp_ns for scan in scans]), poses)
     return pair(estimate, read_tum(shared_data("3d/kitti_0001_first54.tum")))
 

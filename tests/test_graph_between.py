@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.graph.between import BetweenProblem, right_information
+from scanchain.graph.between import BetweenProblem
 from scanchain.graph.robust import RobustLoss, robust_loss
 from scanchain.kernels import graph_between_se2
 
@@ -113,17 +113,6 @@ def test_normal_equations_equal_dense_finite_differences(dimension):
     assert np.allclose(equations.gradient, g, rtol=1e-5, atol=1e-5 * np.abs(g).max())
     e = problem.errors(poses)
     assert np.allclose(problem.chi2(e), [v @ omega @ v for v, omega in zip(e, information, strict=True)])
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_left_information_becomes_right_information_of_the_same_mismatch(dimension):
-    rng = np.random.default_rng(1)
-    k = (3, 6)[dimension - 2]
-    Z, left = lie.exp(rng.normal(size=k)), 1e-4 * rng.normal(size=k)
-    A = rng.normal(size=(k, k))
-    omega = A @ A.T
-    e = lie.log(lie.inverse(Z) @ lie.exp(left) @ Z)
-    assert e @ right_information(Z, omega) @ e == pytest.approx(left @ omega @ left, rel=1e-9)
 
 
 LOSSES = [

@@ -252,10 +252,33 @@ def test_relative_covariance_equals_the_dense_inverse(dimension):
         return P[(a - 1) * k : a * k, (b - 1) * k : b * k]
 
     joint = picked(i, i) + picked(j, j) - picked(i, j) - picked(j, i)
-    adjoint = lie.adjoint(lie.inverse(graph.poses[i]))
+    adjoint = lie.adjoint(lie.inverse(graph.poses[j]))
     assert np.allclose(graph.relative_covariance(i, j), adjoint @ joint @ adjoint.T, rtol=1e-5, atol=1e-9)
-    from_the_held_one = P[:k, :k]  # pose 0 is held at the identity, so the world is its frame
-    assert np.allclose(graph.relative_covariance(0, 1), from_the_held_one, rtol=1e-5, atol=1e-9)
+    assert np.allclose(graph.relative_covariance(0, 1), graph.covariances()[1], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_covariances_are_those_of_right_twists_as_the_information_of_edges_is(dimension):
+    """A chain of edges, each drawn 20,000 times with the covariance of its right twist."""
+    rng = np.random.default_rng(0)
+    k = 3 * (dimension - 1)
+    spreads = [np.diag(rng.uniform(0.005, 0.03, k)) for _ in range(2)]
+    motions = [lie.exp(rng.uniform(-1.5, 1.5, k)) for _ in range(2)]
+    graph = PoseGraph(dimension)
+    for index in range(3):
+        graph.add_pose(lie.identity(dimension), index)
+    for index, (motion, spread) in enumerate(zip(motions, spreads, strict=True)):
+        graph.add_edge(index, index + 1, motion, np.linalg.inv(spread @ spread))
+    graph.optimise(PLAIN)
+    drawn = [
+        motion @ lie.exp(rng.normal(size=(20_000, k)) @ spread)
+        for motion, spread in zip(motions, spreads, strict=True)
+    ]
+    twists = lie.log(lie.inverse(motions[0] @ motions[1]) @ drawn[0] @ drawn[1])
+    scale = np.sqrt(np.outer(*2 * [np.diag(np.cov(twists.T))]))
+    for found in (graph.covariances()[2], graph.relative_covariance(0, 2)):
+        assert np.abs((found - np.cov(twists.T)) / scale).max() < 0.05
+    assert np.allclose(graph.relative_covariance(1, 2), spreads[1] @ spreads[1], rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

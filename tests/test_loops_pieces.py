@@ -99,7 +99,7 @@ def test_a_short_silence_begins_no_new_map():
     log = open_log(shared_data("2d/intel.mcap"))
     odometry = Odometry(configured(2), log.T_base_lidar)
     tracked = [
-        odometry.track(replace(scan, T_odom_base=None))
+        odometry.process(replace(scan, T_odom_base=None))
         for index, scan in enumerate(islice(log.scans(), 400))
         if not 200 <= index < 205
     ]

@@ -39,7 +39,7 @@ def town(tmp_path_factory):
 
 def tracked(scans, T_base_lidar, config):
     odometry = Odometry(config, T_base_lidar)
-    return [odometry.track(scan) for scan in scans]
+    return [odometry.process(scan) for scan in scans]
 
 
 def trajectory(steps):
@@ -82,7 +82,7 @@ def test_the_second_scan_tells_how_the_first_one_was_distorted(town):
     odometry = Odometry(configured(3), T_base_lidar)
     first, second = scans[45:47]  # at 7 m/s
     for scan in (first, second):
-        odometry.track(scan)
+        odometry.process(scan)
     sweep = sweep_of(first, configured(3).preprocess)
     velocity = lie.log(lie.inverse(truth.poses[45]) @ truth.poses[46]) / 0.1
     T_stamp_point = lie.exp((sweep.times_s + sweep.middle_s)[:, None] * velocity)
@@ -186,7 +186,7 @@ def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
         scan = Scan(
             index, index * 10**8, index * 10**8, walls.astype(np.float32), np.empty(0, np.float32), 0, None
         )
-        step = odometry.track(scan)
+        step = odometry.process(scan)
     assert step.state is State.DEGENERATE
     assert abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
     assert "is undetermined" in step.reason

@@ -77,6 +77,7 @@ def compare(
       scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --log.end_s 600
     """
+    from scanchain.api import present_comparison
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import Contest
     from scanchain.comparison.compare import compare as run_contest
@@ -98,18 +99,9 @@ def compare(
         command=tuple(sys.argv),
     )
     with Terminal("scans") as terminal:
-        compared = run_contest(contest, _present, terminal)
+        compared = run_contest(contest, present_comparison, terminal)
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
     if not as_json:
         click.echo(f"written {contest.out}: report.html, compare.rrd, tables")
     if compared.failures:
         raise ScanchainError(f"did not come to their end: {', '.join(compared.failures)}; the table says how")
-
-
-def _present(directory: Path) -> None:
-    """Add report and recording to a comparison's directory."""
-    from scanchain.viz.compare_recording import record_comparison
-    from scanchain.viz.compare_report import write_compare_report
-
-    write_compare_report(directory)
-    record_comparison(directory)

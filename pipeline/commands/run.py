@@ -17,8 +17,7 @@ from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.config import RecordingConfig
-    from scanchain.runs.recorder import Recorder, SinkName
+    from scanchain.runs.recorder import SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look through them often costs a twentieth
@@ -92,6 +91,7 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     gc.set_threshold(_GARBAGE_EVERY)
+    from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
     from scanchain.runs.rescue import how_to_resume
@@ -112,7 +112,7 @@ def run(
         command=tuple(sys.argv),
     )
     with Terminal("scans") as terminal:
-        finished = run_log(job, _record, terminal, _report)
+        finished = run_log(job, open_recorder, terminal, write_report)
     unreliable = finished.metrics.unreliable
     if unreliable:
         click.echo(f"error: {finished.path}: {unreliable}", err=True)
@@ -152,17 +152,3 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
-
-
-def _record(
-    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
-) -> Recorder:
-    from scanchain.viz.recording import Recording  # takes half a second
-
-    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
-
-
-def _report(directory: Path) -> None:
-    from scanchain.viz.run_report import write_run_report
-
-    write_run_report(directory)

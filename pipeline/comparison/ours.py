@@ -34,7 +34,7 @@ class OurOdometry:
 
     def track(self, scan: Scan) -> Pose:
         """T_odom_lidar (d+1, d+1)."""
-        tracked = self.odometry.track(scan)
+        tracked = self.odometry.process(scan)
         self.steps.append(
             Step(
                 scan=scan,

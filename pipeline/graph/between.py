@@ -150,9 +150,3 @@ def _kept(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
-
-
-def right_information(T_ij: Matrix, left_information: Matrix) -> Matrix:
-    """Information of right twists on T_ij, from that of left twists: exp(ξ) T = T exp(e), ξ = Ad(T) e."""
-    adjoint = lie.adjoint(T_ij)
-    return np.swapaxes(adjoint, -1, -2) @ left_information @ adjoint

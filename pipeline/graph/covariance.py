@@ -22,8 +22,8 @@ def own_covariances(problem: BetweenProblem) -> Matrix:
 
 
 def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) -> Matrix:
-    """Covariance (k, k) of a left twist on T_i⁻¹ T_j, Ad(T_i⁻¹) Cov(ξ_j − ξ_i) Ad(T_i⁻¹)ᵀ."""
-    adjoint = lie.adjoint(lie.inverse(poses[i]))
+    """Covariance (k, k) of a right twist on T_i⁻¹ T_j, Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ."""
+    adjoint = lie.adjoint(lie.inverse(poses[j]))
     return adjoint @ difference_covariance(problem, i, j) @ adjoint.T
 
 

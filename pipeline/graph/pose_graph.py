@@ -37,6 +37,9 @@ from scanchain.words import counted
 class PoseGraph:
     """Poses T_world_lidar and between factors T_ij (frame j seen from frame i) with e = log(T_ij⁻¹ T_i⁻¹ T_j).
 
+    Every covariance and information matrix, given or returned, is that of a right twist, T exp(ξ): in the pose's
+    own frame, (translation, rotation). ``Match.information`` is one, so that it serves an edge as it is.
+
     The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
     """
 
@@ -254,14 +257,14 @@ class PoseGraph:
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
-        """Covariance (k, k) of a left twist on T_i⁻¹ T_j, given all edges at the poses and weights of now.
+        """Covariance (k, k) of T_ij = T_i⁻¹ T_j, a right twist on it as in ``add_edge``, at the poses of now.
 
         The factor of H is kept until the graph changes, so that each further pair costs k solves.
         """
         return relative_covariance(self._factored(), self.poses, i, j)
 
     def covariances(self) -> Matrix:
-        """Covariance (K, k, k) of every pose's twist in its own frame, at the poses of now, of the edges in force.
+        """Covariance (K, k, k) of every pose's right twist, T exp(ξ), by the edges in force, at the poses of now.
 
         Raises InputError where these leave poses free, or as good as free.
         """

@@ -65,10 +65,10 @@ def gather(points, chosen, out):
 
 @njit(cache=True, nogil=True)
 def deskew(points, shares, twist):
-    """Move each point, in place, to where the lidar saw it at the scan's stamp.
+    """Move each point, in place, to where the lidar would see it at one instant, as a rule the scan's middle.
 
     points : (N, d) metres, each in the lidar frame of its own instant
-    shares : (N,) time from the stamp to that instant, in units of the time in which the lidar moves by twist
+    shares : (N,) time from that instant to the point's own, in units of the time in which the lidar moves by twist
     twist : (k,) constant velocity; the pose at share τ is T exp(τ ξ), so that p ← exp(τ ξ) p
     """
     d = points.shape[1]

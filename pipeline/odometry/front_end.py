@@ -39,7 +39,7 @@ class FrontEnd:
 
     def locate(self, scan: Scan) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
-        tracked = self.odometry.track(scan)
+        tracked = self.odometry.process(scan)
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
         if is_keyframe:

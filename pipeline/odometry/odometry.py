@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose, Scan, State
-from scanchain.errors import InputError
+from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
+from scanchain.errors import InputError, shown
 from scanchain.kernels.validity import largest_magnitude
 from scanchain.matching import CorrelativeMap, VoxelMap, create_matcher
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from scanchain.preprocess import Resolution, Sweep
-from scanchain.settings import check_order
+from scanchain.settings import check_order, load_settings
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row before the map goes on from the prediction
@@ -30,11 +30,19 @@ _MEMORY = 0.9  # of that running mean, per scan
 
 
 class Odometry:
-    """Feeds on scans, one by one, and keeps the local map."""
+    """Scan-to-map odometry: one scan after another in, the pose of each out; keeps the local map."""
 
-    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
-        """T_base_lidar : (3, 3) for laser scans, (4, 4) for clouds; the identity where there are no wheels."""
-        T_base_lidar = checked_mounting(config, T_base_lidar)
+    def __init__(
+        self, config: Config | None = None, T_base_lidar: Pose | None = None, *, dimension: int | None = None
+    ) -> None:
+        """Start before the first scan.
+
+        config : the preset of the dimension where left out
+        T_base_lidar : pose of the lidar on the robot, (3, 3) for laser scans, (4, 4) for clouds; it matters only
+            where wheel odometry is given, the identity where left out
+        dimension : 2 for laser scans, 3 for clouds; that of ``T_base_lidar``, or 3, where left out
+        """
+        config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.predictor = Predictor(config.odometry, T_base_lidar)
@@ -48,8 +56,20 @@ class Odometry:
         self.usual_cost = 0.0
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # as seen from its stamp, once the second scan is there
+        self.scans = 0
 
-    def track(self, scan: Scan) -> Tracked:
+    def track(
+        self,
+        points: RawPoints,
+        stamp_s: float,
+        times_s: NDArray[np.float32] | None = None,
+        *,
+        T_odom_base: Pose | None = None,
+    ) -> Tracked:
+        """Place a scan as a driver gives it; arguments as in ``Scan.of``."""
+        return self.process(Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base))
+
+    def process(self, scan: Scan) -> Tracked:
         """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""
         checks.instance(
             scan, Scan, "scan", "Scan(index, stamp_ns, log_time_ns, points, times_s, dropped, T_odom_base)"
@@ -59,6 +79,7 @@ class Odometry:
                 f"scan {scan.index} has {scan.points.shape[1]}D points; wanted (N, {self.dimension}), because "
                 f"T_base_lidar is a pose of SE({self.dimension})"
             )
+        self.scans += 1
         started = working_s()
         sweep, sparse = self.resolution.look(scan)
         if self.resolution.scale != self.local_map.scale:
@@ -236,10 +257,20 @@ class Odometry:
         return distance_m >= config.insert_distance_m or angle_rad >= config.insert_angle_rad
 
 
-def checked_mounting(config: Config, T_base_lidar: Pose) -> Pose:
-    """Where the lidar sits; InputError where that is no pose, or the configuration contradicts itself."""
+def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: int | None) -> tuple[Config, Pose]:
+    """Configuration and mounting, the ones that are left out filled in.
+
+    Raises InputError where they are none, or contradict each other or themselves.
+    """
+    if T_base_lidar is not None:
+        d = 2 if checks.shape(T_base_lidar, "T_base_lidar") == (3, 3) else 3
+        T_base_lidar = checks.pose(T_base_lidar, "T_base_lidar", d)
+        if dimension not in (None, d):
+            raise InputError(f"dimension is {shown(dimension)}, but T_base_lidar is a pose of SE({d})")
+    else:
+        T_base_lidar = lie.identity(3 if dimension is None else checks.dimension(dimension))
+    if config is None:
+        config = load_settings(len(T_base_lidar) - 1).config
     checks.instance(config, Config, "config", "load_settings(dimension).config")
     check_order(config)
-    return checks.pose(
-        T_base_lidar, "T_base_lidar", 2 if checks.shape(T_base_lidar, "T_base_lidar") == (3, 3) else 3
-    )
+    return config, T_base_lidar

@@ -23,7 +23,7 @@ ODOMETRY_PERIOD_NS = 20_000_000
 
 def simulate(
     world: str,
-    destination: Path,
+    destination: str | Path,
     *,
     seed: int = 0,
     duration_s: float | None = None,
@@ -45,6 +45,7 @@ def simulate(
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
     check_range("drift", drift, 0.0, 100.0)
+    destination = Path(destination)
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
         raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")

@@ -31,7 +31,7 @@ def main() -> None:
         odometry = Odometry(load_settings(3).config, log.T_base_lidar)
         mebibytes = []
         for scan in log.scans():
-            odometry.track(scan)
+            odometry.process(scan)
             if (scan.index + 1) % max(scans // 10, 1) == 0:
                 mebibytes.append(resident_mib(os.getpid()))
                 print(f"{scan.index + 1:6} scans {mebibytes[-1]:7.1f} MiB", flush=True)

@@ -43,7 +43,7 @@ def main() -> None:
     log = open_log([Path(path)], LogConfig())
     odometry = create(method, log.T_base_lidar)
     for scan in islice(log.scans(), int(count[0]) if count else None):
-        odometry.track(scan)
+        odometry.process(scan)
         first_mib = first_mib or peak_mib()
     print(f"{peak_mib():.1f} {peak_mib() - first_mib:.1f}")
 

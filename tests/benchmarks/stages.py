@@ -34,7 +34,7 @@ def seconds_by_stage(log_scans: list[Scan], T_base_lidar: Pose) -> dict[str, flo
             float(scan.points.sum())
             read = perf_counter() - started
             started = perf_counter()
-            step = odometry.track(scan)
+            step = odometry.process(scan)
             whole = perf_counter() - started
             stages = step.preprocess_s, step.match_s, step.map_s
             rows.append((read, *stages, whole - sum(stages), whole))

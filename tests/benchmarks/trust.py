@@ -58,7 +58,7 @@ def trust(path: Path, drive: Drive) -> Trust:
     log = open_log([path], LogConfig())
     odometry = Odometry(load_settings(3, overrides=NO_WHEELS).config, log.T_base_lidar)
     truth = drive.truth()
-    steps = [odometry.track(scan) for scan in log.scans()]
+    steps = [odometry.process(scan) for scan in log.scans()]
     flags = np.array([step.state is State.DEGENERATE for step in steps])
     shares, angles = np.empty(len(steps)), np.full(len(steps), np.nan)
     for k, step in enumerate(steps):

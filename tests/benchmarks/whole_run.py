@@ -100,7 +100,7 @@ def track(path: Path) -> float:
     seconds = 0.0
     for scan in log.scans():
         started = perf_counter()
-        odometry.track(scan)
+        odometry.process(scan)
         seconds += perf_counter() - started
     return seconds
 

@@ -1,0 +1,143 @@
+"""What scripts call to do what the commands do: process a log, compare methods on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scanchain import checks
+from scanchain.data import Points
+from scanchain.preprocess import downsample as first_per_voxel
+from scanchain.runs.job import Job
+from scanchain.runs.progress import Unwatched
+from scanchain.runs.run import Finished
+from scanchain.runs.run import run as run_job
+from scanchain.settings import Override, load_settings
+from scanchain.source import Source, source_of
+
+if TYPE_CHECKING:
+    from scanchain.comparison.compare import Compared
+    from scanchain.config import RecordingConfig
+    from scanchain.graph.optimisation import Optimisation
+    from scanchain.graph.pose_graph import PoseGraph
+    from scanchain.runs.recorder import Recorder, SinkName
+
+Logs = str | Path | Sequence[str | Path]
+
+
+def run(
+    log: Logs,
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    ground_truth: str | Path | None = None,
+    recording: bool = True,
+    force: bool = False,
+    **overrides: object,
+) -> Finished:
+    """Process a log into a run directory, as ``scanchain run`` does; nothing is printed.
+
+    log : a file, a folder, an address, or the files of one log
+    out : the directory to make; with ``force`` an earlier run there is replaced
+    config : a TOML file on top of the preset
+    ground_truth : a TUM or KITTI file of true poses
+    recording : whether a rerun recording is written
+    overrides : keys of the configuration, two underscores for the dot: ``loops__drift=0.02``
+    Returns where it lies, with metrics, summary and warnings; ``metrics.unreliable`` says why not to trust it.
+    Raises InputError for bad input.
+    """
+    job = Job(
+        logs=_sources(log),
+        out=Path(out),
+        config_file=None if config is None else Path(config),
+        overrides=_overrides(overrides),
+        sinks=frozenset({"save"}) if recording else frozenset(),
+        ground_truth=None if ground_truth is None else Path(ground_truth),
+        force=force,
+    )
+    return run_job(job, open_recorder, Unwatched(), write_report)
+
+
+def compare(
+    log: Logs,
+    out: str | Path,
+    methods: Sequence[str] = (),
+    *,
+    ground_truth: str | Path | None = None,
+    repeat: int = 1,
+    force: bool = False,
+    **overrides: object,
+) -> Compared:
+    """Run several methods over the same scans, as ``scanchain compare`` does; nothing is printed.
+
+    methods : names such as "plicp", "kiss-icp" or "module:Class"; all that make sense for the log where left out
+    repeat : runs of each method, in turn
+    Other arguments as in ``run``. Returns where it lies, and the table. Raises InputError for bad input.
+    """
+    from scanchain.comparison.compare import Contest
+    from scanchain.comparison.compare import compare as run_contest
+
+    contest = Contest(
+        logs=_sources(log),
+        out=Path(out),
+        methods=tuple(methods),
+        overrides=_overrides(overrides),
+        ground_truth=None if ground_truth is None else Path(ground_truth),
+        repeat=repeat,
+        force=force,
+    )
+    return run_contest(contest, present_comparison, Unwatched())
+
+
+def optimize(graph: PoseGraph, **overrides: object) -> Optimisation:
+    """Move the poses of a graph to the minimum of χ², as ``scanchain optimize`` does.
+
+    overrides : keys of ``[graph]``, such as robust="truncated" where loops may be wrong; by default none is
+    Returns what was done: state, χ² before and after, iterations, ``converged`` and ``reason``.
+    Raises InputError where the edges do not hold the poses together.
+    """
+    changes = _overrides({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
+    return graph.optimise(load_settings(graph.dimension, overrides=changes).config.graph)
+
+
+def downsample(points: Points, voxel_size_m: float) -> Points:
+    """The first point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
+    points = checks.points(points, "points", checks.dimension_of(points, "points"))
+    return first_per_voxel(points, checks.positive(voxel_size_m, "voxel_size_m"))
+
+
+def open_recorder(
+    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
+) -> Recorder:
+    """A rerun recording, which takes half a second to import."""
+    from scanchain.viz.recording import Recording
+
+    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
+
+
+def write_report(directory: Path) -> None:
+    """Add report.html to a run directory."""
+    from scanchain.viz.run_report import write_run_report
+
+    write_run_report(directory)
+
+
+def present_comparison(directory: Path) -> None:
+    """Add report.html and a recording to the directory of a comparison."""
+    from scanchain.viz.compare_recording import record_comparison
+    from scanchain.viz.compare_report import write_compare_report
+
+    write_compare_report(directory)
+    record_comparison(directory)
+
+
+def _sources(log: Logs) -> tuple[Source, ...]:
+    return tuple(source_of(each) for each in ([log] if isinstance(log, str | Path) else log))
+
+
+def _overrides(values: dict[str, object]) -> tuple[Override, ...]:
+    return tuple(
+        Override(name.replace("__", "."), str(value).lower() if isinstance(value, bool) else str(value), name)
+        for name, value in values.items()
+    )

@@ -1,0 +1,101 @@
+"""What scripts call: arrays in, results out, without a log, a configuration or a command line."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+from scenes import configured, kitti_scans, shared_data
+
+import scanchain as sc
+from scanchain.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    log = tmp_path_factory.mktemp("api") / "office.mcap"
+    sc.simulate("office", log, duration_s=4.0)
+    return log
+
+
+def test_odometry_of_arrays_is_that_of_the_log_bit_by_bit():
+    scans = kitti_scans(6)
+    of_log = sc.Odometry(configured(3), np.eye(4))
+    live = sc.Odometry(dimension=3)
+    for scan in scans:
+        stamp_s = scan.stamp_ns * 1e-9
+        again = scan.__class__.of(scan.points, stamp_s, scan.times_s, index=scan.index)
+        tracked = live.track(scan.points, stamp_s, scan.times_s)
+        assert np.array_equal(tracked.T_odom_lidar, of_log.process(again).T_odom_lidar)
+    assert tracked.T_odom_lidar[0, 3] > 5.0
+    assert tracked.state is sc.State.OK
+
+
+def test_slam_of_arrays_places_every_scan():
+    scans = list(islice(sc.open_log(shared_data("2d/mit_csail.mcap")).scans(), 120))
+    slam = sc.Slam(dimension=2)
+    steps = [slam.track(scan.points, scan.stamp_ns * 1e-9) for scan in scans]
+    result = slam.finish()
+    assert [step.scan.index for step in steps] == list(range(120))
+    assert len(result.trajectory) == 120
+    assert np.linalg.norm(result.trajectory.poses[-1][:2, 2]) > 1.0
+
+
+POINTS = np.ones((10, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: sc.Odometry(dimension=4), "dimension is 4; it must be 2"),
+        (lambda: sc.Odometry(dimension=2, T_base_lidar=np.eye(4)), r"dimension is 2, but T_base_lidar .* SE\(3\)"),
+        (lambda: sc.Odometry(dimension=2).track(POINTS, 0.0), "has 3D points"),
+        (lambda: sc.Odometry().track(POINTS, 1_700_000_000_000_000_000), "stamp_s is 17"),
+        (lambda: sc.Odometry().track(POINTS, "now"), "stamp_s is 'now'; wanted seconds"),
+        (lambda: sc.Odometry().track(POINTS, np.nan), "stamp_s is nan"),
+        (lambda: sc.Odometry().track(POINTS, 0.0, np.zeros(9)), "times_s"),
+        (lambda: sc.Slam(dimension=3).track(POINTS[:, :2], 0.0), "has 2D points"),
+        (lambda: sc.downsample(POINTS, 0.0), "voxel_size_m is 0"),
+        (lambda: sc.downsample(POINTS[0], 1.0), "points has the shape"),
+        (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
+        (lambda: sc.optimize(sc.PoseGraph(2), robustness="none"), "graph.robustness"),
+    ],
+)
+def test_what_is_no_argument_is_named(call, words):
+    with pytest.raises(InputError, match=words):
+        call()
+
+
+def test_a_run_from_python_writes_what_the_command_writes(office, tmp_path):
+    done = sc.run(office, tmp_path / "run", recording=False, loops__enabled=False, outputs__mcap=True)
+    assert done.metrics.ground_truth.ate.rmse < 0.05
+    written = {path.name for path in done.path.iterdir()}
+    assert {"trajectory.tum", "report.html", "metrics.json", "results.mcap"} <= written
+    assert "recording.rrd" not in written
+    assert len(sc.read_tum(done.path / "trajectory.tum")) == 40
+    with pytest.raises(InputError, match="did you mean loops.drift"):
+        sc.run(office, tmp_path / "again", loops__driff=0.1)
+
+
+def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path):
+    compared = sc.compare(office, tmp_path / "compared", ["plicp", "svd"])
+    assert [row.name for row in compared.table.rows] == ["plicp", "svd"]
+    assert (compared.path / "report.html").exists()
+
+
+def test_a_graph_is_optimized_and_written_and_read(tmp_path):
+    graph = sc.PoseGraph(2)
+    for k in range(4):
+        graph.add_pose(np.array([[1.0, 0.0, 1.1 * k], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), k)
+    step = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    for k in range(3):
+        graph.add_edge(k, k + 1, step, np.eye(3))
+    done = sc.optimize(graph)
+    assert done.converged
+    assert graph.poses[3][0, 2] == pytest.approx(3.0)
+    sc.write_g2o(tmp_path / "graph.g2o", graph)
+    assert np.allclose(sc.read_g2o(tmp_path / "graph.g2o").graph.poses, graph.poses)
+
+
+def test_downsampling_takes_the_first_point_of_each_voxel():
+    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [1.1, 0.1, 0.1]])
+    assert sc.downsample(points, 1.0).tolist() == points[[0, 2]].tolist()
