@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
-import scanchain
 from scanchain import config, data
 from scanchain.clock import working_s
 from scanchain.graph.growing_array import GrowingArray
@@ -44,7 +43,7 @@ _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least 
 
 def _version() -> str:
     """That of the package and a checksum of its code: other code would not go on to the same bits."""
-    package = Path(scanchain.__file__).parent
+    package = Path(__file__).parents[1]
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})"
 
