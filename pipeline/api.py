@@ -19,7 +19,7 @@ from scanchain.source import Source, source_of
 if TYPE_CHECKING:
     from scanchain.comparison.compare import Compared
     from scanchain.config import RecordingConfig
-    from scanchain.graph.optimisation import Optimisation
+    from scanchain.graph.optimization import Optimization
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.runs.recorder import Recorder, SinkName
 
@@ -90,7 +90,7 @@ def compare(
     return run_contest(contest, present_comparison, Unwatched())
 
 
-def optimize(graph: PoseGraph, **overrides: object) -> Optimisation:
+def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     """Move the poses of a graph to the minimum of χ², as ``scanchain optimize`` does.
 
     overrides : keys of ``[graph]``, such as robust="truncated" where loops may be wrong; by default none is
@@ -98,7 +98,7 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimisation:
     Raises InputError where the edges do not hold the poses together.
     """
     changes = _overrides({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
-    return graph.optimise(load_settings(graph.dimension, overrides=changes).config.graph)
+    return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
 
 def downsample(points: Points, voxel_size_m: float) -> Points:

@@ -41,7 +41,7 @@ def dimension_of(value: object, name: str) -> int:
 
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
-    array = _numbers(value, name, f"an (N, {d}) array of metres", dtype)
+    array = _numbers(value, name, f"an (N, {d}) array of meters", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
@@ -90,7 +90,7 @@ def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: fl
     if not farthest_m < _MOST_VOXELS * voxel_m:
         raise InputError(
             f"{name} reach {farthest_m:.3g} m from the origin; a map of {voxel_m:g} m voxels holds "
-            f"{_MOST_VOXELS * voxel_m:.3g} m: give metres, and coordinates near the lidar (subtract a map offset)"
+            f"{_MOST_VOXELS * voxel_m:.3g} m: give meters, and coordinates near the lidar (subtract a map offset)"
         )
 
 

@@ -17,7 +17,7 @@ Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
-Optimiser = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
+Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
 class Section(Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,7 +94,7 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
     """
 
     matcher: Literal["plicp", "svd"] = "plicp"
-    optimiser: Optimiser = "levenberg-marquardt"
+    optimizer: Optimizer = "levenberg-marquardt"
     max_iterations: Count = 50
     reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1
     max_distance_m: Positive = 2.0
@@ -114,7 +114,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How the motion is predicted, how far off the prediction may be, and when a keyframe is made.
 
     ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as
-    a rule is learnt while running. ``max_speed`` and ``max_turn`` are how far a planar scan that fits badly is
+    a rule is learned while running. ``max_speed`` and ``max_turn`` are how far a planar scan that fits badly is
     looked for, per second since the last one.
     """
 
@@ -134,11 +134,11 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
 class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How revisits are found and verified.
 
-    The search radius is what odometry may have drifted since the place was seen, ``drift`` metres a metre, at
+    The search radius is what odometry may have drifted since the place was seen, ``drift`` meters a meter, at
     least ``min_radius_m`` and at most ``max_radius_m``.
 
-    In 3D, places are also recognised by their looks from above, as far as ``place_radius_m`` around where voxels
-    have their full size, wherever odometry has them within ``place_drift`` metres a metre. They look alike from
+    In 3D, places are also recognized by their looks from above, as far as ``place_radius_m`` around where voxels
+    have their full size, wherever odometry has them within ``place_drift`` meters a meter. They look alike from
     ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
     ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
     direction by ``min_place_information``.
@@ -156,8 +156,8 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_information: NonNegative = 0.01
     edge_sigma_m: Positive = 0.05
     edge_sigma_rad: Positive = 0.005
-    optimise_every: Count = 10
-    recognise_places: bool = True
+    optimize_every: Count = 10
+    recognize_places: bool = True
     place_radius_m: Positive = 32.0
     place_drift: Positive = 0.1
     min_likeness: Share = 0.45
@@ -168,9 +168,9 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How the pose graph is optimised."""
+    """How the pose graph is optimized."""
 
-    optimiser: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "newton", "gradient-descent"] = (
+    optimizer: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "newton", "gradient-descent"] = (
         "levenberg-marquardt"
     )
     max_iterations: Count = 50

@@ -2,7 +2,7 @@
 
 A pose is a homogeneous matrix: (3, 3) for SE(2) in a 2D log, (4, 4) for SE(3) in a 3D log. ``T_a_b`` maps
 coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist has k = 3 or 6 entries, ordered
-(translation, rotation). Time is ``int`` nanoseconds, lengths are metres, angles radians.
+(translation, rotation). Time is ``int`` nanoseconds, lengths are meters, angles radians.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Scan:
     index : place of the scan in the order of log time, from 0
     stamp_ns : header stamp; the instant at which the scan's pose holds
     log_time_ns : when it was recorded; scans are processed in this order
-    points : (N, d) float32, metres, lidar frame
+    points : (N, d) float32, meters, lidar frame
     times_s : (N,) float32, seconds of each point relative to ``stamp_ns``; (0,) where the log has none
     dropped : returns removed because they were NaN, infinite or out of range
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
@@ -84,7 +84,7 @@ class Scan:
     ) -> Scan:
         """A scan as a driver gives it.
 
-        points : (N, d) metres, lidar frame, without NaN
+        points : (N, d) meters, lidar frame, without NaN
         stamp_s : seconds since any fixed instant; the pose holds then
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
@@ -189,7 +189,7 @@ class Keyframe:
     scan_index, stamp_ns : the scan it was made of
     stored : its points, which ``points`` reads
     T_odom_lidar : pose in the odometry frame
-    travelled_m : length of the way up to it, by odometry
+    traveled_m : length of the way up to it, by odometry
     scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
@@ -198,7 +198,7 @@ class Keyframe:
     stamp_ns: int
     stored: StoredPoints
     T_odom_lidar: Pose
-    travelled_m: float
+    traveled_m: float
     scale: float = 1.0
 
     @property
@@ -245,7 +245,7 @@ REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """The pose graph after an optimisation.
+    """The pose graph after an optimization.
 
     Attributes
     ----------
@@ -253,7 +253,7 @@ class GraphState:
     stamps_ns : (K,) int64
     edges : (E, 2) int64 keyframe pairs (i, j), odometry first
     is_loop : (E,) bool
-    weight : (E,) robust weight in [0, 1] that the optimiser left to each edge; 1 for odometry
+    weight : (E,) robust weight in [0, 1] that the optimizer left to each edge; 1 for odometry
     chi2 : Σ w eᵀΩe of the edges in force: all but the rejected ones
     edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
     degrees_of_freedom : numbers that the edges in force measure, less those that they are to determine
@@ -311,14 +311,14 @@ class Step:
     ----------
     scan : the scan itself
     points : (M, d) float64 deskewed, downsampled points that were matched, lidar frame
-    T_odom_lidar : pose before optimisation: smooth, drifts
+    T_odom_lidar : pose before optimization: smooth, drifts
     T_world_lidar : best pose known now: jumps at closures
     match : the registration against the local map
     state, reason : how far the pose can be trusted, and why not
     keyframe : index of the keyframe made of this scan, -1 if none was
     local_map : (L, d) float64 points of the local map in the odom frame; filled on keyframes, else (0, d)
     closures : loop closures tried at this scan
-    graph : the optimised graph if this scan led to an optimisation, else None
+    graph : the optimized graph if this scan led to an optimization, else None
     timing : seconds by stage
     """
 

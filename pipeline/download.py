@@ -107,7 +107,7 @@ def _verify(path: Path, sha256: str, url: str) -> str:
     if sha256 and found != sha256:
         path.unlink()
         raise InputError(
-            f"{url}: has SHA-256 {found}, not {sha256} as the catalogue says; it was deleted, call it again, or "
+            f"{url}: has SHA-256 {found}, not {sha256} as the catalog says; it was deleted, call it again, or "
             "see whether its page announces a new version"
         )
     return found

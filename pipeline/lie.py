@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix, Pose
 from scanchain.kernels import pose_log, poses
-from scanchain.kernels.twist import orthonormalise
+from scanchain.kernels.twist import orthonormalize
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
@@ -43,7 +43,7 @@ def between(T_a: Pose, T_b: Pose) -> Pose:
 
 
 def apart(T_a: Pose, T_b: Pose) -> tuple[float, float]:
-    """How far apart two poses are: metres, and the angle in [0, π] between their rotations."""
+    """How far apart two poses are: meters, and the angle in [0, π] between their rotations."""
     return poses.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
 
 
@@ -124,10 +124,10 @@ def twist_size(T: Pose) -> int:
     return 3 if T.shape[-1] == 3 else 6
 
 
-def by_component(k: int, metres: float, radians: float) -> NDArray[np.float64]:
+def by_component(k: int, meters: float, radians: float) -> NDArray[np.float64]:
     """One number for every entry of a twist (k,): that of lengths, then that of angles."""
     d = 2 if k == 3 else 3
-    return np.array([metres] * d + [radians] * (k - d))
+    return np.array([meters] * d + [radians] * (k - d))
 
 
 def adjoint(T: Pose) -> Matrix:
@@ -148,10 +148,10 @@ def adjoint(T: Pose) -> Matrix:
     return result
 
 
-def normalise(T: Pose) -> Pose:
+def normalize(T: Pose) -> Pose:
     """The pose with its rotation made orthonormal again, after many products."""
     result = np.array(T, np.float64, order="C")
-    orthonormalise(result)
+    orthonormalize(result)
     return result
 
 
@@ -168,7 +168,7 @@ def to_quaternion(R: Matrix) -> NDArray[np.float64]:
 
 
 def from_quaternion(quat_xyzw: NDArray[np.float64]) -> Matrix:
-    """Rotation matrices (..., 3, 3) of quaternions xyzw (..., 4); normalised first."""
+    """Rotation matrices (..., 3, 3) of quaternions xyzw (..., 4); normalized first."""
     q = quat_xyzw / np.linalg.norm(quat_xyzw, axis=-1, keepdims=True)
     K = hat(q[..., :3])
     return np.eye(3) + 2.0 * (q[..., 3, None, None] * K + K @ K)

@@ -33,7 +33,7 @@ class PointStore:
         self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
-        """Write points (N, d), metres. Raises OSError where the disk is full."""
+        """Write points (N, d), meters. Raises OSError where the disk is full."""
         stored = StoredPoints(self, self.rows, len(points))
         data = memoryview(np.ascontiguousarray(points, _NUMBER).tobytes())
         self.file.seek(self.rows * self._row_bytes)
@@ -85,7 +85,7 @@ class StoredPoints:
     count: int
 
     def read(self) -> NDArray[np.float64]:
-        """(count, d) metres."""
+        """(count, d) meters."""
         return self.store.read(self.first, self.count).astype(np.float64)
 
 

@@ -24,7 +24,7 @@ _PLACE_KEYS = (
     "loops.place_radius_m", "loops.place_drift", "loops.min_likeness", "loops.min_place_overlap",
     "loops.min_place_information", "loops.min_agreement",
 )  # fmt: skip
-_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m", "loops.recognise_places", *_PLACE_KEYS)
+_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m", "loops.recognize_places", *_PLACE_KEYS)
 _PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
 _NOTHING: Mapping[str, str] = {}
 _ORDERED = (
@@ -131,14 +131,14 @@ def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, 
     reasons = {
         "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
         "it is of 3D logs alone": _SPATIAL_KEYS if dimension == 2 else (),
-        "loops.recognise_places is false": () if values["loops.recognise_places"] else _PLACE_KEYS,
+        "loops.recognize_places is false": () if values["loops.recognize_places"] else _PLACE_KEYS,
         "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
         "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
         "preprocess.min_scale is 1": ("preprocess.range_voxels",) if values["preprocess.min_scale"] == 1.0 else (),
         "preprocess.match_voxel_m is not above preprocess.map_voxel_m": (
             ("preprocess.match_points",) if matches_all else ()
         ),
-        "matching.matcher is svd": ("matching.optimiser",) if values["matching.matcher"] == "svd" else (),
+        "matching.matcher is svd": ("matching.optimizer",) if values["matching.matcher"] == "svd" else (),
         "log.point_times is not clockwise or counterclockwise": (
             () if values["log.point_times"] in ("clockwise", "counterclockwise") else _REVOLUTION_KEYS
         ),

@@ -28,7 +28,7 @@ from scanchain.data import (
     Verdict,
 )
 from scanchain.errors import InputError
-from scanchain.graph.graduation import Judgement
+from scanchain.graph.graduation import Judgment
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops import LoopCloser, refined, spread
@@ -37,15 +37,15 @@ from scanchain.point_store import PointStore
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
-_GROWTH = 0.05  # of the graph, between two optimisations that change little
-_SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimised in soon
+_GROWTH = 0.05  # of the graph, between two optimizations that change little
+_SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
 @dataclass(frozen=True, slots=True)
 class SlamResult:
     """What a log amounts to.
 
-    ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimisation; ``keyframes``
+    ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried.
     """
 
@@ -91,11 +91,11 @@ class Slam:
         self.stamps_ns: list[int] = []
         self.odometry_poses: list[Pose] = []
         self.T_world_odom = lie.identity(self.dimension)
-        self.travelled_m = 0.0
+        self.traveled_m = 0.0
         self.waiting_closures = 0
         self.surprising = False
         self.lost_scans = 0
-        self.optimised_at = 0
+        self.optimized_at = 0
         self.is_finished = False
 
     def track(
@@ -126,7 +126,7 @@ class Slam:
         state = None
         if keyframe >= 0 and self.config.loops.enabled:
             closures = self._close_loops()
-            state = self._optimise_when_due()
+            state = self._optimize_when_due()
         timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
             scan=scan,
@@ -157,7 +157,7 @@ class Slam:
             tell("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
         tell(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
-        state = self._optimise("mended")
+        state = self._optimize("mended")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
@@ -182,7 +182,7 @@ class Slam:
         """Make a keyframe of a scan that moved far enough; its index, or −1."""
         tracked = located.tracked
         if self.odometry_poses:
-            self.travelled_m += lie.apart(self.odometry_poses[-1], tracked.T_odom_lidar)[0]
+            self.traveled_m += lie.apart(self.odometry_poses[-1], tracked.T_odom_lidar)[0]
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
@@ -200,7 +200,7 @@ class Slam:
             stamp_ns=tracked.scan.stamp_ns,
             stored=stored,
             T_odom_lidar=tracked.T_odom_lidar,
-            travelled_m=self.travelled_m,
+            traveled_m=self.traveled_m,
             scale=located.scale,
         )
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
@@ -246,24 +246,24 @@ class Slam:
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         return replace(closure, chi2_before=float(error @ information @ error))
 
-    def _optimise_when_due(self) -> GraphState | None:
-        """Optimise when closures wait: soon if one of them moves the map, else once the graph has grown enough.
+    def _optimize_when_due(self) -> GraphState | None:
+        """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
 
-        The growth asked for is a share of the graph, so that all optimisations together cost little more than a
+        The growth asked for is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. Verdicts are mended where the map moves: there a wrong one would last.
         """
-        grown = len(self.keyframes) - self.optimised_at
-        enough = self.config.loops.optimise_every
+        grown = len(self.keyframes) - self.optimized_at
+        enough = self.config.loops.optimize_every
         if not self.surprising:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:
             return None
-        return self._optimise("mended" if self.surprising else "graduated")
+        return self._optimize("mended" if self.surprising else "graduated")
 
-    def _optimise(self, judgement: Judgement) -> GraphState:
-        state = self.graph.optimise(self.config.graph, initialise="given", judgement=judgement).state
-        self.waiting_closures, self.surprising, self.optimised_at = 0, False, len(self.keyframes)
-        self.T_world_odom = lie.normalise(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
+    def _optimize(self, judgment: Judgment) -> GraphState:
+        state = self.graph.optimize(self.config.graph, initialize="given", judgment=judgment).state
+        self.waiting_closures, self.surprising, self.optimized_at = 0, False, len(self.keyframes)
+        self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
 
 

@@ -75,7 +75,7 @@ class Unsteady(StandsStill):
 
 
 class Shifted(StandsStill):
-    """Ten centimetres forward a scan, or whatever it is told."""
+    """Ten centimeters forward a scan, or whatever it is told."""
 
     def __init__(self, step_m=0.1):
         super().__init__()

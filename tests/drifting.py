@@ -28,7 +28,7 @@ class DriftingOdometry:
         tracked = self.odometry.process(scan)
         motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
-        self.T_drifted = lie.normalise(self.T_drifted @ self.drifted(motion))
+        self.T_drifted = lie.normalize(self.T_drifted @ self.drifted(motion))
         return replace(tracked, T_odom_lidar=self.T_drifted)
 
 
@@ -40,7 +40,7 @@ def drifting_slam(config, T_base_lidar, drifted):
 
 
 def stretched(longer, turn_rad_m):
-    """Motions made longer by a share of themselves and turned by so much a metre."""
+    """Motions made longer by a share of themselves and turned by so much a meter."""
 
     def drifted(motion):
         d = len(motion) - 1
@@ -54,5 +54,5 @@ def stretched(longer, turn_rad_m):
 
 
 def off_by(error_per_m):
-    """Motions followed by a twist (k,) a metre."""
+    """Motions followed by a twist (k,) a meter."""
     return lambda motion: motion @ lie.exp(float(np.linalg.norm(motion[:-1, -1])) * error_per_m)

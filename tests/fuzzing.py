@@ -48,7 +48,7 @@ class Hang(BaseException):
 
 
 def seeds(folder):
-    """Small healthy files of every make: chunked and not, compressed, summarised, with and without CRCs."""
+    """Small healthy files of every make: chunked and not, compressed, summarized, with and without CRCs."""
     clouds = [
         cloud_said(cloud.stamp_ns, point_cloud(cloud.stamp_ns, cloud.rows)) for cloud in recorders.clouds(8, 20)
     ]

@@ -14,7 +14,7 @@ PLACE_SEED = 3
 
 
 @dataclass(frozen=True)
-class LabelledScan:
+class LabeledScan:
     """A scan as a keyframe holds it: points (N, d) thinned out, lidar frame, and which of them moved."""
 
     T_world_lidar: Pose
@@ -35,7 +35,7 @@ def walkers_in_the_office(duration_s=120.0, every_m=0.5):
 
 
 def traffic_in_the_town(duration_s=60.0, every_m=2.0, sensor="hdl-64"):
-    """Cars that come towards a car with a lidar or overtake it, and people on the pavements; no car is parked."""
+    """Cars that come toward a car with a lidar or overtake it, and people on the pavements; no car is parked."""
     drive = plan("town", seed=PLACE_SEED, duration_s=duration_s, sensor=sensor)
     solids = town(np.random.default_rng(PLACE_SEED), parked=0.0)
     drive = replace(drive, solids=solids)
@@ -80,7 +80,7 @@ def _car(solids, axis, across, along):
 
 
 def _scans(drive, every_m, voxel_m, cylinders_at, boxes_at):
-    """A scan every so many metres of the way, taken from a lidar that stands still for it."""
+    """A scan every so many meters of the way, taken from a lidar that stands still for it."""
     random = np.random.default_rng(PLACE_SEED)
     sensor = drive.sensor
     times_s = drive.scans * sensor.period_ns * 1e-9
@@ -109,4 +109,4 @@ def _thinned(T, points: Matrix, moves, voxel_m, dimension):
     points = np.ascontiguousarray(points[:, :dimension])
     chosen = np.empty(len(points), np.int32)
     chosen = chosen[: first_per_voxel(points, voxel_m, 0.0, 1e9, chosen)]
-    return LabelledScan(T if dimension == 3 else lie.flatten(T), points[chosen], moves[chosen])
+    return LabeledScan(T if dimension == 3 else lie.flatten(T), points[chosen], moves[chosen])

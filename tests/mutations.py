@@ -47,7 +47,7 @@ class Seed:
         self.records = list(_records(self.data, self.lidar))
 
     @property
-    def is_summarised(self):
+    def is_summarized(self):
         return any(record.opcode == STATISTICS for record in self.records)
 
     def expected(self, touched):
@@ -136,7 +136,7 @@ def spliced(seed, rng):
     piece = seed.data[begin:end]
     if rng.integers(2):
         what = f"bytes {begin} to {end} left out"
-        seamless = not seed.is_summarised and any(record.begin == begin for record in seed.records)
+        seamless = not seed.is_summarized and any(record.begin == begin for record in seed.records)
         return Mutant(seed.data[:begin] + seed.data[end:], what, [(begin, end)], seamless)
     at = int(rng.integers(8, len(seed.data))) if rng.integers(2) else end
     data = seed.data[:at] + piece + seed.data[at:]

@@ -17,13 +17,13 @@ def group(points, size):
     return {key: np.array(members) for key, members in groups.items()}
 
 
-def members_of(points, neighbours, alone, size):
-    """A voxel's own points where they are many and show some width, else those of the neighbours too."""
+def members_of(points, neighbors, alone, size):
+    """A voxel's own points where they are many and show some width, else those of the neighbors too."""
     if len(points) >= alone and len(points) >= (3 if points.shape[1] == 2 else 5):
         width2 = np.linalg.eigvalsh(np.cov(points.T, bias=True))[1]
         if width2 >= (size / 8) ** 2:
             return points
-    return np.concatenate([points, *neighbours])
+    return np.concatenate([points, *neighbors])
 
 
 def shape(members):

@@ -28,7 +28,7 @@ def interpolated(stamp, stamps, poses, gap):
     return pose
 
 
-def travelled(poses):
+def traveled(poses):
     lengths = [0.0]
     for a, b in pairwise(poses):
         lengths.append(lengths[-1] + math.dist(a[:3, 3], b[:3, 3]))
@@ -41,7 +41,7 @@ def angle(R):
 
 def kitti(reference, estimate, lengths_m, every):
     """Translational share and rad/m of every stretch, as the benchmark's description has it."""
-    path = travelled(reference)
+    path = traveled(reference)
     shares, turns = [], []
     for length in lengths_m:
         for first in range(0, len(reference), every):

@@ -39,11 +39,11 @@ def hold(H, weights, range_m, expected, signals, limits):
 
 def seen_from_source(T, T_first, H, worst, variance):
     """Information and worst direction of twists in the source's frame."""
-    centred = T.copy()
-    centred[:-1, -1] -= T_first[:-1, -1]
-    turned = centred.copy()
+    centered = T.copy()
+    centered[:-1, -1] -= T_first[:-1, -1]
+    turned = centered.copy()
     turned[:-1, -1] = 0.0
-    return lie.adjoint(centred).T @ H @ lie.adjoint(centred) / variance, lie.adjoint(turned).T @ worst
+    return lie.adjoint(centered).T @ H @ lie.adjoint(centered) / variance, lie.adjoint(turned).T @ worst
 
 
 def signal_along(voxel_map, points, T, outcome, twist):

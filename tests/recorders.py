@@ -61,7 +61,7 @@ def clouds(count=3, points=50):
 
 
 def assert_planar(scans, said=None, *, exact=True):
-    """The scans are those that were told, to the last bit, or to a micrometre where angles are told otherwise."""
+    """The scans are those that were told, to the last bit, or to a micrometer where angles are told otherwise."""
     said = planar() if said is None else said
     assert [scan.stamp_ns for scan in scans] == [each.stamp_ns for each in said]
     for scan, each in zip(scans, said, strict=True):
@@ -100,7 +100,7 @@ for store in (ROS1, ROS2):
 
 
 class Ros:
-    """Messages of ROS 1 or 2 as rosbags builds and serialises them."""
+    """Messages of ROS 1 or 2 as rosbags builds and serializes them."""
 
     def __init__(self, store):
         self.store = store

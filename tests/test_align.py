@@ -28,7 +28,7 @@ def real_pair(name, apart):
 
 
 @pytest.mark.parametrize(("name", "apart"), [(KITTI, 3), (CSAIL, 5)])
-def test_real_scans_about_a_metre_apart_are_aligned_without_a_guess(name, apart):
+def test_real_scans_about_a_meter_apart_are_aligned_without_a_guess(name, apart):
     target, source, motion = real_pair(name, apart)
     match = scanchain.align(target, source)
     assert np.linalg.norm(motion[:-1, -1]) > 0.8

@@ -67,7 +67,7 @@ def test_what_is_no_argument_is_named(call, words):
 
 def test_a_run_from_python_writes_what_the_command_writes(office, tmp_path):
     done = sc.run(office, tmp_path / "run", recording=False, loops__enabled=False, outputs__mcap=True)
-    assert done.metrics.ground_truth.optimised.ate_rmse_m < 0.05
+    assert done.metrics.ground_truth.optimized.ate_rmse_m < 0.05
     written = {path.name for path in done.path.iterdir()}
     assert {"trajectory.tum", "report.html", "metrics.json", "results.mcap"} <= written
     assert "recording.rrd" not in written

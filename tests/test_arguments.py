@@ -125,9 +125,9 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: PoseGraph(2).add_edge(0, 1, I3, I3, is_loop="no"), "is_loop is 'no'; wanted True or False"),
         (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], ["no"]), "is_loop .* wanted .* True or"),
         (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], [0]), "is_loop .* wanted .* True or"),
-        (lambda: PoseGraph(2).optimise(Config()), "config is .*; wanted a GraphConfig"),
-        (lambda: PoseGraph(2).optimise(GraphConfig(), initialise="best"), "initialise is 'best'; it must be"),
-        (lambda: PoseGraph(2).optimise(GraphConfig(), judgement="fair"), "judgement is 'fair'; it must be"),
+        (lambda: PoseGraph(2).optimize(Config()), "config is .*; wanted a GraphConfig"),
+        (lambda: PoseGraph(2).optimize(GraphConfig(), initialize="best"), "initialize is 'best'; it must be"),
+        (lambda: PoseGraph(2).optimize(GraphConfig(), judgment="fair"), "judgment is 'fair'; it must be"),
         (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
@@ -261,10 +261,10 @@ def test_real_sweeps_within_the_search_are_called_converged():
     first, second, fourth = sweeps("kitti_0001_first54.mcap", 0, 1, 4)
     align, surfaces = mapped(first.astype(float))
     ahead = lie.exp(np.array([5.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    for source, T_first, travelled_m in ((second, I4, 1.34), (fourth, ahead, 5.35)):
+    for source, T_first, traveled_m in ((second, I4, 1.34), (fourth, ahead, 5.35)):
         match = align.align(source, surfaces, T_first, wide=True)
         assert match.converged and match.fit > 0.8
-        assert match.T_target_source[0, 3] == pytest.approx(travelled_m, abs=0.05)
+        assert match.T_target_source[0, 3] == pytest.approx(traveled_m, abs=0.05)
 
 
 shapes = st.one_of(

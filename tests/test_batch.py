@@ -85,7 +85,7 @@ def test_of_24_logs_two_are_poison_and_22_have_results_and_a_second_call_runs_on
     for row in done.values():
         metrics = json.loads((out / row["run"] / "metrics.json").read_text())
         assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
-        assert row["ate_rmse_m"] == metrics["ground_truth"]["optimised"]["ate_rmse_m"]
+        assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
     assert "24: 22 done, 1 crashed, 1 out of memory" in output
     assert errors == f"error: 2 of 24 logs have no result; {out}/summary.txt says why\n"
 

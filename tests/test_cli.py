@@ -310,7 +310,7 @@ def test_a_span_without_a_scan_names_the_length_of_the_log(refused, tmp_path, of
         (["--gt", "/nope"], ["log.ground_truth_topic /nope", "/odom"]),
         (["--log.odometry_topic", "/nope"], ["log.odometry_topic /nope", "/odom"]),
         (["--config", "absent.toml"], ["absent.toml", "--config"]),
-        (["--colour"], ["No such option '--colour'", "scanchain run --help"]),
+        (["--color"], ["No such option '--color'", "scanchain run --help"]),
         (["--nosuch", "3"], ["No such option '--nosuch'; see scanchain run --help"]),
         (["--forec"], ["No such option '--forec'. Did you mean '--force'?; see"]),
     ],
@@ -598,7 +598,7 @@ def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):
 def test_both_matchers_stay_on_the_way_in_the_office(call, tmp_path, office, matcher):
     call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--matcher", matcher)
     found = metrics(tmp_path / "a")
-    assert found["ok"] == 60 and found["ground_truth"]["optimised"]["ate_rmse_m"] < 0.02
+    assert found["ok"] == 60 and found["ground_truth"]["optimized"]["ate_rmse_m"] < 0.02
 
 
 def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_path, office):
@@ -614,7 +614,7 @@ def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_p
         out = tmp_path / name.strip("/")
         call("run", office, "--out", out, "--rerun", "off", "--force", *flags)
         found = metrics(out)["ground_truth"]
-        ate_m[name], named[name] = found["optimised"]["ate_rmse_m"], found["source"]
+        ate_m[name], named[name] = found["optimized"]["ate_rmse_m"], found["source"]
     assert ate_m["log"] == ate_m["/ground_truth"] == pytest.approx(ate_m["same"], abs=1e-7)
     assert ate_m["other"] > 0.3
     assert named == {
@@ -677,7 +677,7 @@ def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, o
     write_tum(tmp_path / "late.tum", Trajectory(fast.stamps_ns[:-4], fast.poses[:-4]))
     out = tmp_path / "a"
     _, output, errors = call("run", office, "--out", out, "--rerun", "off", "--gt", tmp_path / "late.tum")
-    found = metrics(out)["ground_truth"]["optimised"]
+    found = metrics(out)["ground_truth"]["optimized"]
     assert errors == "" and found["pairs"] == 45
     assert found["missing"] == "15 without a true pose: 1 before the truth begins, 14 after it ends"
     says(output, f"45 scans; {found['missing']}")
@@ -710,7 +710,7 @@ def test_run_and_evaluate_take_kitti_poses_a_row_a_scan_as_compare_does(call, re
     words = ["run", office, "--rerun", "off", "--gt", tmp_path / "poses.txt", "--out"]
     assert call(*words, tmp_path / "a")[0] == 0
     call("run", office, "--rerun", "off", "--out", tmp_path / "b")
-    found, same = (metrics(tmp_path / name)["ground_truth"]["optimised"] for name in "ab")
+    found, same = (metrics(tmp_path / name)["ground_truth"]["optimized"] for name in "ab")
     assert found["pairs"] == 60 and found["ate_rmse_m"] == pytest.approx(same["ate_rmse_m"], abs=1e-7)
     says(refused(*words, tmp_path / "c", "--end", "3"), "60 lines for 30 scans")
     assert not (tmp_path / "c").exists()
@@ -777,7 +777,7 @@ def test_a_robot_that_stands_still_gives_a_run_with_one_keyframe(call, tmp_path)
         out = tmp_path / str(number)
         code, _, errors = call("run", path, "--out", out, "--rerun", "off")
         assert (code, errors) == (0, "")
-        assert metrics(out)["keyframes"] == 1 and metrics(out)["travelled_m"] < 0.01
+        assert metrics(out)["keyframes"] == 1 and metrics(out)["traveled_m"] < 0.01
 
 
 # the other commands
@@ -884,7 +884,7 @@ def test_evaluate_measures_relations_alone_and_beside_the_truth(call, tmp_path):
 def test_evaluate_agrees_with_the_metrics_of_the_run(call, tmp_path, office):
     call("run", office, "--out", tmp_path / "a", "--rerun", "off")
     truth = office.with_suffix(".tum")
-    for name, key in (("trajectory.tum", "optimised"), ("odometry.tum", "odometry")):
+    for name, key in (("trajectory.tum", "optimized"), ("odometry.tum", "odometry")):
         tree = json.loads(call("evaluate", tmp_path / "a" / name, truth, "--json")[1])
         said = metrics(tmp_path / "a")["ground_truth"][key]
         assert tree["ate"]["translation_m"]["rmse"] == pytest.approx(said["ate_rmse_m"], abs=1e-6)
@@ -931,7 +931,7 @@ def test_what_config_dump_prints_can_be_given_back(call, tmp_path, dimension):
     assert call("config", "dump", "--config", tmp_path / "mine.toml")[1] == output
 
 
-def test_sequence_list_knows_every_folder_of_the_catalogue(call):
+def test_sequence_list_knows_every_folder_of_the_catalog(call):
     folders = sorted(path.parent.name for path in (ROOT / "sequences").glob("*/sequence.toml"))
     code, output, errors = call("sequence", "list")
     assert (code, errors) == (0, "")
@@ -990,7 +990,7 @@ def test_optimize_prints_what_it_did_and_writes_the_graph(call, tmp_path, ring):
     again = json.loads(call("optimize", tmp_path / "done.g2o", "--json")[1])
     assert again["chi2_before"] == pytest.approx(again["chi2_after"], rel=1e-9)
     assert again["certificate"]["certified"] and again["certificate"]["relative_gap"] < 1e-6
-    assert again["initialisation"] == "given" and again["kept_lines"] == {"PARAMS": 1}
+    assert again["initialization"] == "given" and again["kept_lines"] == {"PARAMS": 1}
 
 
 def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path, ring):
@@ -1155,11 +1155,11 @@ def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, 
     assert code == 1 and json.loads(output)["converged"] is False
 
 
-@pytest.mark.parametrize(("optimiser", "initialise"), [("dogleg", "chordal"), ("newton", "spanning-tree")])
-def test_optimize_takes_an_optimiser_and_a_first_guess(call, ring, optimiser, initialise):
-    words = ["--optimiser", optimiser, "--initialise", initialise, "--graph.max_iterations", "99", "--json"]
+@pytest.mark.parametrize(("optimizer", "initialize"), [("dogleg", "chordal"), ("newton", "spanning-tree")])
+def test_optimize_takes_an_optimizer_and_a_first_guess(call, ring, optimizer, initialize):
+    words = ["--optimizer", optimizer, "--initialize", initialize, "--graph.max_iterations", "99", "--json"]
     tree = json.loads(call("optimize", ring, *words)[1])
-    assert tree["initialisation"] == initialise and tree["converged"]
+    assert tree["initialization"] == initialize and tree["converged"]
 
 
 @pytest.mark.parametrize(
@@ -1173,7 +1173,7 @@ def test_optimize_takes_an_optimiser_and_a_first_guess(call, ring, optimiser, in
         (["--out", "{}/none/a.g2o"], "there is no folder"),
         (["--out", "{}/ring.g2o"], "exists; choose another name, or --force"),
         (["--out", "{}"], "is a folder"),
-        (["--optimiser", "magic"], "graph.optimiser is 'magic'; it must be one of"),
+        (["--optimizer", "magic"], "graph.optimizer is 'magic'; it must be one of"),
         (["--loops.drift", "1"], "--loops.drift has no meaning for optimize"),
     ],
 )

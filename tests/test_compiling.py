@@ -76,7 +76,7 @@ def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_rehearsal_optimises_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
+def test_a_rehearsal_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
     made = {}
     for name in ("cloud_of", "grid_of"):
         monkeypatch.setattr(f"scanchain.runs.rehearsal.{name}", _remembering(made, name))

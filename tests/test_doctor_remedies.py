@@ -133,7 +133,7 @@ def a_range_for_no_return(world):
 
 
 def wheels_far_from_an_unmounted_lidar(world):
-    """Three metres behind it, scans at 1.7 Hz."""
+    """Three meters behind it, scans at 1.7 Hz."""
     for number, said, decoded in said_in(world("office", None, 40.0)):
         if said.topic == "/odom":
             pose = decoded.pose.pose
@@ -226,7 +226,7 @@ FAULTS = {
 
 
 def figures(path, out, capfd, *flags):
-    """Error of the odometry in metres, infinite where the run stops; scans; those lost."""
+    """Error of the odometry in meters, infinite where the run stops; scans; those lost."""
     words = ["run", path, "--out", out, "--rerun", "off", "--no-loops", "--force", "--json", *flags]
     code = main([str(word) for word in words])
     output = capfd.readouterr().out

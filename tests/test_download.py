@@ -1,4 +1,4 @@
-"""Downloads from a local server that understands ranges, and the catalogue's recordings by way of it."""
+"""Downloads from a local server that understands ranges, and the catalog's recordings by way of it."""
 
 import hashlib
 import http.server
@@ -15,7 +15,7 @@ import recorders
 from test_inputs_carmen import flaser, save
 from test_inputs_folders import kitti_raw
 
-from scanchain import catalogue
+from scanchain import catalog
 from scanchain.__main__ import main
 from scanchain.download import DownloadError, fetch
 from scanchain.errors import InputError
@@ -178,25 +178,25 @@ def test_a_server_that_is_not_there_is_one_line(tmp_path):
         fetch("http://127.0.0.1:9/a", tmp_path / "a")
 
 
-# The catalogue
+# The catalog
 
 PUBLISHED = {"intel", "aces", "freiburg-079", "mit-csail", "mit-killian", "freiburg-hospital", "kitti"}
 PUBLISHED |= {"kitti-odometry", "newer-college", "mulran", "helipr"}
 
 
 def served(monkeypatch, name, **changes):
-    """The catalogue's entry, its addresses on the local server."""
-    entry = catalogue.load(name)
+    """The catalog's entry, its addresses on the local server."""
+    entry = catalog.load(name)
     changed = msgspec.structs.replace(entry, source=msgspec.structs.replace(entry.source, **changes))
-    monkeypatch.setattr(catalogue, "load", lambda _: changed)
+    monkeypatch.setattr(catalog, "load", lambda _: changed)
 
 
-def test_every_recording_of_others_has_its_page_its_licence_and_a_way_to_mcap():
-    assert set(catalogue.names()) >= PUBLISHED
+def test_every_recording_of_others_has_its_page_its_license_and_a_way_to_mcap():
+    assert set(catalog.names()) >= PUBLISHED
     for name in PUBLISHED:
-        entry = catalogue.load(name)
-        assert entry.source.page.startswith("http") and entry.licence and entry.conversion and entry.ground_truth
-        if isinstance(entry.source, catalogue.Download):
+        entry = catalog.load(name)
+        assert entry.source.page.startswith("http") and entry.license and entry.conversion and entry.ground_truth
+        if isinstance(entry.source, catalog.Download):
             assert entry.source.url.startswith("http")
         else:
             assert "scanchain convert" in entry.source.steps and f"{name}.mcap" in entry.source.steps
@@ -234,7 +234,7 @@ def test_an_archive_is_unpacked_and_its_folder_converted_with_its_truth(site, tm
         "/calib.zip": zipped(base / "2011_09_26" / "calib_imu_to_velo.txt", base),
     }
     served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url=f"{site.url}/calib.zip")
-    log = open_log(catalogue.prepare("kitti", tmp_path / "logs"))
+    log = open_log(catalog.prepare("kitti", tmp_path / "logs"))
     truth = log.ground_truth()
     assert log.scan_count == 3 and truth is not None and len(truth) == 3
 
@@ -247,7 +247,7 @@ def test_names_in_an_archive_lead_nowhere_else(site, tmp_path, monkeypatch):
     site.files = {"/drive.zip": packed.getvalue()}
     served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")
     with pytest.raises(InputError):
-        catalogue.prepare("kitti", tmp_path / "a" / "logs")
+        catalog.prepare("kitti", tmp_path / "a" / "logs")
     assert {path.name for path in (tmp_path / "a").rglob("*.txt")} <= {"outside.txt", "absolute.txt"}
     for path in tmp_path.rglob("*.txt"):
         assert path.is_relative_to(tmp_path / "a" / "logs" / "kitti-unpacked")
@@ -257,7 +257,7 @@ def test_an_archive_that_is_none_says_so(site, tmp_path, monkeypatch):
     site.files = {"/drive.zip": b"no zip"}
     served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")
     with pytest.raises(InputError, match=r"drive\.zip: does not unpack"):
-        catalogue.prepare("kitti", tmp_path)
+        catalog.prepare("kitti", tmp_path)
 
 
 def test_a_recording_that_asks_for_an_account_says_what_to_do(capfd, tmp_path):

@@ -302,7 +302,7 @@ def test_the_metrics_agree_with_the_files(drive):
     left_out = f"{metrics['moving_points_removed']:,} more left out as having moved"
     assert left_out in (drive.folder / "summary.txt").read_text(encoding="utf-8")
     assert metrics["moving_points_removed"] < 0.01 * metrics["map_points"]  # nothing moves there
-    assert metrics["travelled_m"] == pytest.approx(length_m(drive.tum()), abs=1e-5)
+    assert metrics["traveled_m"] == pytest.approx(length_m(drive.tum()), abs=1e-5)
     assert (metrics["scan_points"], metrics["dropped_points"]) == (
         steps["scan_points"].sum(),
         steps["dropped"].sum(),
@@ -319,7 +319,7 @@ def test_the_metrics_agree_with_the_files(drive):
 def test_the_error_told_is_the_one_scipy_finds(drive):
     told = drive.metrics["ground_truth"]
     assert told["path_length_m"] == pytest.approx(length_m(drive.truth), abs=1e-5)
-    for key, name in (("optimised", "trajectory"), ("odometry", "odometry")):
+    for key, name in (("optimized", "trajectory"), ("odometry", "odometry")):
         assert told[key]["ate_rmse_m"] == pytest.approx(ate_m(drive.tum(name), drive.truth), abs=1e-6)
         assert told[key]["pairs"] == len(drive.truth)
         share = told[key]["ate_rmse_m"] / told["path_length_m"]
@@ -337,7 +337,7 @@ def test_the_summary_says_what_the_metrics_say(drive):
     for part in (
         f"{metrics['scans']:,} over {metrics['log_span_s']:.1f} s",
         f"loop closures  {metrics['closures_tried'] or 'none'} tried",
-        f"ATE            rmse {metrics['ground_truth']['optimised']['ate_rmse_m']:.4f} m",
+        f"ATE            rmse {metrics['ground_truth']['optimized']['ate_rmse_m']:.4f} m",
     ):
         assert part in text
 
@@ -380,7 +380,7 @@ def test_the_recording_has_every_entity_and_every_scan_on_both_timelines(drive):
 
 def test_the_recorded_poses_are_those_of_the_trajectories(drive):
     path = drive.folder / "recording.rrd"
-    (strip,) = optimised_strips(path)
+    (strip,) = optimized_strips(path)
     np.testing.assert_allclose(strip, drive.tum()[:, 1:4], atol=1e-4)
     steps = drive.steps
     assert sorted(column(path, entities.INLIERS, "scan")) == steps["index"].tolist()
@@ -407,10 +407,10 @@ def test_events_edges_counts_and_the_table_agree_on_the_verdict_of_every_closure
     assert drive.metrics["closures_accepted"] == accepted
 
 
-def optimised_strips(path):
+def optimized_strips(path):
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
-        if chunk.entity_path.lstrip("/") == entities.OPTIMISED and "LineStrips3D:strips" in batch.schema.names:
+        if chunk.entity_path.lstrip("/") == entities.OPTIMIZED and "LineStrips3D:strips" in batch.schema.names:
             yield np.array(batch.column("LineStrips3D:strips").to_pylist()[0][0])
 
 
@@ -478,7 +478,7 @@ def test_intel_gives_all_13631_scans_in_the_order_they_were_taken(intel):
     steps = intel.steps
     assert (np.diff(steps["log_time_ns"]) >= 0).all() and (np.diff(steps["stamp_ns"]) < 0).sum() == 631
     rows, _ = rows_of(intel.folder / "recording.rrd")
-    assert rows[entities.OPTIMISED_LIDAR] == 13_631
+    assert rows[entities.OPTIMIZED_LIDAR] == 13_631
 
 
 @pytest.mark.parametrize(("name", "limit_m"), [("odometry", 0.03), ("trajectory", 0.0229)])

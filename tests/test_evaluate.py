@@ -139,7 +139,7 @@ def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(which, meas
 
 
 def test_rpe_over_distance_takes_the_first_pose_far_enough(pairs):
-    path = naive.travelled(pairs.reference)
+    path = naive.traveled(pairs.reference)
     for i, j in relative_error_over_distance(pairs, 20.0).stretches:
         assert path[j] - path[i] >= 20.0 - 1e-9 > path[j - 1] - path[i] - 2e-9
 
@@ -199,17 +199,17 @@ def test_short_paths_are_judged_over_short_lengths(pairs):
     assert [part.translation_share is not None for part in error.by_length] == [True, True] + [False] * 6
 
 
-def test_metres_or_centimetres_same_judgement(pairs):
+def test_meters_or_centimeters_same_judgment(pairs):
     def in_cm(trajectory):
         poses = trajectory.poses.copy()
         poses[:, :3, 3] *= 100.0
         return Trajectory(trajectory.stamps_ns, poses)
 
     scaled = pair(in_cm(disturbed(drive())), in_cm(drive()))
-    metres, centimetres = absolute_error(pairs), absolute_error(scaled)
-    assert centimetres.translation_m.rmse == pytest.approx(100.0 * metres.translation_m.rmse)
-    assert centimetres.rotation_rad.rmse == pytest.approx(metres.rotation_rad.rmse)
-    assert centimetres.share_of_path == pytest.approx(metres.share_of_path)
+    meters, centimeters = absolute_error(pairs), absolute_error(scaled)
+    assert centimeters.translation_m.rmse == pytest.approx(100.0 * meters.translation_m.rmse)
+    assert centimeters.rotation_rad.rmse == pytest.approx(meters.rotation_rad.rmse)
+    assert centimeters.share_of_path == pytest.approx(meters.share_of_path)
 
 
 def test_a_perfect_estimate_in_another_frame_has_no_error():

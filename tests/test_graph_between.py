@@ -105,7 +105,7 @@ def test_normal_equations_equal_dense_finite_differences(dimension):
     fixed = np.array([False, False, True, False, False])
     weights = rng.uniform(0.2, 1.0, len(edges))
     problem = BetweenProblem(edges, measured, information, fixed)
-    equations = problem.linearise(poses, problem.errors(poses), weights)
+    equations = problem.linearize(poses, problem.errors(poses), weights)
     H, g = naive_graph.normal_equations(poses, edges, measured, information, weights, fixed)
     assert np.allclose(
         naive_graph.dense(problem.pattern, equations.values), H, rtol=1e-5, atol=1e-5 * np.abs(H).max()

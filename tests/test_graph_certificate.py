@@ -10,7 +10,7 @@ from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern
 from scanchain.graph.g2o import read_g2o
-from scanchain.graph.minorant import Minorants, minorise
+from scanchain.graph.minorant import Minorants, minorize
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph_dual import scatter_dual
 
@@ -46,7 +46,7 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
     k, bounded = (3, 6)[dimension - 2], 0
     for _ in range(100):
         problem, poses = problem_of_one_edge(dimension, noise, rng)
-        bound = minorise(problem, poses, np.ones(1))
+        bound = minorize(problem, poses, np.ones(1))
         if bound.kappa[0] <= 0.0:
             continue
         bounded += 1
@@ -88,7 +88,7 @@ def test_the_bound_of_an_edge_with_singular_information_is_nowhere_above_its_chi
         Z = lie.inverse(poses[0]) @ poses[1] @ lie.inverse(lie.exp(noise * rng.normal(size=k)))
         omega = singular_information(dimension, kind, rng) / noise**2
         problem = BetweenProblem(np.array([[0, 1]]), Z[None], omega[None], np.array([True, False]))
-        bound = minorise(problem, poses, np.ones(1))
+        bound = minorize(problem, poses, np.ones(1))
         at_estimate = problem.chi2(problem.errors(poses))[0]
         same = np.eye(dimension)[None]
         assert minorant_values(bound, at_estimate, same, same, bound.leap)[0] == pytest.approx(at_estimate)
@@ -112,7 +112,7 @@ def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
     measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.05 * rng.normal(size=(6, k)))
     A = rng.normal(size=(6, k, k))
     problem = BetweenProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
-    bound = minorise(problem, poses, np.ones(6))
+    bound = minorize(problem, poses, np.ones(6))
     blocks = np.zeros((len(problem.pattern.rows), dimension + 1, dimension + 1))
     residual = np.zeros((count, dimension + 1, dimension))
     scatter_dual(bound.leap, bound.force, bound.torque, bound.tau, bound.kappa, problem.slots, blocks, residual)
@@ -141,8 +141,8 @@ def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
 def test_the_two_numbers_that_the_bound_rests_on():
     """V⁻¹ slopes at most 0.9311 up to π; κ‖φ‖² bends at least as said, for θ* up to 1 rad, in all directions."""
     for theta in np.linspace(1e-2, np.pi - 1e-6, 40):
-        for towards in np.linspace(0.0, np.pi / 2, 20):
-            ahead = 1e-6 * np.array([np.sin(towards), 0.0, np.cos(towards)])
+        for toward in np.linspace(0.0, np.pi / 2, 20):
+            ahead = 1e-6 * np.array([np.sin(toward), 0.0, np.cos(toward)])
             there, back = (_inverse_v(np.array([0.0, 0.0, theta]) + sign * ahead) for sign in (1.0, -1.0))
             assert np.linalg.norm(there - back, 2) / 2e-6 <= 0.9311
     delta = np.linspace(1e-2, np.pi, 1500)[:, None]
@@ -175,7 +175,7 @@ def _inverse_v(phi):
 @pytest.mark.parametrize("name", ["manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D"])
 def test_the_minima_of_the_published_graphs_are_certified(name):
     graph = read_g2o(shared_data(f"graphs/{name}.g2o")).graph
-    answer = graph.optimise(GraphConfig())
+    answer = graph.optimize(GraphConfig())
     certificate = graph.certify()
     assert certificate.certified and certificate.chi2 == pytest.approx(answer.chi2_after, rel=1e-9)
     assert certificate.relative_gap < 1e-6
@@ -183,11 +183,11 @@ def test_the_minima_of_the_published_graphs_are_certified(name):
 
 def test_the_bound_lies_below_every_other_minimum_that_is_found():
     graph = read_g2o(shared_data("graphs/intel.g2o")).graph
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     certificate = graph.certify()
     for seed in range(3):
         other = disturbed("intel", seed)
-        assert other.optimise(PLAIN, initialise="given").chi2_after >= certificate.chi2 - certificate.gap
+        assert other.optimize(PLAIN, initialize="given").chi2_after >= certificate.chi2 - certificate.gap
 
 
 def disturbed(name, seed):
@@ -203,9 +203,9 @@ def disturbed(name, seed):
 
 @pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
 def test_a_local_minimum_from_a_bad_guess_is_not_certified(name):
-    best = read_g2o(shared_data(f"graphs/{name}.g2o")).graph.optimise(PLAIN).chi2_after
+    best = read_g2o(shared_data(f"graphs/{name}.g2o")).graph.optimize(PLAIN).chi2_after
     graph = disturbed(name, 1)
-    answer = graph.optimise(GraphConfig(robust="none", max_iterations=300), initialise="given")
+    answer = graph.optimize(GraphConfig(robust="none", max_iterations=300), initialize="given")
     assert answer.chi2_after > 1.5 * best
     certificate = graph.certify()
     assert not certificate.certified and certificate.gap == certificate.chi2
@@ -232,18 +232,18 @@ def closed_ring(dimension, count, turns, noise=0.0):
 def test_a_ring_wound_up_once_is_a_minimum_but_not_certified(dimension, noise):
     """Turning by 2π/40 at every step no step is far from its measurement, and yet all are wrong."""
     wound = closed_ring(dimension, 40, 1, noise)
-    answer = wound.optimise(GraphConfig(robust="none", max_iterations=1000), initialise="given")
+    answer = wound.optimize(GraphConfig(robust="none", max_iterations=1000), initialize="given")
     assert answer.converged and answer.chi2_after > 1000.0
     certificate = wound.certify()
     assert not certificate.certified and "not positive definite" in certificate.reason
     unwound = closed_ring(dimension, 40, 0, noise)
-    assert unwound.optimise(PLAIN).chi2_after < 100.0
+    assert unwound.optimize(PLAIN).chi2_after < 100.0
     assert unwound.certify().certified
 
 
 def test_a_graph_without_contradictions_is_optimal_whatever_the_rounding():
     graph = closed_ring(2, 5, 0)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     certificate = graph.certify()
     assert certificate.certified and certificate.relative_gap == 0.0
     assert certificate.verdict == "globally optimal: χ² is zero"
@@ -257,7 +257,7 @@ def test_the_minimum_and_its_certificate_do_not_depend_on_the_unit_of_the_inform
         for k, pose in enumerate(ring.poses):
             graph.add_pose(pose, k)
         graph.add_edges(ring.edges, ring.measurements, unit * ring.information, ring.is_loop)
-        answer, certificate = graph.optimise(PLAIN, initialise="given"), graph.certify()
+        answer, certificate = graph.optimize(PLAIN, initialize="given"), graph.certify()
         assert answer.converged and answer.chi2_after < 0.9 * answer.chi2_before
         assert certificate.certified and not certificate.is_zero and certificate.relative_gap < 1e-3
         of_all.append(answer.chi2_after / unit)
@@ -268,9 +268,9 @@ def test_the_minimum_and_its_certificate_do_not_depend_on_the_unit_of_the_inform
 
 def test_an_unfinished_answer_has_a_wider_gap():
     graph = read_g2o(shared_data("graphs/sphere2500.g2o")).graph
-    best = graph.optimise(GraphConfig(robust="none")).chi2_after
+    best = graph.optimize(GraphConfig(robust="none")).chi2_after
     graph = read_g2o(shared_data("graphs/sphere2500.g2o")).graph
-    early = graph.optimise(GraphConfig(robust="none", max_iterations=2))
+    early = graph.optimize(GraphConfig(robust="none", max_iterations=2))
     certificate = graph.certify()
     assert certificate.certified
     assert 0.0 < early.chi2_after - best <= certificate.gap < 0.01 * best
@@ -279,7 +279,7 @@ def test_an_unfinished_answer_has_a_wider_gap():
 def test_edges_that_were_rejected_do_not_count():
     graph = closed_ring(2, 30, 0, noise=0.01)
     graph.add_edge(3, 20, lie.pose_2d(7.0, -2.0, 2.5), 100.0 * np.eye(3), is_loop=True)
-    answer = graph.optimise(GraphConfig(robust="truncated"))
+    answer = graph.optimize(GraphConfig(robust="truncated"))
     assert answer.rejected.sum() == 1
     certificate = graph.certify()
     assert certificate.certified and certificate.chi2 == pytest.approx(answer.chi2_after)
@@ -290,11 +290,11 @@ def test_what_the_bound_cannot_do_is_said():
     graph = closed_ring(2, 30, 0, noise=0.01)
     graph.fix(0)
     graph.fix(7)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     assert graph.certify().reason == "2 poses are fixed; the bound is for one"
     graph = closed_ring(2, 4, 0)
     graph.add_edge(0, 2, lie.pose_2d(0.0, 0.0, 3.0), 1e-6 * np.eye(3))
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     assert graph.certify().reason == "1 edge too far from what was measured to be bounded, first 0-2"
 
 
@@ -310,7 +310,7 @@ def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
             graph.add_edge(i, i + reach, lie.inverse(truth[i]) @ truth[i + reach] @ off, 400.0 * np.eye(3))
     contrary = lie.inverse(truth[3]) @ truth[30] @ lie.pose_2d(0.0, 0.0, 2.0)
     graph.add_edge(3, 30, contrary, 0.1 * np.eye(3))
-    graph.optimise(GraphConfig(robust="none"))
+    graph.optimize(GraphConfig(robust="none"))
     certificate = graph.certify()
     price = graph.state().edge_chi2[-1]
     assert certificate.certified
@@ -338,7 +338,7 @@ def silenced(name, share, of_loops, silence):
 @pytest.mark.parametrize("name", ["intel", "smallGrid3D", "sphere2500"])
 def test_loops_of_position_alone_and_of_rotation_alone_are_certified(name, silence):
     graph = silenced(name, 0.3, True, silence)
-    answer = graph.optimise(PLAIN)
+    answer = graph.optimize(PLAIN)
     certificate = graph.certify()
     assert certificate.certified and certificate.relative_gap < 1e-6
     assert certificate.chi2 == pytest.approx(answer.chi2_after, rel=1e-9)
@@ -355,7 +355,7 @@ def test_edges_of_position_alone_may_have_any_rotation_in_their_measurement():
     for stamp, pose in enumerate(graph.poses):
         other.add_pose(pose, stamp)
     other.add_edges(graph.edges, measurements, graph.information, graph.is_loop)
-    assert other.optimise(PLAIN).chi2_after == pytest.approx(graph.optimise(PLAIN).chi2_after, rel=1e-9)
+    assert other.optimize(PLAIN).chi2_after == pytest.approx(graph.optimize(PLAIN).chi2_after, rel=1e-9)
     assert other.certify().certified
 
 
@@ -369,5 +369,5 @@ def test_no_information_that_is_taken_overflows(dimension, information):
     for i, j in [(0, 1), (1, 2), (2, 3), (3, 0)]:
         graph.add_edge(i, j, lie.exp(0.3 * rng.normal(size=k)), np.diag([information, *[1.0] * (k - 1)]))
     with np.errstate(all="raise", under="ignore"):
-        graph.optimise(PLAIN)
+        graph.optimize(PLAIN)
         graph.certify()

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
 
 
 def _matrix(sizes, pairs, seed):
@@ -35,8 +35,8 @@ def _graphs(draw):
 @given(_graphs())
 def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_sizes(graph):
     pattern, values, A = _matrix(*graph)
-    cholesky = SparseCholesky(pattern, analyse(pattern))
-    cholesky.factorise(values)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
     b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
     assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
@@ -47,8 +47,8 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
 @given(_graphs())
 def test_the_selected_inverse_equals_the_dense_one_for_any_pattern_and_block_sizes(graph):
     pattern, values, A = _matrix(*graph)
-    cholesky = SparseCholesky(pattern, analyse(pattern))
-    cholesky.factorise(values)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
     inverse = naive_graph.dense(pattern, cholesky.inverse_blocks())
     there = naive_graph.dense(pattern, np.ones(pattern.value_count)) != 0.0
     assert np.allclose(inverse[there], np.linalg.inv(A)[there], rtol=1e-9, atol=1e-14)
@@ -60,18 +60,18 @@ def test_wide_fronts_are_eliminated_in_panels_and_tiles(size):
     rng = np.random.default_rng(0)
     pairs = [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.5 or i - j == 1]
     pattern, values, A = _matrix([size] * n, pairs, 3)
-    cholesky = SparseCholesky(pattern, analyse(pattern))
-    cholesky.factorise(values)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
     b = rng.normal(size=len(A))
     assert np.allclose(A @ cholesky.solve(b), b, atol=1e-10)
 
 
-def test_a_new_factorisation_forgets_the_values_of_the_last():
+def test_a_new_factorization_forgets_the_values_of_the_last():
     pattern, values, A = _matrix([3, 2, 3, 1], [(0, 1), (3, 1), (2, 0)], 1)
-    cholesky = SparseCholesky(pattern, analyse(pattern))
+    cholesky = SparseCholesky(pattern, analyze(pattern))
     b = np.arange(9.0)
-    cholesky.factorise(5.0 * values)
-    cholesky.factorise(values)
+    cholesky.factorize(5.0 * values)
+    cholesky.factorize(values)
     assert np.allclose(A @ cholesky.solve(b), b)
 
 
@@ -85,7 +85,7 @@ def test_a_grid_fills_in_far_less_than_a_dense_factor():
         ]
     )
     pattern = BlockPattern(np.full(side * side, 3, np.int64), pairs)
-    cholesky = SparseCholesky(pattern, analyse(pattern))
+    cholesky = SparseCholesky(pattern, analyze(pattern))
     n = 3 * side * side
     assert cholesky.entries < 0.03 * n * (n + 1)
 
@@ -94,20 +94,20 @@ def test_a_singular_matrix_names_the_undetermined_variable():
     pattern = BlockPattern(np.array([2, 2, 2]), np.array([[1, 0]]))
     values = np.concatenate([np.eye(2).ravel(), 2.0 * np.eye(2).ravel(), np.diag([1.0, 0.0]).ravel(), np.zeros(4)])
     with pytest.raises(SingularMatrixError, match="variable 2"):
-        SparseCholesky(pattern, analyse(pattern)).factorise(values)
+        SparseCholesky(pattern, analyze(pattern)).factorize(values)
 
 
 def test_an_indefinite_matrix_is_refused():
     pattern = BlockPattern(np.array([1, 1]), np.array([[1, 0]]))
     with pytest.raises(SingularMatrixError):
-        SparseCholesky(pattern, analyse(pattern)).factorise(np.array([1.0, 1.0, 2.0]))
+        SparseCholesky(pattern, analyze(pattern)).factorize(np.array([1.0, 1.0, 2.0]))
 
 
-def test_the_same_factorisation_twice_is_equal_to_the_bit():
+def test_the_same_factorization_twice_is_equal_to_the_bit():
     pattern, values, A = _matrix([6] * 30, [(i, i - d) for i in range(30) for d in (1, 5) if i >= d], 2)
     answers = []
     for _ in range(2):
-        cholesky = SparseCholesky(pattern, analyse(pattern))
-        cholesky.factorise(values)
+        cholesky = SparseCholesky(pattern, analyze(pattern))
+        cholesky.factorize(values)
         answers.append(cholesky.solve(A[:, 7]))
     assert np.array_equal(*answers)

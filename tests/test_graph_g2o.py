@@ -162,11 +162,11 @@ def test_suspect_loops_are_the_edges_that_skip_poses():
     assert np.array_equal(graph.is_loop, apart != 1)
 
 
-def test_an_optimised_graph_can_be_written_and_is_still_optimal(tmp_path):
+def test_an_optimized_graph_can_be_written_and_is_still_optimal(tmp_path):
     graph = read_g2o(shared_data("graphs/intel.g2o")).graph
-    answer = graph.optimise(GraphConfig())
+    answer = graph.optimize(GraphConfig())
     write_g2o(tmp_path / "intel.g2o", graph)
-    again = read_g2o(tmp_path / "intel.g2o").graph.optimise(GraphConfig())
+    again = read_g2o(tmp_path / "intel.g2o").graph.optimize(GraphConfig())
     assert again.chi2_before == pytest.approx(answer.chi2_after, rel=1e-9)
 
 

@@ -46,7 +46,7 @@ def test_the_axes_that_its_edges_say_nothing_of_are_named_and_nothing_is_certifi
     if isinstance(silent, str):
         silent = slice(0, dimension) if silent == "positions" else slice(dimension, None)
     graph = chain(dimension, silent)
-    answer = graph.optimise(PLAIN)
+    answer = graph.optimize(PLAIN)
     assert answer.converged and answer.chi2_after < 1e-9
     [free] = graph.free_poses()
     assert (free.name, free.axes) == (50, NAMES[dimension][silent])
@@ -65,7 +65,7 @@ def test_a_loop_that_holds_them_is_seen(dimension):
 def test_all_zero_information_is_refused_with_the_names_of_the_poses(dimension):
     """It was called globally optimal."""
     with pytest.raises(InputError, match=r"1 of 6 poses are not joined to a fixed one: 50; .* is not zero"):
-        chain(dimension, 0.0).optimise(PLAIN)
+        chain(dimension, 0.0).optimize(PLAIN)
     with pytest.raises(InputError, match=r"1 of 6 poses are not joined"):
         chain(dimension, 0.0).certify()
 
@@ -97,7 +97,7 @@ def test_a_group_on_next_to_no_information_is_named_whole_by_certificate_and_cov
         information[axes] *= share if (i, j) == (4, 5) else 1.0
         noise = lie.exp(0.01 * rng.normal(size=k))
         graph.add_edge(i, j, lie.inverse(true[i]) @ true[j] @ noise, np.diag(information))
-    assert graph.optimise(PLAIN).converged
+    assert graph.optimize(PLAIN).converged
     certificate, refusal = graph.certify(), ""
     try:
         assert np.isfinite(graph.covariances()).all()
@@ -119,7 +119,7 @@ def test_what_moves_together_is_named_together(dimension):
     [body] = free.free_poses()
     assert (body.name, body.axes, body.followers) == (3, ("x",), (4, 5))
     with pytest.raises(InputError, match=r"leave 3 poses free: 3 to 5 \(x\) as one body"):
-        free.optimise(GraphConfig(robust="none", optimiser="gauss-newton"))
+        free.optimize(GraphConfig(robust="none", optimizer="gauss-newton"))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -135,7 +135,7 @@ def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
         fixed = np.arange(count) == 0
         problem = BetweenProblem(edges, Z, information, fixed)
         found = free_poses(problem, poses, np.ones(len(edges)), ranks(information), np.arange(count))
-        equations = problem.linearise(poses, problem.errors(poses), np.ones(len(edges)))
+        equations = problem.linearize(poses, problem.errors(poses), np.ones(len(edges)))
         H = naive_graph.dense(problem.pattern, equations.values)
         values, vectors = np.linalg.eigh(H)
         null = vectors[:, values < 1e-10 * values[-1]].reshape(count - 1, k, -1)
@@ -146,9 +146,9 @@ def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
     assert len(seen) >= 3
 
 
-@pytest.mark.parametrize("initialise", ["auto", "given", "odometry", "spanning-tree", "chordal"])
+@pytest.mark.parametrize("initialize", ["auto", "given", "odometry", "spanning-tree", "chordal"])
 @pytest.mark.parametrize("robust", ["none", "huber", "truncated"])
-def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_poses(initialise, robust):
+def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_poses(initialize, robust):
     rng = np.random.default_rng(2)
     for _ in range(40):
         dimension, count = int(rng.integers(2, 4)), int(rng.integers(1, 7))
@@ -162,7 +162,7 @@ def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_po
             Z = lie.inverse(true[i]) @ true[j] @ lie.exp(0.1 * rng.normal(size=k))
             graph.add_edge(i, j, Z, information, is_loop=j - i > 1)
         try:
-            graph.optimise(GraphConfig(robust=robust), initialise=initialise)
+            graph.optimize(GraphConfig(robust=robust), initialize=initialize)
         except InputError as error:
             assert "not joined to a fixed one" in str(error) or " free: " in str(error)
             continue

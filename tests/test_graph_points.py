@@ -1,4 +1,4 @@
-"""Points in a pose graph of the plane: optimised with the poses, with covariance and certificate."""
+"""Points in a pose graph of the plane: optimized with the poses, with covariance and certificate."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_poses_and_points_reach_the_minimum_that_a_dense_solver_finds():
     expected = least_squares(
         whitened_residuals, np.concatenate([np.ravel(start), np.ravel(marks)]), args=(graph,), xtol=1e-14
     )
-    answer = graph.optimise(GraphConfig(robust="none", tolerance=1e-12))
+    answer = graph.optimize(GraphConfig(robust="none", tolerance=1e-12))
     assert answer.chi2_after == pytest.approx(2.0 * expected.cost, rel=1e-7)
     assert np.allclose(graph.poses[12:, :2, 2].ravel(), expected.x[33:], atol=1e-5)
     assert np.allclose(graph.poses[12:, :2, :2], np.eye(2))
@@ -69,7 +69,7 @@ def test_sightings_have_the_jacobian_of_finite_differences():
     problem = BetweenProblem(graph.edges, graph.measurements, graph.information, graph.fixed, graph.is_point)
     weights = np.linspace(0.3, 1.0, len(graph.edges))
     poses = graph.poses
-    equations = problem.linearise(poses, problem.errors(poses), weights)
+    equations = problem.linearize(poses, problem.errors(poses), weights)
     scalars = problem.pattern.scalars
     assert scalars == 3 * 11 + 2 * 5
 
@@ -87,9 +87,9 @@ def test_sightings_have_the_jacobian_of_finite_differences():
 
 def test_covariances_of_points_equal_the_dense_inverse():
     graph = field()
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     problem = BetweenProblem(graph.edges, graph.measurements, graph.information, graph.fixed, graph.is_point)
-    equations = problem.linearise(graph.poses, problem.errors(graph.poses), np.ones(len(graph.edges)))
+    equations = problem.linearize(graph.poses, problem.errors(graph.poses), np.ones(len(graph.edges)))
     P = np.linalg.inv(dense(problem.pattern, equations.values))
     found = graph.covariances()
     for point in range(5):
@@ -100,16 +100,16 @@ def test_covariances_of_points_equal_the_dense_inverse():
     assert np.allclose(found[7], adjoint @ P[18:21, 18:21] @ adjoint.T, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("initialise", ["auto", "given", "odometry", "spanning-tree", "chordal"])
-def test_every_way_to_start_places_the_points_too(initialise):
-    best = field().optimise(PLAIN).chi2_after
+@pytest.mark.parametrize("initialize", ["auto", "given", "odometry", "spanning-tree", "chordal"])
+def test_every_way_to_start_places_the_points_too(initialize):
+    best = field().optimize(PLAIN).chi2_after
     graph = field()
-    assert graph.optimise(PLAIN, initialise=initialise).chi2_after == pytest.approx(best, rel=1e-6)
+    assert graph.optimize(PLAIN, initialize=initialize).chi2_after == pytest.approx(best, rel=1e-6)
 
 
 def test_a_graph_with_points_is_certified():
     graph = field(noise=0.02)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     certificate = graph.certify()
     assert certificate.certified and certificate.relative_gap < 1e-6
 
@@ -125,5 +125,5 @@ def test_a_ring_with_a_point_is_certified_unless_it_is_wound_up(turns):
     graph.add_sightings(
         np.array([[0, mark], [1, mark]]), np.array([[2.0, 1.1], [2.1, 1.0]]), np.array([np.eye(2)] * 2)
     )
-    assert graph.optimise(PLAIN, initialise="given").converged
+    assert graph.optimize(PLAIN, initialize="given").converged
     assert graph.certify().certified == (turns == 0)

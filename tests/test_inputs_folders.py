@@ -50,8 +50,8 @@ def test_the_truth_of_a_kitti_drive_is_its_gps_moved_to_the_lidar(tmp_path):
             [sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa],
             [-sb, cb * sa, cb * ca],
         ]
-        metre = np.pi / 180 * 6378137.0 * np.cos(np.radians(49.0))
-        T[:3, 3] = 2e-5 * k * metre, 1e-5 * k / np.cos(np.radians(49.0)) * metre, 0.5 * k
+        meter = np.pi / 180 * 6378137.0 * np.cos(np.radians(49.0))
+        T[:3, 3] = 2e-5 * k * meter, 1e-5 * k / np.cos(np.radians(49.0)) * meter, 0.5 * k
         imu.append(T)
     T_lidar_imu = np.array([[0, -1, 0, -0.8], [1, 0, 0, 0.3], [0, 0, 1, -0.75], [0, 0, 0, 1.0]])
     for k in range(3):

@@ -10,7 +10,7 @@ from scanchain.kernels.association import associate
 from scanchain.kernels.residuals import normal_equations
 from scanchain.kernels.shortest_ways import shortest_ways
 from scanchain.kernels.trust import weigh
-from scanchain.kernels.twist import orthonormalise, perturb
+from scanchain.kernels.twist import orthonormalize, perturb
 from scanchain.kernels.voxels import DIRECTION, SHAPE
 from scanchain.matching import VoxelMap
 
@@ -276,11 +276,11 @@ def test_perturbation_is_the_exponential_about_the_origin(twist):
     np.testing.assert_allclose(T, before, atol=1e-15)
 
 
-def test_orthonormalising_leaves_a_rotation_and_changes_it_little():
+def test_orthonormalizing_leaves_a_rotation_and_changes_it_little():
     T = lie.exp(np.array([1, 2, 3, 0.4, 0.5, -0.6]))
     T[:3, :3] += 1e-6 * np.random.default_rng(0).normal(size=(3, 3))
     before = T.copy()
-    orthonormalise(T)
+    orthonormalize(T)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(T, before, atol=1e-5)
 
@@ -298,12 +298,12 @@ def test_solve_says_so_where_the_system_is_singular():
     assert not descent.solve(np.diag([1.0, 0.0, 1.0]), np.ones(3), 0.5, np.empty((3, 3)), np.empty(3))
 
 
-@pytest.mark.parametrize("optimiser", [descent.NEWTON, descent.GAUSS_NEWTON, descent.GRADIENT_DESCENT])
-def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimiser):
+@pytest.mark.parametrize("optimizer", [descent.NEWTON, descent.GAUSS_NEWTON, descent.GRADIENT_DESCENT])
+def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
     rng = np.random.default_rng(6)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
     H, x = B.T @ B, np.empty(6)
-    assert descent.step(optimiser, H, b, 0.0, np.empty((6, 6)), x)
+    assert descent.step(optimizer, H, b, 0.0, np.empty((6, 6)), x)
     decrease = -(b @ x + 0.5 * x @ H @ x)
     assert decrease > 0.0
     assert descent.predicted_decrease(H, b, x) == pytest.approx(decrease)

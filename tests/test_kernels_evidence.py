@@ -105,7 +105,7 @@ def test_how_far_apart_two_poses_are(k, angle_rad):
     turn[-1] = angle_rad
     b = a @ lie.exp(turn)
     b[:-1, -1] += 0.5
-    metres, radians = poses.apart(a, b)
-    assert metres == pytest.approx(0.5 * math.sqrt(len(a) - 1))
+    meters, radians = poses.apart(a, b)
+    assert meters == pytest.approx(0.5 * math.sqrt(len(a) - 1))
     assert radians == pytest.approx(angle_rad, abs=1e-7)
     assert math.isclose(radians, float(lie.rotation_angle(lie.between(a, b))), abs_tol=1e-7)

@@ -10,7 +10,7 @@ from scanchain.graph.robust import RobustLoss
 from scanchain.kernels import dead_reckoning, landmark_factors
 from scanchain.landmarks import guess as guesses
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
-from scanchain.landmarks.minimise import QUADRATIC, minimise
+from scanchain.landmarks.minimize import QUADRATIC, minimize
 from scanchain.landmarks.npz import read_landmark_data
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
@@ -69,7 +69,7 @@ def test_dead_reckoning_equals_many_short_steps_and_stands_still_before_the_firs
 
 
 def test_the_spread_of_dead_reckoning_is_what_noisy_velocities_do():
-    """Noise of density q a metre, at v held for τ, is a velocity error of variance q v / τ; turning likewise."""
+    """Noise of density q a meter, at v held for τ, is a velocity error of variance q v / τ; turning likewise."""
     rng = np.random.default_rng(0)
     times, nodes = np.arange(0.0, 2.0, 0.1), np.array([0.0, 2.0])
     clean = np.tile([0.8, 0.5], (len(times), 1))
@@ -91,12 +91,12 @@ def nonlinear():
     data = read_landmark_data(shared_data("landmarks/2d_nonlinear.npz"))
     problem = BearingRangeProblem(world_referenced(data))
     guess = guesses.from_odometry(problem.measurements)
-    return data, problem, guess, minimise(problem, guess, create_solver("cholesky"))
+    return data, problem, guess, minimize(problem, guess, create_solver("cholesky"))
 
 
 @pytest.mark.parametrize("guess", ["disturbed", "origin", "turned the other way"])
-@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "gauss-newton", "dogleg"])
-def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, optimiser):
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton", "dogleg"])
+def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, optimizer):
     data, problem, good, best = nonlinear
     assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
     assert np.abs(best.state.poses - data.true_poses).max() < 0.05
@@ -105,7 +105,7 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
         "turned the other way": guesses.disturbed(good, -1.0, -0.5),
         "origin": State(good.poses, np.zeros_like(good.landmarks)),
     }[guess]
-    minimum = minimise(problem, start, create_solver("schur"), optimiser=optimiser)
+    minimum = minimize(problem, start, create_solver("schur"), optimizer=optimizer)
     assert minimum.converged
     assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < 1e-5
 
@@ -113,7 +113,7 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
 def test_gradient_descent_goes_downhill_and_says_that_it_did_not_arrive(nonlinear):
     _, problem, guess, best = nonlinear
     few, many = (
-        minimise(problem, guess, create_solver("schur"), optimiser="gradient-descent", max_iterations=steps)
+        minimize(problem, guess, create_solver("schur"), optimizer="gradient-descent", max_iterations=steps)
         for steps in (10, 100)
     )
     assert best.cost < many.cost < few.cost
@@ -126,26 +126,26 @@ def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
     blind = BearingRangeProblem(replace(given, **{
         name: getattr(given, name)[given.observed[:, 1] != 4] for name in ("observed", "measured")
     }))  # fmt: skip
-    for optimiser in ("gauss-newton", "dogleg"):
+    for optimizer in ("gauss-newton", "dogleg"):
         with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
-            minimise(blind, guess, create_solver("schur"), optimiser=optimiser)
+            minimize(blind, guess, create_solver("schur"), optimizer=optimizer)
 
 
 def test_all_methods_reach_the_same_minimum(nonlinear):
     _, problem, guess, best = nonlinear
     for method in METHODS:
-        found = minimise(problem, guess, create_solver(method)).state.unknowns
+        found = minimize(problem, guess, create_solver(method)).state.unknowns
         assert np.abs(found - best.state.unknowns).max() < 1e-8
 
 
 def test_running_out_of_iterations_is_said_not_hidden(nonlinear):
     _, problem, guess, _ = nonlinear
-    minimum = minimise(problem, guess, create_solver("schur"), max_iterations=2)
+    minimum = minimize(problem, guess, create_solver("schur"), max_iterations=2)
     assert not minimum.converged and minimum.reason == "2 iterations reached"
 
 
 def measurements(seed=0, unit=1.0, outliers=0):
-    """A made-up drive of 40 poses past 6 landmarks, lengths in metres over ``unit``."""
+    """A made-up drive of 40 poses past 6 landmarks, lengths in meters over ``unit``."""
     rng = np.random.default_rng(seed)
     motion = np.tile([0.3, 0.0, 0.16], (39, 1)) + rng.normal(size=(39, 3)) * [0.01, 0.005, 0.01]
     poses = guesses.chain(np.zeros(3), np.tile([0.3, 0.0, 0.16], (39, 1)))
@@ -174,11 +174,11 @@ def measurements(seed=0, unit=1.0, outliers=0):
 
 
 def solve(given, loss):
-    return minimise(BearingRangeProblem(given), guesses.from_odometry(given), create_solver("schur"), loss=loss)
+    return minimize(BearingRangeProblem(given), guesses.from_odometry(given), create_solver("schur"), loss=loss)
 
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman-mcclure"])
-def test_metres_or_centimetres_same_weights_and_same_drive(kernel):
+def test_meters_or_centimeters_same_weights_and_same_drive(kernel):
     loss = RobustLoss(kernel, 2.0, 1.0)
     in_m, in_cm = (solve(measurements(unit=unit, outliers=8)[2], loss) for unit in (1.0, 0.01))
     assert np.allclose(in_m.weights, in_cm.weights, atol=1e-5)

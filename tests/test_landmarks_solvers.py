@@ -74,7 +74,7 @@ def test_the_factor_of_pinv_is_the_inverse():
     assert np.allclose(factor.matrix.toarray(), np.linalg.inv(A.T @ A))
 
 
-def test_qr_is_orthogonal_factorisation_and_keeps_the_digits_that_the_normal_equations_lose():
+def test_qr_is_orthogonal_factorization_and_keeps_the_digits_that_the_normal_equations_lose():
     """A Läuchli matrix: AᵀA is singular in floating point, A is not."""
     e = 1e-8 / 3.0
     A = np.array([[1.0, 1.0, 0.0, 0.0], [e, 0.0, 0.0, 0.0], [0.0, e, 0.0, 0.0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])

@@ -124,12 +124,12 @@ def test_quaternions_return_the_rotation(twist):
 
 
 @given(_twists())
-def test_normalise_restores_orthonormal_rotations(twist):
+def test_normalize_restores_orthonormal_rotations(twist):
     T = lie.exp(twist)
     d = len(T) - 1
     spoilt = T.copy()
     spoilt[:d, :d] += 1e-6 * np.arange(d * d).reshape(d, d)
-    R = lie.normalise(spoilt)[:d, :d]
+    R = lie.normalize(spoilt)[:d, :d]
     assert np.allclose(R.T @ R, np.eye(d), atol=1e-14)
     assert np.linalg.det(R) == pytest.approx(1.0)
     assert np.allclose(R, T[:d, :d], atol=1e-4)

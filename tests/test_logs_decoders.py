@@ -273,7 +273,7 @@ def test_times_before_the_stamp_are_negative(tmp_path):
     np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S - 0.1, atol=1e-6)
 
 
-def test_nanoseconds_in_a_float_are_recognised(tmp_path):
+def test_nanoseconds_in_a_float_are_recognized(tmp_path):
     np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e9, "<f8"), RISING_S, atol=1e-7)
     np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S * 1e9, "<f4"), RISING_S, atol=1e-7)
 
@@ -375,7 +375,7 @@ def test_poses_are_read_in_either_byte_order(tmp_path, order):
     assert lie.rotation_angle(log.T_base_lidar) > 0.3
 
 
-def test_a_quaternion_that_is_not_quite_unit_is_normalised(tmp_path):
+def test_a_quaternion_that_is_not_quite_unit_is_normalized(tmp_path):
     data = bytearray(odometry(STAMP_NS, 1.0, 2.0, 0.5))
     rows = random_rows(XYZ)
     quat = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])

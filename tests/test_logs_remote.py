@@ -98,7 +98,7 @@ def test_many_small_chunks_are_asked_for_together(site, log_file):
     assert len(site.asked) < 6
 
 
-def test_neighbours_are_joined_up_to_a_size_and_gaps_are_left_out():
+def test_neighbors_are_joined_up_to_a_size_and_gaps_are_left_out():
     assert merged([(0, 10), (20, 30), (200_000, 200_010)]) == [(0, 30), (200_000, 200_010)]
     assert merged([(0, 3_000_000), (3_000_000, 6_000_000)]) == [(0, 3_000_000), (3_000_000, 6_000_000)]
     assert merged([(0, 90_000_000)]) == [(0, 90_000_000)]

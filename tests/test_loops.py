@@ -15,7 +15,7 @@ from scanchain.runs.verdicts import final_verdicts
 
 
 def chain(count, sigma_m=0.01):
-    """Keyframes a metre apart on a straight line."""
+    """Keyframes a meter apart on a straight line."""
     graph = PoseGraph(2)
     information = np.diag([sigma_m**-2.0, sigma_m**-2.0, 1e6])
     for index in range(count):

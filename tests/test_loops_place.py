@@ -53,15 +53,15 @@ def scan_from(x, y, yaw, seed=0):
     return sweep.points().astype(np.float64), T
 
 
-def passage(places, first_index=0, travelled_m=0.0):
+def passage(places, first_index=0, traveled_m=0.0):
     """Keyframes along places (x, y, yaw), as odometry without drift has them."""
     keyframes = []
     for k, (x, y, yaw) in enumerate(places):
         points, T = scan_from(x, y, yaw, seed=first_index + k)
         if keyframes:
-            travelled_m += float(np.linalg.norm((T - keyframes[-1].T_odom_lidar)[:3, 3]))
+            traveled_m += float(np.linalg.norm((T - keyframes[-1].T_odom_lidar)[:3, 3]))
         index = first_index + k
-        keyframes.append(Keyframe(index, index, index, stored(points), T, travelled_m))
+        keyframes.append(Keyframe(index, index, index, stored(points), T, traveled_m))
     return keyframes
 
 
@@ -206,16 +206,16 @@ def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
 def there_and_back(lost_m=0.0):
     """Keyframes of a street, and of it again the other way after a detour, odometry so far off."""
     there = passage(street())
-    back = passage(street(4.0, True), len(there), there[-1].travelled_m + 120.0)
+    back = passage(street(4.0, True), len(there), there[-1].traveled_m + 120.0)
     shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)
     moved = [
-        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.travelled_m) for k in back
+        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.traveled_m) for k in back
     ]
     return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
 
 
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])
-def test_a_street_driven_the_other_way_is_recognised_wherever_odometry_has_it(lost_m):
+def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lost_m):
     keyframes, truth = there_and_back(lost_m)
     closer = PlaceCloser(configured(3), Pieces())
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])

@@ -126,7 +126,7 @@ def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(
     assert metrics["closures_rejected_by_back_end"] >= 5
     graph = read_g2o(forced / "graph.g2o").graph
     before = graph.poses
-    answer = graph.optimise(GraphConfig())
+    answer = graph.optimize(GraphConfig())
     assert moved_m(graph.poses, before) < 1e-3
     assert answer.chi2_before == pytest.approx(metrics["chi2"], rel=1e-6)
     assert (
@@ -145,7 +145,7 @@ def test_rejected_loops_stand_in_a_file_of_their_own(forced):
     assert np.array_equal(rejected.poses, kept.poses)
     kept.add_edges(rejected.edges, rejected.measurements, rejected.information, np.zeros(len(named), bool))
     before = kept.poses
-    kept.optimise(GraphConfig(), initialise="given")
+    kept.optimize(GraphConfig(), initialize="given")
     assert moved_m(kept.poses, before) > 0.5  # what a graph with all of them would do
 
 

@@ -36,7 +36,7 @@ CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
 
 
 def random_scans(count=12, beams=80, seed=0):
-    """Poses that wander over some metres, and scans of returns all around."""
+    """Poses that wander over some meters, and scans of returns all around."""
     random = np.random.default_rng(seed)
     poses = np.array([lie.pose_2d(*random.normal(scale=[3, 2, 2])) for _ in range(count)])
     angles = random.uniform(-np.pi, np.pi, (count, beams))

@@ -7,11 +7,11 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
 from scanchain.matching import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
-from scanchain.matching.matcher import OPTIMISERS
+from scanchain.matching.matcher import OPTIMIZERS
 
 
 def room(dimension, seed=0, unit=1.0):
-    """Points on the walls (and floor) of a room with a pillar, some centimetres of noise."""
+    """Points on the walls (and floor) of a room with a pillar, some centimeters of noise."""
     rng = np.random.default_rng(seed)
     n = 3000
     z = rng.uniform(0.0, 2.5, n)
@@ -57,11 +57,11 @@ def off(T_a, T_b):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("optimiser", list(OPTIMISERS))
-def test_all_four_optimisers_reach_the_same_minimum_near_the_truth(dimension, optimiser):
+@pytest.mark.parametrize("optimizer", list(OPTIMIZERS))
+def test_all_four_optimizers_reach_the_same_minimum_near_the_truth(dimension, optimizer):
     T = truth(dimension)
-    iterations = 20_000 if optimiser == "gradient-descent" else 200
-    matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=iterations)
+    iterations = 20_000 if optimizer == "gradient-descent" else 200
+    matcher, target = set_up(dimension, optimizer=optimizer, max_iterations=iterations)
     reference, _ = set_up(dimension)
     match = matcher.align(scan_at(T), target, lie.identity(dimension))
     expected = reference.align(scan_at(T), target, lie.identity(dimension))
@@ -69,24 +69,24 @@ def test_all_four_optimisers_reach_the_same_minimum_near_the_truth(dimension, op
     assert off(expected.T_target_source, T) < 3e-3
     # pairs and their trust stay after PATIENCE associations, when gradient descent is still on its way
     assert off(match.T_target_source, expected.T_target_source) < (
-        5e-3 if optimiser == "gradient-descent" else 1e-3
+        5e-3 if optimizer == "gradient-descent" else 1e-3
     )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_second_order_methods_need_half_the_steps_of_gradient_descent(dimension):
     steps = {}
-    for optimiser in OPTIMISERS:
-        matcher, target = set_up(dimension, optimiser=optimiser, max_iterations=20_000)
+    for optimizer in OPTIMIZERS:
+        matcher, target = set_up(dimension, optimizer=optimizer, max_iterations=20_000)
         T = truth(dimension)
-        steps[optimiser] = matcher.align(scan_at(T), target, lie.identity(dimension)).iterations
+        steps[optimizer] = matcher.align(scan_at(T), target, lie.identity(dimension)).iterations
     assert max(steps["newton"], steps["gauss-newton"], steps["levenberg-marquardt"]) < 40
     assert steps["gradient-descent"] >= 2 * steps["levenberg-marquardt"]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
-def test_metres_or_centimetres_same_motion(dimension, matcher_name):
+def test_meters_or_centimeters_same_motion(dimension, matcher_name):
     answers = []
     for unit in (1.0, 100.0):
         matcher, target = set_up(dimension, unit, matcher=matcher_name)
@@ -101,7 +101,7 @@ def test_metres_or_centimetres_same_motion(dimension, matcher_name):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
-def test_both_matchers_find_the_motion_from_a_guess_half_a_metre_off(dimension, matcher_name):
+def test_both_matchers_find_the_motion_from_a_guess_half_a_meter_off(dimension, matcher_name):
     T = truth(dimension)
     T[0, -1] += 0.4
     matcher, target = set_up(dimension, matcher=matcher_name)
@@ -165,7 +165,7 @@ def dented_corridor(dents, seed=0):
 
 @pytest.mark.parametrize(("dents", "is_believed"), [(20, False), (400, True)])
 def test_a_sure_prediction_outweighs_weak_data_and_no_others(dents, is_believed):
-    """A dent that says 5 cm: a handful of points is not believed against an experience of millimetres."""
+    """A dent that says 5 cm: a handful of points is not believed against an experience of millimeters."""
     target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
     target.insert(dented_corridor(400), lie.identity(2))
     expected = lie.pose_2d(0.05, 0.0, 0.0)
@@ -194,11 +194,11 @@ def test_the_closed_form_equals_scipys(dimension):
     T = lie.exp(np.array([1, 2, 0, 0, 0, 2.0] if dimension == 2 else [1, 2, 3, 0.3, -1.2, 2.0]))
     y = lie.transform(T, x) + 0.1 * rng.normal(size=x.shape) * ([1, 1, 0] if dimension == 2 else 1)
     weight = rng.uniform(0.1, 1.0, 40)
-    centre = [weight @ v / weight.sum() for v in (x, y)]
-    R = Rotation.align_vectors(y - centre[1], x - centre[0], weights=weight)[0].as_matrix()
+    center = [weight @ v / weight.sum() for v in (x, y)]
+    R = Rotation.align_vectors(y - center[1], x - center[0], weights=weight)[0].as_matrix()
     answer = rigid_transform(x[:, :dimension], y[:, :dimension], weight)
     np.testing.assert_allclose(answer[:-1, :-1], R[:dimension, :dimension], atol=1e-9)
-    np.testing.assert_allclose(answer[:-1, -1], (centre[1] - R @ centre[0])[:dimension], atol=1e-9)
+    np.testing.assert_allclose(answer[:-1, -1], (center[1] - R @ center[0])[:dimension], atol=1e-9)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -54,7 +54,7 @@ def ate_m(estimate, truth):
 
 @pytest.mark.parametrize("prior", ["auto", "constant-velocity"])
 @pytest.mark.parametrize("matcher", ["plicp", "svd"])
-def test_a_minute_in_the_office_drifts_by_centimetres(office, prior, matcher):
+def test_a_minute_in_the_office_drifts_by_centimeters(office, prior, matcher):
     scans, T_base_lidar, truth = office
     config = configured(2, {"odometry.prior": prior, "matching.matcher": matcher})
     steps = tracked(scans, T_base_lidar, config)
@@ -62,7 +62,7 @@ def test_a_minute_in_the_office_drifts_by_centimetres(office, prior, matcher):
     assert ate_m(trajectory(steps), truth) < (0.03 if matcher == "plicp" else 0.06)
 
 
-def test_six_seconds_in_town_drift_by_centimetres(town):
+def test_six_seconds_in_town_drift_by_centimeters(town):
     scans, T_base_lidar, truth = town
     assert ate_m(trajectory(tracked(scans, T_base_lidar, configured(3))), truth) < 0.01
 
@@ -92,7 +92,7 @@ def test_the_second_scan_tells_how_the_first_one_was_distorted(town):
     assert np.median(np.linalg.norm(odometry.first_points - expected, axis=1)) < 0.05
 
 
-def test_a_drive_that_starts_at_speed_drifts_by_centimetres(town):
+def test_a_drive_that_starts_at_speed_drifts_by_centimeters(town):
     scans, T_base_lidar, truth = town
     assert ate_m(trajectory(tracked(scans[40:], T_base_lidar, configured(3))), truth) < 0.02
 
@@ -276,7 +276,7 @@ def test_kitti_stays_within_its_error_of_the_gps(matcher, limit_m):
     assert ate_m(trajectory(steps), truth) < limit_m
 
 
-def test_every_motion_agrees_with_kiss_icp_to_two_centimetres():
+def test_every_motion_agrees_with_kiss_icp_to_two_centimeters():
     pytest.importorskip("kiss_icp")
     log = open_log(shared_data("3d/kitti_0005_first60.mcap"))
     scans = list(log.scans())

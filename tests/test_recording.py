@@ -34,13 +34,13 @@ START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
     entities.LIDAR, entities.SCAN, entities.COVARIANCE, entities.ODOMETRY, entities.TRAJECTORY,
     entities.TIME, entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.OBSERVABILITY,
-    entities.ITERATIONS, entities.OPTIMISED_LIDAR,
+    entities.ITERATIONS, entities.OPTIMIZED_LIDAR,
 )  # fmt: skip
 NOW_AND_THEN = (
     entities.ODOM, entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.ACCEPTED,
     entities.REJECTED, entities.STATE, entities.EVENTS,
 )  # fmt: skip
-FOR_EVER = (entities.WORLD, entities.OPTIMISED, entities.LEGEND)
+FOR_EVER = (entities.WORLD, entities.OPTIMIZED, entities.LEGEND)
 
 
 def drive(count, dimension, points=180, seed=1):
@@ -251,10 +251,10 @@ def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_amber(tmp_path):
     strips = np.array(column(tmp_path / "a.rrd", entities.ACCEPTED, "LineStrips3D:strips")[-1])
     nodes = np.array(column(tmp_path / "a.rrd", entities.KEYFRAMES, "Points3D:positions")[-1])
     np.testing.assert_array_equal(strips, [[nodes[0], nodes[4]], [nodes[0], nodes[8]]])
-    colours = column(tmp_path / "a.rrd", entities.ACCEPTED, "LineStrips3D:colors")[-1]
+    colors = column(tmp_path / "a.rrd", entities.ACCEPTED, "LineStrips3D:colors")[-1]
     red, green, blue = entities.ORANGE
     amber = (red << 24) + (green << 16) + (blue << 8) + 255
-    assert colours[0] == amber != colours[1]
+    assert colors[0] == amber != colors[1]
 
 
 def test_a_3d_scan_of_8000_points_takes_at_most_150_kilobytes(tmp_path):

@@ -276,9 +276,9 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
         "degenerate: 4 scans", "lost: 3 scans", "contradicted: 10 scans", "ground truth",
     ]  # fmt: skip
     told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
-    assert len(told["lines"]) == len(section.chips) == len({chip.colour for chip in section.chips})
-    assert [line["color"] for line in told["lines"]] == [chip.colour for chip in section.chips]
-    assert all(chip.colour in section.drawings[0].svg for chip in section.chips)
+    assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})
+    assert [line["color"] for line in told["lines"]] == [chip.color for chip in section.chips]
+    assert all(chip.color in section.drawings[0].svg for chip in section.chips)
 
 
 def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
@@ -347,7 +347,7 @@ def course(positions, **known):
     return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
 
 
-def test_a_drawing_takes_the_colours_of_its_page():
+def test_a_drawing_takes_the_colors_of_its_page():
     positions = np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=0)
     svg = plan("a", [course(positions)], None, positions.min(axis=0), positions.max(axis=0))
     assert "var(--ink)" in svg and "var(--line)" in svg and "#010203" not in svg

@@ -96,7 +96,7 @@ def test_odometry_is_that_of_the_transforms_and_has_a_covariance(finished):
     assert np.count_nonzero(covariance) <= 9
 
 
-def test_the_path_is_the_optimised_one_of_the_robot(finished):
+def test_the_path_is_the_optimized_one_of_the_robot(finished):
     log, run, told = finished
     (log_ns, path), trajectory = told["/path"][0], read_tum(run / "trajectory.tum")
     T_lidar_base = lie.inverse(open_log(log).T_base_lidar)

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from scanchain import catalogue, lie
+from scanchain import catalog, lie
 from scanchain.errors import InputError
 from scanchain.simulation import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
 from scanchain.simulation.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
@@ -168,8 +168,8 @@ def test_the_drive_starts_from_standstill_and_never_jerks(drives, name):
     poses = motion.base(times)
     assert motion.speed_m_s(np.array([0.0]))[0] < 1e-3
     speed = motion.speed_m_s(times)
-    travelled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
-    assert np.allclose(travelled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
+    traveled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
+    assert np.allclose(traveled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
     assert speed.max() < 1.01 * vehicle.speed_m_s
     assert np.abs(np.diff(speed)).max() / step < 1.5 * vehicle.acceleration_m_s2
     yaw_rate = lie.wrap(np.diff(lie.yaw(poses))) / step
@@ -188,7 +188,7 @@ def test_the_car_follows_the_ground(drives):
 
 @pytest.mark.parametrize("name", ["demo-office", "demo-town", "office", "town"])
 def test_a_sequence_comes_back_to_where_it_was(name):
-    source = catalogue.load(name).source
+    source = catalog.load(name).source
     _, motion = drive(source.world, source.duration_s, source.seed)
     times = np.arange(0.0, source.duration_s, 0.1)
     poses = lie.flatten(motion.lidar(times))
@@ -240,10 +240,10 @@ def test_every_lidar_sees_something_everywhere(name, sensor):
 
 def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
     poses = planned("rounds", "vlp-16").truth().poses[::5]
-    travelled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)))
+    traveled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)))
     same = opposite = aside = 0
     for k, T in enumerate(poses):
-        old = poses[travelled_m < travelled_m[k] - 100.0]
+        old = poses[traveled_m < traveled_m[k] - 100.0]
         place = lie.inverse(T) @ old
         near = (np.abs(place[:, 0, 3]) < 3.0) & (np.abs(place[:, 1, 3]) < 6.0)
         ahead = place[near, 0, 0]
@@ -290,7 +290,7 @@ def test_the_highway_is_at_full_speed_from_the_first_scan():
     assert np.abs(np.diff(lie.yaw(drive.truth().poses))).max() > 0.007  # a bend of 300 m is part of it
 
 
-def test_the_hall_stands_still_for_two_seconds_then_moves_half_a_metre_a_scan():
+def test_the_hall_stands_still_for_two_seconds_then_moves_half_a_meter_a_scan():
     poses = planned("hall", "vlp-16").truth().poses
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps[:20].max() < 1e-6
@@ -614,34 +614,34 @@ def test_nothing_is_overwritten_without_force(tmp_path, existing):
     simulate("office", tmp_path / "a.mcap", duration_s=0.2, force=True)
 
 
-# --- the catalogue ---------------------------------------------------------------------------------------------
+# --- the catalog ---------------------------------------------------------------------------------------------
 
 
-def test_every_sequence_of_the_catalogue_can_be_read():
-    assert {"office", "town", "demo-office", "demo-town", "intel", "kitti"} <= set(catalogue.names())
-    for name in catalogue.names():
-        source = catalogue.load(name).source
-        if isinstance(source, catalogue.Simulated):
+def test_every_sequence_of_the_catalog_can_be_read():
+    assert {"office", "town", "demo-office", "demo-town", "intel", "kitti"} <= set(catalog.names())
+    for name in catalog.names():
+        source = catalog.load(name).source
+        if isinstance(source, catalog.Simulated):
             assert source.world in WORLDS and source.sensor in SENSORS
 
 
 def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
-    short = catalogue.Simulated(world="office", sensor="lms-270", seed=0, duration_s=0.5)
-    sequence = catalogue.load("demo-office")
-    monkeypatch.setattr(catalogue, "load", lambda name: msgspec.structs.replace(sequence, source=short))
-    path = catalogue.prepare("demo-office", tmp_path)
+    short = catalog.Simulated(world="office", sensor="lms-270", seed=0, duration_s=0.5)
+    sequence = catalog.load("demo-office")
+    monkeypatch.setattr(catalog, "load", lambda name: msgspec.structs.replace(sequence, source=short))
+    path = catalog.prepare("demo-office", tmp_path)
     assert path == tmp_path / "demo-office.mcap" and len(messages(path, "/scan")) == 5
     written = path.stat().st_mtime_ns
-    assert catalogue.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
+    assert catalog.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
 
 
 def test_an_unknown_sequence_names_the_known_ones():
     with pytest.raises(InputError, match="demo-office, demo-town"):
-        catalogue.load("mars")
+        catalog.load("mars")
 
 
 def test_a_misspelt_key_is_refused(tmp_path):
-    text = (catalogue._folder() / "office" / "sequence.toml").read_text()
+    text = (catalog._folder() / "office" / "sequence.toml").read_text()
     (tmp_path / "sequence.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
     with pytest.raises(InputError, match="sede"):
-        catalogue.read(tmp_path / "sequence.toml")
+        catalog.read(tmp_path / "sequence.toml")

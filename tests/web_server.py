@@ -10,7 +10,7 @@ from contextlib import contextmanager
 class Site:
     """Files to serve by their path.
 
-    has_ranges : whether it honours Range; etag : what it calls their version; delay_s : before each answer
+    has_ranges : whether it honors Range; etag : what it calls their version; delay_s : before each answer
     failures : statuses of the next GET answers, 0 for one that breaks off in the middle
     asked : the ranges asked for, None for the whole; sent : bytes of bodies
     """

@@ -17,7 +17,7 @@ from scanchain.runs.metrics import Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.viz import report
-from scanchain.viz.courses import colour_of
+from scanchain.viz.courses import color_of
 from scanchain.viz.report import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
 from scanchain.viz.sheet import Sheet
 from scanchain.words import counted
@@ -34,7 +34,7 @@ _HEADS = (
     Head("warn.", "", "warnings of the run: what was lost, left out or is wrong"),
     Head("way", "m"),
     Head("loops", "", "loop closures accepted"),
-    Head("ATE", "m", "rmse against the ground truth in the log, after optimisation"),
+    Head("ATE", "m", "rmse against the ground truth in the log, after optimization"),
     Head("KITTI", "%", "translational error of the KITTI metric"),
     Head("inliers", "%", "median over the scans"),
     Head("residual", "mm", "median over the scans"),
@@ -86,14 +86,14 @@ def _row(directory: Path, row: Row, name: str) -> report.Row:
     m, link = row.metrics, _link(directory, row)
     if m is None:
         return report.Row(name, (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
-    truth = None if m.ground_truth is None else m.ground_truth.optimised
+    truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
         Cell(f"{m.scans:,}"),
         Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
         Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
         Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
-        Cell(f"{m.travelled_m:,.1f}"),
+        Cell(f"{m.traveled_m:,.1f}"),
         Cell(f"{m.closures_accepted:,}"),
         Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
         Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
@@ -125,7 +125,7 @@ def _paths(row: Row) -> str:
 def _spread(done: Sequence[Row]) -> Iterator[Section]:
     """How the figures of the logs spread, where there are some to compare."""
     drawn = (
-        ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimised.ate_rmse_m),
+        ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimized.ate_rmse_m),
         ("Speed", "× real time", lambda row, m: m.times_real_time),
         ("Memory", "MiB", lambda row, m: row.peak_mib),
     )
@@ -146,7 +146,7 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
     with Sheet(name) as sheet:
         share = 100.0 * (np.arange(len(values)) + 1) / len(values)
-        sheet.axes.step(values, share, where="post", color=colour_of(0), marker="o", markersize=2.5)
+        sheet.axes.step(values, share, where="post", color=color_of(0), marker="o", markersize=2.5)
         sheet.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
         sheet.axes.set_ylim(0.0, 105.0)
         sheet.axes.set_xlabel(f"{name} [{unit}]")
@@ -163,15 +163,15 @@ def _ways(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterat
     ]
     text = f"The first {_MOST_WAYS} of {len(done):,}." if len(done) > _MOST_WAYS else ""
     if drawings:
-        yield Section("Ways, optimised, seen from above", text, drawings=tuple(drawings), is_small=True)
+        yield Section("Ways, optimized, seen from above", text, drawings=tuple(drawings), is_small=True)
 
 
 def _way(name: str, trajectory: Path) -> Markup:
     positions = read_tum(trajectory).poses[:, :2, -1]
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     with Sheet(name, height_inches=3.6) as sheet:
-        sheet.axes.plot(*positions[rows].T, color=colour_of(0))
-        sheet.axes.plot(*positions[0], color=colour_of(0), marker="o", markersize=4.0)
+        sheet.axes.plot(*positions[rows].T, color=color_of(0))
+        sheet.axes.plot(*positions[0], color=color_of(0), marker="o", markersize=4.0)
         sheet.axes.set_aspect("equal", adjustable="datalim")
         sheet.axes.set_xlabel("x [m]")
         sheet.axes.set_ylabel("y [m]")

@@ -88,12 +88,12 @@ def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
 def eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole way."""
     low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
-    centre = 0.5 * (low + high)
+    center = 0.5 * (low + high)
     size_m = max(float(np.linalg.norm(high - low)), 20.0 if dimension == 2 else 60.0)
     away = (0.0, 0.0, 1.3) if dimension == 2 else (-0.35, -0.7, 0.7)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
-        position=centre + size_m * np.array(away),
-        look_target=centre,
+        position=center + size_m * np.array(away),
+        look_target=center,
         eye_up=(0.0, 1.0, 0.0) if dimension == 2 else (0.0, 0.0, 1.0),
     )

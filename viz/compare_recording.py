@@ -53,27 +53,27 @@ def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray)
 def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
     """The way piece by piece, the lidar on it, the map, and the plots."""
     name = rr.escape_entity_path_part(course.name)
-    colour, positions = _rgb(course.colour), course.positions.astype(np.float32)
+    color, positions = _rgb(course.color), course.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
     strips = rr.LineStrips3D.columns(strips=shapes.segments(before, positions))
     messages = [
-        Message(f"world/{name}/way", rr.LineStrips3D.from_fields(colors=[colour], radii=[entities.pixels(1.5)])),
+        Message(f"world/{name}/way", rr.LineStrips3D.from_fields(colors=[color], radii=[entities.pixels(1.5)])),
         Message(f"world/{name}/way", strips, times),
-        Message(f"world/{name}/lidar", rr.Points3D.from_fields(colors=[colour], radii=[entities.pixels(5.0)])),
+        Message(f"world/{name}/lidar", rr.Points3D.from_fields(colors=[color], radii=[entities.pixels(5.0)])),
         Message(
             f"world/{name}/lidar", rr.Points3D.columns(positions=positions).partition([1] * len(positions)), times
         ),
     ]
     if map_file.exists():
         points = shapes.in_space(shapes.at_most(read_ply(map_file), _MAP_POINTS))
-        faint = tuple((value + shade) // 2 for value, shade in zip(colour, entities.GREY, strict=True))
+        faint = tuple((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
         archetype = rr.Points3D(points, colors=[faint], radii=[entities.pixels(0.5)])
         messages.append(Message(f"world/{name}/map", archetype))
     for plot, values in _series(course).items():
         known = np.isfinite(values)
         if known.any():
-            series = rr.SeriesLines(colors=[colour], names=[course.name], widths=[1.0])
+            series = rr.SeriesLines(colors=[color], names=[course.name], widths=[1.0])
             messages.append(Message(f"plots/{plot}/{name}", series))
             columns = rr.Scalars.columns(scalars=values[known])
             messages.append(Message(f"plots/{plot}/{name}", columns, times[known]))
@@ -126,7 +126,7 @@ def _stamps(directory: Path) -> np.ndarray:
     return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
+def _rgb(color: str) -> tuple[int, int, int]:
     """The parts of #rrggbb."""
-    red, green, blue = bytes.fromhex(colour[1:])
+    red, green, blue = bytes.fromhex(color[1:])
     return red, green, blue

@@ -172,7 +172,7 @@ def _disagreement(table: Table) -> Section:
     ]
     return Section(
         "Disagreement",
-        "Median distance between the motions that two methods find for a scan, in millimetres. "
+        "Median distance between the motions that two methods find for a scan, in millimeters. "
         "Not ground truth: two that err alike agree.",
         grid=Grid((Head("mm"), *(Head(name) for name in names)), tuple(rows)),
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.evidence import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
-from scanchain.viz.courses import Course, Floats, colour_of
+from scanchain.viz.courses import Course, Floats, color_of
 
 
 def read_courses(directory: Path) -> list[Course]:
@@ -29,7 +29,7 @@ def _course(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -
     errors_m = np.empty(0) if relations is None else _column(_of(relations, row.name), "error_m")
     return Course(
         name=row.name,
-        colour=colour_of(place),
+        color=color_of(place),
         is_dashed="+loops" in row.base,
         positions=np.stack([_column(chosen, f"aligned_{axis}") for axis in "xyz"], axis=1),
         distance_m=_column(chosen, "distance_m"),

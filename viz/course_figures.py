@@ -23,7 +23,7 @@ _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
 _TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 3))}
 _BLIND, _PLAIN = 0.01, 1000.0  # times the least that must be known; less and more are drawn as that
-_BAR_INCHES = 0.65  # of a colour bar and its numbers
+_BAR_INCHES = 0.65  # of a color bar and its numbers
 
 
 def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
@@ -37,7 +37,7 @@ def plan(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats
 
 
 def height(name: str, courses: Sequence[Course], truth: Floats | None, low: Floats, high: Floats) -> Markup:
-    """Height over the distance travelled, within corners."""
+    """Height over the distance traveled, within corners."""
     with Sheet(name) as sheet:
         _each(sheet.axes, courses, lambda course: (course.distance_m, course.positions[:, 2]))
         if truth is not None:
@@ -48,7 +48,7 @@ def height(name: str, courses: Sequence[Course], truth: Floats | None, low: Floa
         sheet.axes.set_ylim(low[2], high[2])
         longest_m = np.median([course.distance_m[-1] for course in courses if len(course.distance_m)])
         sheet.axes.set_xlim(0.0, 1.05 * max(float(longest_m), 1.0))
-        _label(sheet.axes, "distance travelled [m]", "z [m]")
+        _label(sheet.axes, "distance traveled [m]", "z [m]")
         return sheet.svg()
 
 
@@ -60,7 +60,7 @@ def error_over_distance(name: str, courses: Sequence[Course]) -> Markup:
             x, y = _windowed(course.distance_m[known], course.error_m[known])
             sheet.axes.plot(x, np.maximum(y, 1e-4), **course.style)
         _logarithmic(sheet.axes, "y")
-        _label(sheet.axes, "distance travelled [m]", "position error [m]")
+        _label(sheet.axes, "distance traveled [m]", "position error [m]")
         return sheet.svg()
 
 
@@ -194,7 +194,7 @@ def _thinned(values: Floats) -> Floats:
 
 
 def _windowed(x: Floats, y: Floats, combine: Callable[..., Floats] = np.median) -> tuple[Floats, Floats]:
-    """Neighbouring values put together so that a line of them can be read."""
+    """Neighboring values put together so that a line of them can be read."""
     size = max(1, -(-len(x) // _WINDOWS))
     count = len(x) // size * size
     if not count:

@@ -17,7 +17,7 @@ from scanchain.viz.map_figures import loops_picture
 from scanchain.viz.report import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
-_MEDIANS = "Of long logs, medians of neighbouring scans."
+_MEDIANS = "Of long logs, medians of neighboring scans."
 _FIGURES = re.compile(
     r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
 )  # of one closure; limits stand behind them
@@ -25,7 +25,7 @@ _FIGURES = re.compile(
 
 def chip(course: Course) -> Chip:
     """The course in a legend."""
-    return Chip(course.name, course.colour, course.is_dashed)
+    return Chip(course.name, course.color, course.is_dashed)
 
 
 def _legend(courses: Sequence[Course]) -> tuple[Chip, ...]:
@@ -41,7 +41,7 @@ def way_section(
     drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", courses, truth, *corners))]
     if not is_planar:
         height = figures.height("height", courses, truth, *corners)
-        drawings.append(Drawing("Height", "Over the distance travelled.", height))
+        drawings.append(Drawing("Height", "Over the distance traveled.", height))
     chips = _legend(courses) if truth is None else (*map(chip, courses), _TRUTH_CHIP)
     return Section("Trajectories", text, chips, tuple(drawings))
 
@@ -105,7 +105,7 @@ def knowledge_section(courses: Sequence[Course], *, is_planar: bool) -> Iterator
         return
     along = Drawing(
         "Observability along the way",
-        "How many times the least that it takes is known of the worst direction, worst of neighbouring scans. "
+        "How many times the least that it takes is known of the worst direction, worst of neighboring scans. "
         "Below the dotted line a scan is called degenerate.",
         figures.observability("observability", told),
     )
@@ -170,7 +170,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
             (
                 Cell(f"{len(places):,}"),
                 Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
-                Cell(_millimetres(float(np.median(residual_m[places])))),
+                Cell(_millimeters(float(np.median(residual_m[places])))),
                 Cell(reason, is_wide=True),
             ),
         )
@@ -179,7 +179,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
     return Grid(heads, rows)
 
 
-def _millimetres(value_m: float) -> str:
+def _millimeters(value_m: float) -> str:
     """– for what no point has."""
     return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 

@@ -12,8 +12,8 @@ from scanchain.runs.verdicts import BACK_END, VERIFICATION
 
 Floats = NDArray[np.float64]
 
-# Told apart on white and on black, also by most who see colours differently.
-_COLOURS = (
+# Told apart on white and on black, also by most who see colors differently.
+_COLORS = (
     "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
     "#b0413e", "#5f8f57",
 )  # fmt: skip
@@ -33,9 +33,9 @@ class Course:
     Attributes
     ----------
     name : for legends outside the drawings
-    colour, is_dashed : how its line is drawn
-    positions : (N, 3) metres, in one frame with the other courses
-    distance_m : (N,) travelled
+    color, is_dashed : how its line is drawn
+    positions : (N, 3) meters, in one frame with the other courses
+    distance_m : (N,) traveled
     error_m : (N,) distance from where it was
     relation_error_m : (K,) the same of K relations, none where there are no relations
     seconds : (N,) what each scan took
@@ -44,7 +44,7 @@ class Course:
     """
 
     name: str
-    colour: str
+    color: str
     is_dashed: bool
     positions: Floats
     distance_m: Floats
@@ -57,7 +57,7 @@ class Course:
     @property
     def style(self) -> dict[str, Any]:
         """For matplotlib."""
-        return {"color": self.colour, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
+        return {"color": self.color, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +70,6 @@ class PathLine:
     is_dashed: bool = False
 
 
-def colour_of(place: int) -> str:
+def color_of(place: int) -> str:
     """Of the method at this place of the table."""
-    return _COLOURS[place % len(_COLOURS)]
+    return _COLORS[place % len(_COLORS)]

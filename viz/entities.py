@@ -1,4 +1,4 @@
-"""The entities of a recording: their paths, colours, and what holds for all of their time.
+"""The entities of a recording: their paths, colors, and what holds for all of their time.
 
 Frames are entities: points under ``world/lidar`` move with the scan's pose, points under ``world/odom`` with the
 correction that loop closures make. A 2D log is drawn in the plane z = 0.
@@ -21,9 +21,9 @@ SCAN = "world/lidar/scan"
 COVARIANCE = "world/lidar/covariance"
 ODOMETRY = "world/odometry"
 TRAJECTORY = "world/trajectory"
-OPTIMISED = "world/optimised"
+OPTIMIZED = "world/optimized"
 GROUND_TRUTH = "world/ground_truth"
-OPTIMISED_LIDAR = "world/optimised/lidar"
+OPTIMIZED_LIDAR = "world/optimized/lidar"
 KEYFRAMES = "world/graph/keyframes"
 ODOMETRY_EDGES = "world/graph/odometry"
 ACCEPTED = "world/graph/loops/accepted"
@@ -44,11 +44,11 @@ LEGEND = "legend"
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
-YELLOW, GREY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
+YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
 CYAN = (70, 210, 210)
 
-_HEIGHT_COLOURS = np.array(
+_HEIGHT_COLORS = np.array(
     [(50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230)], np.float64
 )
 
@@ -73,28 +73,28 @@ back.
 """
 
 
-def height_colours(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
+def height_colors(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
     low, high = np.percentile(points[:, 2], (2.0, 98.0))
     share = np.clip((points[:, 2] - low) / max(float(high - low), 1e-3), 0.0, 1.0)
-    anchors = np.linspace(0.0, 1.0, len(_HEIGHT_COLOURS))
-    channels = [np.interp(share, anchors, channel) for channel in _HEIGHT_COLOURS.T]
+    anchors = np.linspace(0.0, 1.0, len(_HEIGHT_COLORS))
+    channels = [np.interp(share, anchors, channel) for channel in _HEIGHT_COLORS.T]
     return np.stack(channels, axis=-1).astype(np.uint8)
 
 
 def constants(dimension: int) -> list[Message]:
-    """What never changes: axes, colours, line widths, names of the series."""
+    """What never changes: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
     return [
         Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
         Message(SCAN, _dots(YELLOW, 2.0)),
-        Message(LOCAL_MAP, _dots(GREY, 1.2)),
+        Message(LOCAL_MAP, _dots(GRAY, 1.2)),
         Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=[pixels(1.0)])),
         Message(ODOMETRY, _lines(ORANGE, 1.0)),
         Message(TRAJECTORY, _lines(BLUE, 1.5)),
         Message(KEYFRAMES, _dots(VIOLET, 2.0)),
-        Message(ODOMETRY_EDGES, _lines(GREY, 0.75)),
+        Message(ODOMETRY_EDGES, _lines(GRAY, 0.75)),
         Message(ACCEPTED, rr.LineStrips3D.from_fields(radii=[pixels(1.5)])),
         Message(REJECTED, _lines(RED, 0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
@@ -104,7 +104,7 @@ def constants(dimension: int) -> list[Message]:
 
 def _series() -> list[Message]:
     stages = [f"{stage} [ms]" for stage in STAGES]
-    colours = [CYAN, GREEN, BLUE, YELLOW, RED]
+    colors = [CYAN, GREEN, BLUE, YELLOW, RED]
     single = {
         INLIERS: "inliers",
         INLIER_SHARE: "inlier share",
@@ -114,18 +114,16 @@ def _series() -> list[Message]:
     }
     states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, ORANGE, RED])
     return [
-        Message(TIME, rr.SeriesLines(names=stages, colors=colours)),
+        Message(TIME, rr.SeriesLines(names=stages, colors=colors)),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),
         Message(LOOPS, _steps(["accepted", "rejected"], [GREEN, RED])),
         Message(STATE, states),
     ]
 
 
-def _steps(names: list[str], colours: list[tuple[int, int, int]]) -> rr.SeriesLines:
+def _steps(names: list[str], colors: list[tuple[int, int, int]]) -> rr.SeriesLines:
     """Series that hold their value until the next."""
-    return rr.SeriesLines(
-        names=names, colors=colours, interpolation_mode=rr.components.InterpolationMode.StepAfter
-    )
+    return rr.SeriesLines(names=names, colors=colors, interpolation_mode=rr.components.InterpolationMode.StepAfter)
 
 
 def pixels(radius: float) -> float:
@@ -133,9 +131,9 @@ def pixels(radius: float) -> float:
     return -radius
 
 
-def _dots(colour: tuple[int, int, int], radius: float) -> rr.Points3D:
-    return rr.Points3D.from_fields(colors=[colour], radii=[pixels(radius)])
+def _dots(color: tuple[int, int, int], radius: float) -> rr.Points3D:
+    return rr.Points3D.from_fields(colors=[color], radii=[pixels(radius)])
 
 
-def _lines(colour: tuple[int, int, int], radius: float) -> rr.LineStrips3D:
-    return rr.LineStrips3D.from_fields(colors=[colour], radii=[pixels(radius)])
+def _lines(color: tuple[int, int, int], radius: float) -> rr.LineStrips3D:
+    return rr.LineStrips3D.from_fields(colors=[color], radii=[pixels(radius)])

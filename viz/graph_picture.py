@@ -1,4 +1,4 @@
-"""A pose graph before and after optimisation, side by side."""
+"""A pose graph before and after optimization, side by side."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import GraphState
-from scanchain.graph.optimisation import GraphChange, fit
+from scanchain.graph.optimization import GraphChange, fit
 from scanchain.viz.figure_file import write_figure
 
 if TYPE_CHECKING:
@@ -64,9 +64,9 @@ def _draw_state(axes: Axes, state: GraphState) -> None:
 
 
 def _draw_edges(
-    axes: Axes, seen: NDArray[np.float64], edges: NDArray[np.int64], colour: str, width: float, name: str
+    axes: Axes, seen: NDArray[np.float64], edges: NDArray[np.int64], color: str, width: float, name: str
 ) -> None:
     from matplotlib.collections import LineCollection
 
     if len(edges):
-        axes.add_collection(LineCollection(list(seen[edges]), colors=colour, linewidths=width, label=name))
+        axes.add_collection(LineCollection(list(seen[edges]), colors=color, linewidths=width, label=name))

@@ -1,4 +1,4 @@
-"""A pose graph before and after optimisation as a recording."""
+"""A pose graph before and after optimization as a recording."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from scanchain.data import GraphState
-from scanchain.graph.optimisation import GraphChange
+from scanchain.graph.optimization import GraphChange
 from scanchain.viz import entities, shapes
 from scanchain.viz.messages import Message, Times
 from scanchain.viz.sinks import open_stream, write_recording
 
 
 def record_graph(change: GraphChange, path: Path) -> None:
-    """Write a .rrd file: the timeline ``scan`` is 0 before and 1 after, edges are coloured by verdict.
+    """Write a .rrd file: the timeline ``scan`` is 0 before and 1 after, edges are colored by verdict.
 
     Raises OSError.
     """
@@ -43,16 +43,16 @@ def _messages(state: GraphState, when: int) -> list[Message]:
         positions=nodes, colors=[entities.VIOLET] * len(nodes), radii=[entities.pixels(1.5)] * len(nodes)
     )
     kinds = (
-        (entities.ODOMETRY_EDGES, ~skips & ~rejected, entities.GREY),
+        (entities.ODOMETRY_EDGES, ~skips & ~rejected, entities.GRAY),
         (entities.ACCEPTED, skips & ~rejected, entities.GREEN),
         (entities.REJECTED, rejected, entities.RED),
     )
-    lines = [_lines(entity, nodes[state.edges[chosen]], colour, times) for entity, chosen, colour in kinds]
+    lines = [_lines(entity, nodes[state.edges[chosen]], color, times) for entity, chosen, color in kinds]
     return [Message(entities.KEYFRAMES, dots.partition([len(nodes)]), times), *lines]
 
 
-def _lines(entity: str, strips: NDArray[np.float32], colour: tuple[int, int, int], times: Times) -> Message:
+def _lines(entity: str, strips: NDArray[np.float32], color: tuple[int, int, int], times: Times) -> Message:
     columns = rr.LineStrips3D.columns(
-        strips=strips, colors=[colour] * len(strips), radii=[entities.pixels(0.75)] * len(strips)
+        strips=strips, colors=[color] * len(strips), radii=[entities.pixels(0.75)] * len(strips)
     )
     return Message(entity, columns.partition([len(strips)]), times)

@@ -85,11 +85,11 @@ class KeyframeGraph:
             nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
         accepted = [item for item in self.judged if item.verdict is Verdict.ACCEPTED]
         rejected = [item for item in self.judged if item.verdict is Verdict.REJECTED]
-        colours = [entities.ORANGE if item.weight < _DOUBT else entities.GREEN for item in accepted]
+        colors = [entities.ORANGE if item.weight < _DOUBT else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), times),
             _strips(entities.ODOMETRY_EDGES, nodes[None], times),
-            _strips(entities.ACCEPTED, _edges(nodes, accepted), times, colours),
+            _strips(entities.ACCEPTED, _edges(nodes, accepted), times, colors),
             _strips(entities.REJECTED, _edges(nodes, rejected), times),
         ]
 
@@ -112,11 +112,11 @@ def _as_found(closure: Closure) -> JudgedClosure:
 
 
 def _strips(
-    entity: str, strips: NDArray[np.float32], times: Times, colours: Sequence[tuple[int, int, int]] = ()
+    entity: str, strips: NDArray[np.float32], times: Times, colors: Sequence[tuple[int, int, int]] = ()
 ) -> Message:
     columns = [*rr.LineStrips3D.columns(strips=strips).partition([len(strips)])]
-    if colours:
-        columns += [*rr.LineStrips3D.columns(colors=list(colours)).partition([len(colours)])]
+    if colors:
+        columns += [*rr.LineStrips3D.columns(colors=list(colors)).partition([len(colors)])]
     return Message(entity, rr.ComponentColumnList(columns), times)
 
 

@@ -28,7 +28,7 @@ _TITLE = {"loc": "left", "fontsize": 11}
 
 
 def draw_estimate(path: Path, study: Study) -> None:
-    """Draw trajectory and landmarks before and after optimisation, side by side, over the truth, to a PNG.
+    """Draw trajectory and landmarks before and after optimization, side by side, over the truth, to a PNG.
 
     Landmarks after it carry their 95 % ellipses. All is in the frame of the truth where there is one.
     """
@@ -38,12 +38,12 @@ def draw_estimate(path: Path, study: Study) -> None:
     width, height = high - low
     figure = Figure(figsize=(11.0, float(np.clip(5.2 * height / width, 3.0, 9.0)) + 1.0), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, estimate, colour, title in (
+    for axes, estimate, color, title in (
         (panels[0], study.before, _BEFORE, "before"),
         (panels[1], study.after, _AFTER, "after"),
     ):
         _draw_truth(axes, study)
-        _draw_state(axes, estimate, colour, title)
+        _draw_state(axes, estimate, color, title)
         accuracy = estimate.accuracy.poses_m
         error = f": poses {accuracy:.3g} m off" if np.isfinite(accuracy) else ""
         axes.set_title(f"{study.name}, {title}{error}", **_TITLE)
@@ -112,11 +112,11 @@ def _draw_truth(axes: Axes, study: Study) -> None:
         )  # fmt: skip
 
 
-def _draw_state(axes: Axes, estimate: Estimate, colour: str, when: str) -> None:
+def _draw_state(axes: Axes, estimate: Estimate, color: str, when: str) -> None:
     poses, landmarks = _in_truth(estimate)
-    axes.plot(*poses.T, color=colour, linewidth=1.2, alpha=0.85, label=f"trajectory {when}", zorder=3)
+    axes.plot(*poses.T, color=color, linewidth=1.2, alpha=0.85, label=f"trajectory {when}", zorder=3)
     axes.plot(
-        *landmarks.T, color=colour, linestyle="none", marker="o", markersize=4, markeredgewidth=0.9,
+        *landmarks.T, color=color, linestyle="none", marker="o", markersize=4, markeredgewidth=0.9,
         markerfacecolor="none", label=f"landmarks {when}", zorder=5,
     )  # fmt: skip
 

@@ -47,20 +47,20 @@ def _root(study: Study) -> str:
 def _truth(study: Study) -> list[Message]:
     """True trajectory and landmarks, for ever."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    way = rr.LineStrips3D([shapes.in_space(study.true_poses)], colors=[entities.GREY], radii=entities.pixels(1.0))
-    marks = rr.Points3D(shapes.in_space(known), colors=[entities.GREY], radii=entities.pixels(4.0))
+    way = rr.LineStrips3D([shapes.in_space(study.true_poses)], colors=[entities.GRAY], radii=entities.pixels(1.0))
+    marks = rr.Points3D(shapes.in_space(known), colors=[entities.GRAY], radii=entities.pixels(4.0))
     return [Message(f"{_root(study)}/truth/trajectory", way), Message(f"{_root(study)}/truth/landmarks", marks)]
 
 
 def _state(study: Study, estimate: Estimate, when: int) -> list[Message]:
     """Trajectory and landmarks at one instant."""
     times, T = Times.at(when, when), estimate.T_truth_estimate
-    colour = entities.ORANGE if when == 0 else entities.BLUE
+    color = entities.ORANGE if when == 0 else entities.BLUE
     way = shapes.in_space(lie.transform(T, estimate.state.poses[:, :2]))
     points = shapes.in_space(lie.transform(T, estimate.state.landmarks))
-    line = rr.LineStrips3D.columns(strips=[way], colors=[colour], radii=[entities.pixels(1.5)])
+    line = rr.LineStrips3D.columns(strips=[way], colors=[color], radii=[entities.pixels(1.5)])
     marks = rr.Points3D.columns(
-        positions=points, colors=[colour] * len(points), radii=[entities.pixels(3.0)] * len(points)
+        positions=points, colors=[color] * len(points), radii=[entities.pixels(3.0)] * len(points)
     )
     return [
         Message(f"{_root(study)}/trajectory", line.partition([1]), times),
@@ -69,7 +69,7 @@ def _state(study: Study, estimate: Estimate, when: int) -> list[Message]:
 
 
 def _ellipses(study: Study) -> Message:
-    """The 95 % ellipse of every landmark after optimisation."""
+    """The 95 % ellipse of every landmark after optimization."""
     T = study.after.T_truth_estimate
     turn: Matrix = T[:2, :2]
     values, axes = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)

@@ -35,7 +35,7 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
 
 
 def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
-    """Points (M, 3) seen from above, within corners; the colour is the height, where there is any."""
+    """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
     with Sheet.of_plan(name, low, high) as sheet:
         _draw_points(sheet, points, low, high, by_height=True)
         return sheet.svg()
@@ -44,7 +44,7 @@ def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
 def path_over_map(
     name: str, points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats
 ) -> Markup:
-    """Lines over the map (grey), seen from above, within corners; circle and square begin and end the path."""
+    """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
     with Sheet.of_plan(name, low, high) as sheet:
         _draw_points(sheet, points, low, high, by_height=False)
         for line in lines:
@@ -66,7 +66,7 @@ def _draw_points(sheet: Sheet, points: Points, low: Floats, high: Floats, *, by_
 
 
 def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
-    """(H, W, 4), clear where nothing is, the fuller the more points there are, coloured as the highest of them."""
+    """(H, W, 4), clear where nothing is, the fuller the more points there are, colored as the highest of them."""
     from matplotlib import colormaps
     from matplotlib.colors import to_rgba
 
@@ -75,12 +75,12 @@ def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDA
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     points = points[np.argsort(points[:, 2])]
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
-    colours = np.array([to_rgba(_POINTS)])
+    colors = np.array([to_rgba(_POINTS)])
     if by_height and np.ptp(points[:, 2]):
         bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
-        colours = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
+        colors = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
     image = np.zeros((rows, columns, 4))
-    image[row, column] = colours
+    image[row, column] = colors
     opacity = float(np.clip(_OPAQUE / len(points), *_OPACITIES))
     counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
     image[:, :, 3] = 1.0 - (1.0 - opacity) ** counts
@@ -90,7 +90,7 @@ def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDA
 def loops_picture(
     name: str, course: Course, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
-    """The way (grey) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3) from place to place."""
+    """The way (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3) from place to place."""
     with Sheet.of_plan(name, low, high) as sheet:
         sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
         for by, (_, color) in CLOSURES.items():

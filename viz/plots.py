@@ -1,4 +1,4 @@
-"""Pictures of a result: the way, before and after optimisation, over the map, seen from above."""
+"""Pictures of a result: the way, before and after optimization, over the map, seen from above."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _WIDTH_INCHES = 8.0
 _MAX_POINTS = 400_000
-_ODOMETRY, _OPTIMISED = "#e07b00", "#1f5fd0"
+_ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
 _POINTS = "#8a8f98"
 _FREE, _OCCUPIED = 35, 65  # percent; what is below is drawn white, above dark
 _UNKNOWN = 0.90
@@ -42,7 +42,7 @@ def draw_map(
     path: Path,
     *,
     title: str,
-    optimised: Matrix,
+    optimized: Matrix,
     odometry: Matrix | None = None,
     ground_truth: Matrix | None = None,
     points: NDArray[np.floating] | None = None,
@@ -53,7 +53,7 @@ def draw_map(
     points : (M, d) of the map; of a 3D one the height is the shade
     ground_truth : moved onto the estimate beforehand; nothing is aligned here
     """
-    ways = [way for way in (optimised, odometry, ground_truth) if way is not None and len(way)]
+    ways = [way for way in (optimized, odometry, ground_truth) if way is not None and len(way)]
     low, high = _frame(ways, points, grid)
     figure, axes = _paper(low, high)
     if grid is not None:
@@ -61,9 +61,9 @@ def draw_map(
     if points is not None and len(points):
         _draw_points(axes, points)
     _draw_way(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
-    _draw_way(axes, optimised, "optimised", _OPTIMISED, "-", 1.8)
+    _draw_way(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
     _draw_way(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
-    _mark_ends(axes, optimised)
+    _mark_ends(axes, optimized)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_title(title, loc="left", fontsize=11)
@@ -109,7 +109,7 @@ def _paper(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure,
 
 
 def _draw_grid(axes: Axes, grid: GridPicture) -> None:
-    """Free white, occupied dark, unknown a light grey, like the paper around the grid."""
+    """Free white, occupied dark, unknown a light gray, like the paper around the grid."""
     share = np.clip((grid.cells - float(_FREE)) / (_OCCUPIED - _FREE), 0.0, 1.0)
     shade = np.where(grid.cells < 0, _UNKNOWN, 1.0 - 0.85 * share)
     axes.set_facecolor((_UNKNOWN, _UNKNOWN, _UNKNOWN))
@@ -134,19 +134,19 @@ def _draw_points(axes: Axes, points: NDArray[np.floating]) -> None:
 
 
 def _draw_way(
-    axes: Axes, way: Matrix | None, name: str, colour: str, style: str | tuple[int, tuple[int, int]], width: float
+    axes: Axes, way: Matrix | None, name: str, color: str, style: str | tuple[int, tuple[int, int]], width: float
 ) -> None:
     """Draw one line, its length in the legend."""
     if way is None or not len(way):
         return
     x, y = way[:, 0, -1], way[:, 1, -1]
     length_m = float(np.linalg.norm(np.diff(way[:, :-1, -1], axis=0), axis=1).sum())
-    axes.plot(x, y, color=colour, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
+    axes.plot(x, y, color=color, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
 
 
 def _mark_ends(axes: Axes, way: Matrix) -> None:
     if not len(way):
         return
-    marks = {"color": _OPTIMISED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
+    marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
     axes.plot(*way[0, :2, -1], marker="o", label="start", **marks)
     axes.plot(*way[-1, :2, -1], marker="s", label="end", **marks)

@@ -119,17 +119,17 @@ class Recording:
             self._send(lambda: self._step(step))
 
     def log_trajectory(
-        self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]
+        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
     ) -> None:
-        """Record the way after optimisation: poses (N, d+1, d+1) of the scans ``indices``."""
-        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimised))
+        """Record the way after optimization: poses (N, d+1, d+1) of the scans ``indices``."""
+        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
 
     def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
         self._send(lambda: self._settled(judged, graph))
 
     def log_ground_truth(self, poses: Matrix) -> None:
-        """Record true poses (N, 4, 4), moved onto the optimised way."""
+        """Record true poses (N, 4, 4), moved onto the optimized way."""
         line = rr.LineStrips3D([shapes.positions(poses)], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
         self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
 
@@ -204,8 +204,8 @@ class Recording:
         path = shapes.positions(poses)
         line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(0.75)])
         return [
-            Message(entities.OPTIMISED, line),
-            Message(entities.OPTIMISED_LIDAR, shapes.transforms(poses), times),
+            Message(entities.OPTIMIZED, line),
+            Message(entities.OPTIMIZED_LIDAR, shapes.transforms(poses), times),
         ]
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
@@ -213,8 +213,8 @@ class Recording:
         drawn = shapes.in_space(shapes.at_most(points, limit))
         if not len(drawn):
             return []
-        colours = entities.height_colours(drawn) if self.dimension == 3 else [entities.WHITE]
-        return [Message(entities.MAP, rr.Points3D(drawn, colors=colours, radii=[entities.pixels(1.0)]))]
+        colors = entities.height_colors(drawn) if self.dimension == 3 else [entities.WHITE]
+        return [Message(entities.MAP, rr.Points3D(drawn, colors=colors, radii=[entities.pixels(1.0)]))]
 
     def _grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]

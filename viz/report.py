@@ -21,7 +21,7 @@ class Chip:
     """A name in a legend with the line that it is drawn with."""
 
     name: str
-    colour: str
+    color: str
     is_dashed: bool = False
 
 

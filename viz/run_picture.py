@@ -23,17 +23,17 @@ def draw_run(directory: Path, picture: Path) -> None:
     points = read_ply(directory / "map.ply")
     is_planar = not points[:, 2].any()
     cells, resolution_m, origin_m = read_map(directory)
-    optimised, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
+    optimized, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
     truth_file = directory / TRUTH_FILE
     truth = None
     if truth_file.exists():
         judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
-        truth = on_the_estimate(optimised, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
+        truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
     try:
         draw_map(
             picture,
             title=directory.resolve().name,
-            optimised=optimised.poses,
+            optimized=optimized.poses,
             odometry=odometry.poses,
             ground_truth=None if truth is None else truth.poses,
             points=None if is_planar else points,

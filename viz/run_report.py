@@ -24,7 +24,7 @@ from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.viz.course_sections import error_section, knowledge_section, loop_section, time_section, way_section
-from scanchain.viz.courses import Course, Floats, colour_of
+from scanchain.viz.courses import Course, Floats, color_of
 from scanchain.viz.map_viewer import SCRIPT
 from scanchain.viz.provenance_folds import provenance_folds
 from scanchain.viz.report import REPORT_FILE, Fold, Page, Section, write_page
@@ -63,7 +63,7 @@ def _summary_lines(directory: Path) -> list[str]:
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     """The result first, what it took last."""
-    yield "trajectory", f"{m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
+    yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
@@ -82,7 +82,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
 def _accuracy(m: Metrics) -> str:
     if m.ground_truth is None:
         return "unknown: no ground truth"
-    error = m.ground_truth.optimised
+    error = m.ground_truth.optimized
     share = "" if error.ate_share_of_path is None else f", {100.0 * error.ate_share_of_path:.3f} % of the path"
     return f"ATE {error.ate_rmse_m:.4f} m{share}"
 
@@ -94,24 +94,24 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
     gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
-    optimised, before = (_against(each, truth, gap_s) for each in (trajectory, odometry))
+    optimized, before = (_against(each, truth, gap_s) for each in (trajectory, odometry))
     nees = None if truth is None else nees_of_steps(steps, odometry, truth, gap_s=gap_s)
-    T_world_truth = lie.inverse(optimised.T_truth_way)
+    T_world_truth = lie.inverse(optimized.T_truth_way)
     courses = [
-        _course("optimised", 0, trajectory, lie.identity(3), optimised, steps, nees),
+        _course("optimized", 0, trajectory, lie.identity(3), optimized, steps, nees),
         _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, None),
     ]
     if metrics.ground_truth is not None:
         yield accuracy_section(metrics.ground_truth)
     is_planar = metrics.dimension == 2
-    way = None if truth is None else lie.transform(T_world_truth, optimised.truth)
+    way = None if truth is None else lie.transform(T_world_truth, optimized.truth)
     loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
     grain_m = float(str(config["maps.voxel_size_m"]))
     yield trajectory_section(courses[0], Told.read(steps, loops_file), way, points, grain_m)
     if config["loops.enabled"]:
         yield from loop_section(courses[0], loops_file, "Loop closures")
     text = (
-        "Odometry and truth are moved onto the optimised trajectory as for the ATE." if truth is not None else ""
+        "Odometry and truth are moved onto the optimized trajectory as for the ATE." if truth is not None else ""
     )
     yield way_section(courses, courses, way, is_planar=is_planar, text=text)
     if metrics.ground_truth is not None:
@@ -123,7 +123,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
 
 @dataclass(frozen=True, slots=True)
 class _Off:
-    """A way against the truth: how it was moved onto it, and (N,) metres off, NaN where nothing is known.
+    """A way against the truth: how it was moved onto it, and (N,) meters off, NaN where nothing is known.
 
     ``truth`` : (K, 3) true positions at the scans that have one; more would lengthen the path by their noise
     """
@@ -152,7 +152,7 @@ def _course(
     poses = T_world_way @ trajectory.poses
     return Course(
         name=name,
-        colour=colour_of(place),
+        color=color_of(place),
         is_dashed=False,
         positions=poses[:, :3, 3],
         distance_m=path_length(poses),

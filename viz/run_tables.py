@@ -19,7 +19,7 @@ def accuracy_section(truth: GroundTruth) -> Section:
             name, tuple(Cell(text, is_bad=bool(complaint) and k == 0) for k, text in enumerate(_figures(accuracy)))
         )
         for name, accuracy, complaint in (
-            ("optimised", truth.optimised, truth.complaint),
+            ("optimized", truth.optimized, truth.complaint),
             ("odometry", truth.odometry, ""),
         )
     )
@@ -27,11 +27,11 @@ def accuracy_section(truth: GroundTruth) -> Section:
         Head("way"), Head("ATE", "m", "rmse"), Head("ATE mean", "m"), Head("ATE max", "m"), Head("ATE/path", "%"),
         Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
     )  # fmt: skip
-    missing = f", {truth.optimised.missing}" if truth.optimised.missing else ""
+    missing = f", {truth.optimized.missing}" if truth.optimized.missing else ""
     text = (
-        f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimised.pairs, 'scan')}{missing}."
+        f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."
     )
-    return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimised.definition,)))
+    return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimized.definition,)))
 
 
 def stages_section(metrics: Metrics) -> Section:

@@ -1,4 +1,4 @@
-"""A small drawing that becomes an SVG inside a page and takes the page's colours, light or dark."""
+"""A small drawing that becomes an SVG inside a page and takes the page's colors, light or dark."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH = 4.6  # inches
-INK, LINE = "#010203", "#040506"  # stand for the page's own colours; nothing else is drawn in these
+INK, LINE = "#010203", "#040506"  # stand for the page's own colors; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
 _DPI = 140  # of what is drawn as pixels
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
@@ -88,6 +88,6 @@ class Sheet:
         text = text[text.index("<svg") :]
         text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
         text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-        for colour, variable in _VARIABLES.items():
-            text = text.replace(colour, variable)
+        for color, variable in _VARIABLES.items():
+            text = text.replace(color, variable)
         return Markup(text)

@@ -21,7 +21,7 @@ class Baseline(Protocol):
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """T_odom_lidar (4, 4) at the scan's stamp; the first is the identity.
 
-        points : (N, 3) metres, lidar frame; times_s : (N,) seconds relative to the stamp, (0,) where unknown
+        points : (N, 3) meters, lidar frame; times_s : (N,) seconds relative to the stamp, (0,) where unknown
         """
         ...
 

@@ -1,4 +1,4 @@
-"""small_gicp (Koide 2024) as a baseline: voxelised GICP to a map, and GICP from scan to scan."""
+"""small_gicp (Koide 2024) as a baseline: voxelized GICP to a map, and GICP from scan to scan."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class GicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     thinning_m: Positive = 0.25
     max_distance_m: Positive = 1.0
-    neighbours: Count = 20
+    neighbors: Count = 20
     threads: Annotated[int, Meta(ge=0)] = 0
 
 
@@ -36,7 +36,7 @@ class VgicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
     thinning_m: Positive = 0.25
     voxel_size_m: Positive = 1.0
     horizon: Count = 100
-    neighbours: Count = 20
+    neighbors: Count = 20
     threads: Annotated[int, Meta(ge=0)] = 0
 
 
@@ -73,13 +73,13 @@ class SmallGicpModel:
         cloud, _ = self.library.preprocess_points(
             frame,
             downsampling_resolution=self.settings.thinning_m,
-            num_neighbors=self.settings.neighbours,
+            num_neighbors=self.settings.neighbors,
             num_threads=self.threads,
         )
         if self.started:
             guess = self.T_odom_lidar @ self.T_previous_current
             answer = self.library.align(self.map, cloud, guess, num_threads=self.threads)
-            T_odom_lidar = lie.normalise(np.array(answer.T_target_source))
+            T_odom_lidar = lie.normalize(np.array(answer.T_target_source))
             self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
             self.T_odom_lidar = T_odom_lidar
         self.map.insert(cloud, self.T_odom_lidar)
@@ -113,7 +113,7 @@ class SmallGicpPairs:
         cloud, tree = self.library.preprocess_points(
             frame,
             downsampling_resolution=self.settings.thinning_m,
-            num_neighbors=self.settings.neighbours,
+            num_neighbors=self.settings.neighbors,
             num_threads=self.threads,
         )
         if self.previous is not None:
@@ -127,7 +127,7 @@ class SmallGicpPairs:
                 num_threads=self.threads,
             )
             self.T_previous_current = np.array(answer.T_target_source)
-            self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)
+            self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud, tree
         return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 

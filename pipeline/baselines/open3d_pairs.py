@@ -28,7 +28,7 @@ class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
     voxel_size_m: Positive = 0.5
     max_distance_m: Positive = 1.0
     normal_radius_m: Positive = 1.5
-    normal_neighbours: Count = 20
+    normal_neighbors: Count = 20
     max_iterations: Count = 30
 
 
@@ -74,7 +74,7 @@ class Open3dPairs:
                 self.criteria,
             )
             self.T_previous_current = np.array(answer.transformation)
-            self.T_odom_lidar = lie.normalise(self.T_odom_lidar @ self.T_previous_current)
+            self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud
         return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
 
@@ -84,7 +84,7 @@ class Open3dPairs:
         if self.residual != "point-to-point":
             cloud.estimate_normals(
                 self.open3d.geometry.KDTreeSearchParamHybrid(
-                    self.settings.normal_radius_m, self.settings.normal_neighbours
+                    self.settings.normal_radius_m, self.settings.normal_neighbors
                 )
             )
         return cloud

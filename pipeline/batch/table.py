@@ -27,7 +27,7 @@ _NUMBERS = (
     "closures_accepted",
     "degrees_of_freedom",
 )
-_FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "travelled_m", "chi2", "median_residual_m")
+_FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "traveled_m", "chi2", "median_residual_m")
 _ERRORS = ("ate_rmse_m", "ate_share_of_path", "kitti_translation_share", "kitti_rotation_rad_per_m")
 
 
@@ -51,7 +51,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
         "warnings": "lines in the run's metrics.json on what was lost, left out or is wrong",
         "run": "directory of the result, beside this file; empty where there is none",
         "duration_s, peak_mib": "of the whole process of the last try",
-        "ate_*, kitti_*": "against the ground truth in the log, after optimisation; null without any",
+        "ate_*, kitti_*": "against the ground truth in the log, after optimization; null without any",
     }
     table = pa.Table.from_pylist([_cells(row) for row in rows], schema=schema.with_metadata(notes))
     pq.write_table(table, folder / f"{TABLE_FILE}.new", compression="zstd")
@@ -89,12 +89,12 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     scans, degenerate, lost = (
         sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
     )
-    way = _distance(sum(each.travelled_m for each in results))
+    way = _distance(sum(each.traveled_m for each in results))
     time = _duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
     yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {way} and {time}"
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
-    errors_m = [each.ground_truth.optimised.ate_rmse_m for each in results if each.ground_truth is not None]
+    errors_m = [each.ground_truth.optimized.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:
         yield (
             "ATE",
@@ -126,6 +126,6 @@ def _cells(row: Row) -> dict[str, object]:
     cells |= {name: getattr(metrics, name) for name in (*_NUMBERS, *_FIGURES)}
     if metrics.ground_truth is not None:
         truth = metrics.ground_truth
-        cells |= {name: getattr(truth.optimised, name) for name in _ERRORS}
+        cells |= {name: getattr(truth.optimized, name) for name in _ERRORS}
         cells["odometry_ate_rmse_m"] = truth.odometry.ate_rmse_m
     return cells

@@ -43,7 +43,7 @@ _PATH = click.Path(path_type=Path)
     default="1pose,1s,10m,100m",
     show_default=True,
     metavar="LIST",
-    help="Stretches of the RPE: poses, seconds or metres, with commas.",
+    help="Stretches of the RPE: poses, seconds or meters, with commas.",
 )
 @click.option("--kitti", is_flag=True, help="Both files are KITTI's, 12 numbers a line; poses pair line by line.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from scanchain.graph.certificate import Certificate
     from scanchain.graph.g2o import G2oFile
     from scanchain.graph.observability import FreePose
-    from scanchain.graph.optimisation import GraphChange, Optimisation
+    from scanchain.graph.optimization import GraphChange, Optimization
 
 _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
@@ -27,15 +27,15 @@ class Answer:
 
     file: G2oFile
     change: GraphChange
-    optimisation: Optimisation
+    optimization: Optimization
     free: tuple[FreePose, ...]
     weak: NDArray[np.int64]
     certificate: Certificate
 
     def text(self, written: list[Path]) -> str:
         """A line for each fact."""
-        graph, done = self.file.graph, self.optimisation
-        guess = done.initialisation
+        graph, done = self.file.graph, self.optimization
+        guess = done.initialization
         if guess == "given":
             guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
         size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
@@ -87,13 +87,13 @@ class Answer:
     @property
     def _ending(self) -> str:
         """Why the iteration stopped."""
-        done = self.optimisation
+        done = self.optimization
         return done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
 
     @property
     def _chi2(self) -> str:
         """Of the edges in force before and after, with how many degrees of freedom."""
-        from scanchain.graph.optimisation import fit, has_loops
+        from scanchain.graph.optimization import fit, has_loops
 
         before, after = self.change.before, self.change.after
         first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"
@@ -104,7 +104,7 @@ class Answer:
 
     def json(self, written: list[Path]) -> str:
         """The same, and every rejected edge, by vertex ids."""
-        graph, done = self.file.graph, self.optimisation
+        graph, done = self.file.graph, self.optimization
         tree = {
             "warnings": self._warnings,
             "graph": self.change.name,
@@ -123,7 +123,7 @@ class Answer:
             "iterations": done.iterations,
             "converged": done.converged,
             "reason": done.reason,
-            "initialisation": done.initialisation,
+            "initialization": done.initialization,
             "time_s": done.time_s,
             "free": [asdict(pose) for pose in self.free],
             "weakly_joined": self.weak.tolist(),

@@ -16,7 +16,7 @@ from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.landmarks.dead_reckoning import OdometryNoise
-    from scanchain.landmarks.minimise import Optimiser
+    from scanchain.landmarks.minimize import Optimizer
     from scanchain.landmarks.study import Guess, Study
 
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     "--odometry-noise",
     "noise",
     metavar="FORWARD,SIDEWAYS,DRIFT,TURN",
-    help="Of an MRCLAM robot after a metre: m, m, rad; after a radian: rad. [default: estimated]",
+    help="Of an MRCLAM robot after a meter: m, m, rad; after a radian: rad. [default: estimated]",
 )
 @click.option(
     "--guess",
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     help="Where a nonlinear file begins: disturbed by 1 m and 0.5 rad, or with all landmarks at the origin.",
 )
 @click.option(
-    "--optimiser",
+    "--optimizer",
     type=click.Choice(["levenberg-marquardt", "gauss-newton", "dogleg", "gradient-descent"]),
     default="levenberg-marquardt",
     show_default=True,
@@ -79,7 +79,7 @@ def landmarks(
     robot: int,
     noise: str | None,
     guess: Guess,
-    optimiser: Optimiser,
+    optimizer: Optimizer,
     recording: Path | None,
     force: bool,
     as_json: bool,
@@ -98,7 +98,7 @@ def landmarks(
       scanchain landmarks 2d_linear.npz --out runs/linear
       scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --methods all --out runs/solvers
       scanchain landmarks 2d_nonlinear.npz --guess origin --methods cholesky,schur --out runs/nonlinear
-      scanchain landmarks 2d_nonlinear.npz --optimiser dogleg --out runs/dogleg --recording dogleg.rrd
+      scanchain landmarks 2d_nonlinear.npz --optimizer dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
     from scanchain.commands.outputs import check_output
@@ -113,7 +113,7 @@ def landmarks(
     from scanchain.runs.directory import RunDirectory
     from scanchain.viz.landmark_report import write_report
 
-    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimiser)
+    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimizer)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
     _check_options(ctx, {"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
@@ -143,7 +143,7 @@ _ALONE = {  # options that only some problems take
     "robot": ("--robot", *_OF_LOGS),
     "noise": ("--odometry-noise", *_OF_LOGS),
     "guess": ("--guess", *_OF_NONLINEAR),
-    "optimiser": ("--optimiser", *_OF_NONLINEAR),
+    "optimizer": ("--optimizer", *_OF_NONLINEAR),
 }
 
 

@@ -20,7 +20,7 @@ from scanchain.settings import Override, load_settings
 if TYPE_CHECKING:
     from scanchain.config import GraphConfig
     from scanchain.graph.g2o import G2oFile, Indefinite
-    from scanchain.graph.initialise import Initialisation
+    from scanchain.graph.initialize import Initialization
 
 _PATH = click.Path(path_type=Path)
 _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
@@ -29,11 +29,11 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
 @click.argument("source", metavar="GRAPH.g2o", type=_PATH)
 @click.option(
-    "--out", metavar="FILE", type=_PATH, help="Write the optimised graph: .g2o, or TORO's .graph or .toro."
+    "--out", metavar="FILE", type=_PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
-@click.option("--optimiser", metavar="NAME", help="Short for --graph.optimiser.")
+@click.option("--optimizer", metavar="NAME", help="Short for --graph.optimizer.")
 @click.option(
-    "--initialise",
+    "--initialize",
     type=click.Choice(_WAYS),
     default="auto",
     show_default=True,
@@ -65,7 +65,7 @@ def optimize(
     ctx: click.Context,
     source: Path,
     out: Path | None,
-    initialise: str,
+    initialize: str,
     indefinite: str,
     marginals: str | None,
     png: Path | None,
@@ -74,7 +74,7 @@ def optimize(
     as_json: bool,
     **shortcuts: str | None,
 ) -> None:
-    """Optimise a pose graph and say whether the minimum is the global one.
+    """Optimize a pose graph and say whether the minimum is the global one.
 
     GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
     below. Edges that --robust rejects count in no χ²: --out FILE.g2o holds the edges in force, each with its
@@ -83,10 +83,10 @@ def optimize(
 
     \b
     Examples:
-      scanchain optimize sphere2500.g2o --out optimised.g2o
+      scanchain optimize sphere2500.g2o --out optimized.g2o
       scanchain optimize sphere2500.g2o --png sphere.png --json
       scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
-      scanchain optimize manhattan.g2o --initialise spanning-tree --optimiser dogleg --graph.max_iterations 100
+      scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer dogleg --graph.max_iterations 100
     """
     outputs = Outputs(out, marginals, png, recording)
     outputs.check(force)
@@ -94,10 +94,10 @@ def optimize(
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     file = _read(source, cast("Indefinite", indefinite), is_suspicious)
-    answer = _solved(file, source.name, config, cast("Initialisation", initialise))
+    answer = _solved(file, source.name, config, cast("Initialization", initialize))
     written = outputs.write(answer)
     click.echo(answer.json(written) if as_json else answer.text(written))
-    if not answer.optimisation.converged:
+    if not answer.optimization.converged:
         ctx.exit(1)
 
 
@@ -207,12 +207,12 @@ def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
     return file
 
 
-def _solved(file: G2oFile, name: str, config: GraphConfig, initialise: Initialisation) -> Answer:
-    """Optimise and certify."""
-    from scanchain.graph.optimisation import GraphChange
+def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initialization) -> Answer:
+    """Optimize and certify."""
+    from scanchain.graph.optimization import GraphChange
 
     before = file.graph.state()
-    done = file.graph.optimise(config, initialise=initialise)
+    done = file.graph.optimize(config, initialize=initialize)
     change = GraphChange(name, before, done.state)
     free, weak = file.graph.free_poses(), file.graph.weakly_joined()
     return Answer(file, change, done, free, weak, file.graph.certify())

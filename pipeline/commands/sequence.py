@@ -1,4 +1,4 @@
-"""``scanchain sequence``: the catalogue of logs."""
+"""``scanchain sequence``: the catalog of logs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sequence() -> None:
 @sequence.command("list", cls=OnceCommand)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_sequences(as_json: bool) -> None:
-    """List the catalogue.
+    """List the catalog.
 
     \b
     Examples:
@@ -33,9 +33,9 @@ def list_sequences(as_json: bool) -> None:
     """
     from msgspec import to_builtins
 
-    from scanchain import catalogue
+    from scanchain import catalog
 
-    entries = {name: catalogue.load(name) for name in catalogue.names()}
+    entries = {name: catalog.load(name) for name in catalog.names()}
     if as_json:
         click.echo(json.dumps({name: to_builtins(entry) for name, entry in entries.items()}, indent=2))
         return
@@ -58,7 +58,7 @@ def list_sequences(as_json: bool) -> None:
 @click.option("--force", is_flag=True, help="Make it again even if it is there.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
-    """Make a log of the catalogue, or fetch and convert it, unless it is there, and print where it lies.
+    """Make a log of the catalog, or fetch and convert it, unless it is there, and print where it lies.
 
     A download that was broken off goes on where it was. Of recordings that ask for an account it says what to do.
 
@@ -68,10 +68,10 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
       scanchain sequence get demo-town --out logs --force
       scanchain sequence get intel
     """
-    from scanchain import catalogue
+    from scanchain import catalog
     from scanchain.commands.terminal import Terminal
 
-    unit = "MiB" if isinstance(catalogue.load(name).source, catalogue.Download) else "scans"
+    unit = "MiB" if isinstance(catalog.load(name).source, catalog.Download) else "scans"
     with Terminal(unit) as terminal:
-        path = catalogue.prepare(name, out, force=force, progress=terminal.count)
+        path = catalog.prepare(name, out, force=force, progress=terminal.count)
     click.echo(json.dumps({"name": name, "path": str(path)}) if as_json else path)

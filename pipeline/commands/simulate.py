@@ -18,7 +18,7 @@ from scanchain.words import counted
 @click.option("--duration", type=float, metavar="SECONDS", help="How long to drive. [default: the world's]")
 @click.option("--sensor", metavar="NAME", help="lms-270, utm-30, hdl-64, os1-32, vlp-16, rosette.")
 @click.option("--drift", default=1.0, show_default=True, metavar="FACTOR", help="Errors of the wheel odometry.")
-@click.option("--noise", type=float, metavar="METRES", help="Standard deviation of a range.")
+@click.option("--noise", type=float, metavar="METERS", help="Standard deviation of a range.")
 @click.option("--dropout", type=float, metavar="SHARE", help="Share of returns that are lost.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
@@ -44,7 +44,7 @@ def simulate(
       corridor   80 m between bare walls: along it nothing is seen but at its ends
       field      flat, a few poles far apart: between them nothing is seen but the ground
       forest     trunks and crowns on rough ground
-      staircase  four storeys, walked with the lidar in the hand
+      staircase  four storys, walked with the lidar in the hand
       hall       flat floor, few pillars, from standstill to 5 m/s
       turns      turns on the spot at 120 deg/s and short moves in a yard
       gap        the town, but one second of scans is missing in a bend, and one on a straight

@@ -104,7 +104,7 @@ COLUMNS = (
         4,
         "low",
         "accuracy",
-        "mean turn per metre over the same",
+        "mean turn per meter over the same",
     ),
     Column(
         "paired_share",
@@ -163,9 +163,9 @@ COLUMNS = (
     ),
     Column("match_s", "match", "ms", 1e3, 2, "", "time", "median of matching"),
     Column("map_s", "map", "ms", 1e3, 2, "", "time", "median of extending the local map"),
-    Column("loops_s", "loops", "ms", 1e3, 2, "", "time", "mean of keyframes, loop closures and optimisations"),
+    Column("loops_s", "loops", "ms", 1e3, 2, "", "time", "mean of keyframes, loop closures and optimizations"),
     Column("start_s", "start", "s", 1.0, 1, "", "time", "import, loading what is compiled, warming up"),
-    Column("finish_s", "finish", "s", 1.0, 2, "", "time", "after the last scan: optimisation, tables"),
+    Column("finish_s", "finish", "s", 1.0, 2, "", "time", "after the last scan: optimization, tables"),
     Column(
         "peak_mib",
         "memory",

@@ -18,7 +18,7 @@ from scanchain.comparison.maps import maps_of
 from scanchain.comparison.methods import default_names, resolve
 from scanchain.comparison.race import limits_for, race
 from scanchain.comparison.scan_store import StoredScans, store
-from scanchain.comparison.summary import summarise
+from scanchain.comparison.summary import summarize
 from scanchain.comparison.table import Table, write_table
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
@@ -111,7 +111,7 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
             provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=perf_counter() - began
         )
         provenance.write(directory.path / RUN_FILE)
-        table = summarise(evidence, log, limits, provenance)
+        table = summarize(evidence, log, limits, provenance)
         write_table(directory.path, table)
         present(directory.path)
         directory.complete()

@@ -63,7 +63,7 @@ class OurChain:
     """With loop closures and pose graph."""
 
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
-        self.description = f"{_description(config)}; loops closed, pose graph optimised at the end"
+        self.description = f"{_description(config)}; loops closed, pose graph optimized at the end"
         self.slam = Slam(config, T_base_lidar)
         self.steps = StepTable()
 
@@ -85,7 +85,7 @@ class OurChain:
 def _description(config: Config) -> str:
     wheels = "wheels where the log has them" if config.odometry.prior != "constant-velocity" else "no wheels"
     deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
-    steps = f" by {config.matching.optimiser}" if config.matching.matcher == "plicp" else ""
+    steps = f" by {config.matching.optimizer}" if config.matching.matcher == "plicp" else ""
     size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
     return (
         f"ours, {config.matching.matcher}{steps}, scan to map, voxels of {size_m} m, "

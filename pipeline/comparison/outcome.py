@@ -40,7 +40,7 @@ class EndReport(Struct, frozen=True):
     status, reason : how it ended; the reason is empty where all went well
     description : what the method does, with its settings
     start_s : import, loading what is compiled, and a throwaway instance on the first scans
-    finish_s : after the last scan, as for the last optimisation
+    finish_s : after the last scan, as for the last optimization
     peak_mib : of its resident memory, interpreter and packages included
     has_compiled : whether kernels were compiled in between, so that its times say nothing
     """

@@ -20,7 +20,7 @@ _NOTES = {
     "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
     "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
-    "distance_m": "travelled up to the scan, by the method itself",
+    "distance_m": "traveled up to the scan, by the method itself",
     "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
     "nees": "of the motion up to the scan; null where the method does not tell its covariance",
 }
@@ -81,13 +81,13 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
     aligned = (run.judged.T_reference_estimate @ poses)[:, :3, 3]
     known = observability(run.outcome)
     known = known[:count] if len(known) else np.full(count, np.nan)
-    travelled_m = path_length(poses) if count else np.empty(0)
+    traveled_m = path_length(poses) if count else np.empty(0)
     numbers = {
         "seconds": run.outcome.seconds[:count],
         "cpu_seconds": run.outcome.cpu_seconds[:count],
         **pose_columns(poses),
         **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
-        "distance_m": travelled_m,
+        "distance_m": traveled_m,
         "error_m": run.judged.errors_m[:count],
         "error_rad": run.judged.errors_rad[:count],
         "nees": run.judged.nees[:count],

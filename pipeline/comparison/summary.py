@@ -19,7 +19,7 @@ from scanchain.runs.provenance import Provenance, package_version
 from scanchain.watched import Limits
 
 
-def summarise(evidence: Evidence, log: Log, limits: Limits, provenance: Provenance) -> Table:
+def summarize(evidence: Evidence, log: Log, limits: Limits, provenance: Provenance) -> Table:
     """Every method's row, with what only all of them together tell: sharpness and disagreement."""
     scans, sharp = evidence.scans, sharpness_of(evidence.maps)
     finals = [representative(evidence.outcomes[method.name]).trajectory.poses for method in evidence.methods]

@@ -103,7 +103,7 @@ def on_the_estimate(estimate: Trajectory, reference: Trajectory, *, gap_s: float
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
-    """The estimate (N, 4, 4) turned by the one rotation R that minimises Σ ‖R_ref − R R_est‖² (Umeyama 1991).
+    """The estimate (N, 4, 4) turned by the one rotation R that minimizes Σ ‖R_ref − R R_est‖² (Umeyama 1991).
 
     Positions alone leave the roll about a straight course to the noise; a rotation error must not inherit that.
     """
@@ -114,6 +114,6 @@ def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
 
 
 def path_length(poses: Matrix) -> NDArray[np.float64]:
-    """(N,) metres travelled up to each pose."""
+    """(N,) meters traveled up to each pose."""
     steps_m = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps_m))

@@ -11,7 +11,7 @@ from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.matching.svd import DegeneratePairsError, rigid_transform
 
-_PLANAR = 1e-9  # metres of height and radians of tilt below which poses count as planar
+_PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 
 
 class Alignment(StrEnum):

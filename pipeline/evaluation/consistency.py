@@ -1,4 +1,4 @@
-"""Whether an odometry's covariances say how far off it is: the normalised squared error of its motions."""
+"""Whether an odometry's covariances say how far off it is: the normalized squared error of its motions."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from scanchain.data import Matrix
 
 
 def disagreement(trajectories: Sequence[Matrix]) -> NDArray[np.float64]:
-    """(M, M) metres: median over the scans of the distance between the motions that two methods find for a scan.
+    """(M, M) meters: median over the scans of the distance between the motions that two methods find for a scan.
 
     trajectories : M times poses (N, d+1, d+1) of the same scans, (0, d+1, d+1) of a method that has failed
     NaN where one of the two has failed.

@@ -1,4 +1,4 @@
-"""The KITTI odometry metric: drift per metre over stretches of several lengths."""
+"""The KITTI odometry metric: drift per meter over stretches of several lengths."""
 
 from __future__ import annotations
 
@@ -68,17 +68,17 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     """
     if every < 1 or not lengths_m or min(lengths_m) <= 0.0:
         raise InputError(f"lengths {list(lengths_m)} m from every {every} poses: take positive ones")
-    travelled_m = path_length(pairs.reference)
+    traveled_m = path_length(pairs.reference)
     by_length, shares, turns = [], [], []
     for length_m in lengths_m:
-        share, turn = _drift(pairs, travelled_m, length_m, every)
+        share, turn = _drift(pairs, traveled_m, length_m, every)
         shares.append(share)
         turns.append(turn)
         by_length.append(LengthError(length_m, len(share), _mean(share), _mean(turn)))
     share, turn = np.concatenate(shares), np.concatenate(turns)
     if not len(share):
         raise InputError(
-            f"no stretch of {min(lengths_m):g} m fits into a path of {travelled_m[-1]:.1f} m; take shorter lengths"
+            f"no stretch of {min(lengths_m):g} m fits into a path of {traveled_m[-1]:.1f} m; take shorter lengths"
         )
     starts = "pose" if every == 1 else f"{every}th pose"
     lengths = ", ".join(f"{length_m:g}" for length_m in lengths_m)
@@ -103,11 +103,11 @@ def kitti_error_on_any_course(pairs: Pairs) -> KittiError:
 
 
 def _drift(
-    pairs: Pairs, travelled_m: NDArray[np.float64], length_m: float, every: int
+    pairs: Pairs, traveled_m: NDArray[np.float64], length_m: float, every: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Translational share and rad/m of every stretch of a length."""
     start = np.arange(0, len(pairs), every)
-    end = np.searchsorted(travelled_m, travelled_m[start] + length_m, side="right")
+    end = np.searchsorted(traveled_m, traveled_m[start] + length_m, side="right")
     fits = end < len(pairs)
     error = motion_errors(pairs, np.stack([start[fits], end[fits]], axis=1))
     return np.linalg.norm(error[:, :3, 3], axis=1) / length_m, lie.rotation_angle(error) / length_m

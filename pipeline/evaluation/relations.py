@@ -58,7 +58,7 @@ class RelationError:
 
     @property
     def summary(self) -> str:
-        """The figures as published: mean ± std, absolute and squared, metres and degrees."""
+        """The figures as published: mean ± std, absolute and squared, meters and degrees."""
         degrees = np.degrees(1.0)
         rotation, squared = self.rotation_rad.scaled(degrees), self.rotation_squared_rad2.scaled(degrees**2)
         return (

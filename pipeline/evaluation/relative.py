@@ -63,8 +63,8 @@ def relative_error_over_distance(pairs: Pairs, distance_m: float) -> RelativeErr
     """RPE from each pair to the first that lies at least ``distance_m`` further along the reference's path."""
     if not distance_m > 0.0:
         raise InputError(f"RPE over {distance_m:g} m is not defined; take more than 0")
-    travelled_m = path_length(pairs.reference)
-    end = _of_that_size(travelled_m, first_after(travelled_m, distance_m), distance_m)
+    traveled_m = path_length(pairs.reference)
+    end = _of_that_size(traveled_m, first_after(traveled_m, distance_m), distance_m)
     return _relative_error(pairs, end, f"{distance_m:g} m along the reference")
 
 
@@ -80,9 +80,9 @@ def relative_error_over_time(pairs: Pairs, duration_s: float) -> RelativeError:
     return _relative_error(pairs, end, f"{duration_s:g} s")
 
 
-def first_after(travelled_m: NDArray[np.float64], distance_m: float) -> NDArray[np.int64]:
+def first_after(traveled_m: NDArray[np.float64], distance_m: float) -> NDArray[np.int64]:
     """(N,) index of the first pose at least ``distance_m`` further along, N where there is none."""
-    return np.searchsorted(travelled_m, travelled_m + distance_m, side="left")
+    return np.searchsorted(traveled_m, traveled_m + distance_m, side="left")
 
 
 def _of_that_size(

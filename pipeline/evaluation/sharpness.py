@@ -1,13 +1,13 @@
 """How sharp the map is that a trajectory makes of a log, where there is no ground truth (Razlaw et al. 2015).
 
 The same points of the same scans are put where a trajectory has the lidar at their instants (between two stamps
-along the screw that joins the poses). Around the same query points, all neighbours within a radius make a
+along the screw that joins the poses). Around the same query points, all neighbors within a radius make a
 covariance Σ (d, d) with smallest eigenvalue λ₁, and over the query points q
 
     mean map entropy       1/Q Σ_q ½ ln det(2πe Σ(q))     in nats for Σ in m²
-    surface thickness      √(1/Q Σ_q λ₁(q))               in metres, the root of the mean variance across it
+    surface thickness      √(1/Q Σ_q λ₁(q))               in meters, the root of the mean variance across it
 
-A query point counts if in the map of every trajectory it has 10 neighbours at least and a covariance that is not
+A query point counts if in the map of every trajectory it has 10 neighbors at least and a covariance that is not
 flat by accident (λ₁ > 0). Lower is sharper. Moving objects blur all maps alike. It is not ground truth: a map that
 is bent but sharp scores well.
 """
@@ -26,7 +26,7 @@ from scanchain.data import Points, Scan, Trajectory
 
 RADIUS_M = {2: 0.2, 3: 0.5}
 REACH_M = 40.0  # points further off are too sparse to judge by
-MIN_NEIGHBOURS = 10
+MIN_NEIGHBORS = 10
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000
 _HELD = 0.5  # share of the query points of the best map, below which a map has fallen apart
 
@@ -94,12 +94,12 @@ def _deskewed(scan: Scan, step: int, before: NDArray[np.float64], after: NDArray
 
 
 def _eigenvalues(points: Points) -> NDArray[np.float64]:
-    """(Q, d) ascending, m², of the covariance around every query point; NaN where there are too few neighbours."""
+    """(Q, d) ascending, m², of the covariance around every query point; NaN where there are too few neighbors."""
     d = points.shape[1]
     queries = points[:: max(1, len(points) // MAX_QUERIES)]
-    neighbours = KDTree(points).query_ball_point(queries, RADIUS_M[d], return_sorted=False)
+    neighbors = KDTree(points).query_ball_point(queries, RADIUS_M[d], return_sorted=False)
     result = np.full((len(queries), d), np.nan)
-    for row, chosen in enumerate(neighbours):
-        if len(chosen) >= MIN_NEIGHBOURS:
+    for row, chosen in enumerate(neighbors):
+        if len(chosen) >= MIN_NEIGHBORS:
             result[row] = np.linalg.eigvalsh(np.cov(points[chosen].T))
     return result

@@ -1,1 +1,1 @@
-"""Pose graphs: factors, optimisers, linear solvers, g2o."""
+"""Pose graphs: factors, optimizers, linear solvers, g2o."""

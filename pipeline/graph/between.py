@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyse
+from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.kernels import graph_between_se2, graph_between_se3, graph_scatter
 
 
@@ -68,7 +68,7 @@ class BetweenProblem:
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
-        self.cholesky = SparseCholesky(self.pattern, analyse(self.pattern))
+        self.cholesky = SparseCholesky(self.pattern, analyze(self.pattern))
 
     def restricted(self, kept: NDArray[np.bool_]) -> BetweenProblem:
         """The problem of the same poses with some of its edges, kept (E,)."""
@@ -96,7 +96,7 @@ class BetweenProblem:
         """∂e/∂ξ_j (E, k, k); ∂e/∂ξ_i is its negative."""
         return self._jacobians(poses, self.edges, errors)
 
-    def linearise(self, poses: Matrix, errors: Matrix, weights: NDArray[np.float64]) -> NormalEquations:
+    def linearize(self, poses: Matrix, errors: Matrix, weights: NDArray[np.float64]) -> NormalEquations:
         """Normal equations at these poses, with these residuals and robust weights (E,)."""
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))

@@ -11,7 +11,7 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
-from scanchain.graph.minorant import Minorants, minorise
+from scanchain.graph.minorant import Minorants, minorize
 from scanchain.graph.soundness import is_connected
 from scanchain.kernels.graph_dual import scatter_dual
 from scanchain.words import counted
@@ -66,11 +66,11 @@ def certify(
     """Bound the global minimum of Σ w eᵀΩe from below, with the weights w (E,) as they stand and any Ω.
 
     Every edge's χ² is replaced by a quadratic function of rotations and positions that is nowhere above it and
-    touches it at these poses (``minorise``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et
+    touches it at these poses (``minorize``). The Lagrangian dual of that problem (Carlone et al. 2015; Rosen et
     al. 2019, theorem 1) bounds it in turn: if S, with the gauge fixed, is positive definite, then for all poses
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
-    factorisation goes through, so the claim holds to the rounding of that. A few edges too far from their
+    factorization goes through, so the claim holds to the rounding of that. A few edges too far from their
     measurements for such a function are bounded by zero instead: their χ² is part of the gap. What leaves
     poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,) are what the poses are called.
     """
@@ -86,9 +86,9 @@ def certify(
     if len(poses) - len(problem.free) > 1:
         reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
-    centred = poses.copy()
-    centred[:, :-1, -1] -= centred[:, :-1, -1].mean(axis=0)
-    minorants = minorise(problem, centred, weights)
+    centered = poses.copy()
+    centered[:, :-1, -1] -= centered[:, :-1, -1].mean(axis=0)
+    minorants = minorize(problem, centered, weights)
     loose = kept & np.isnan(minorants.kappa)
     given_up = float(of_edges[loose].sum())
     rest = problem.edges[kept & ~loose]
@@ -127,7 +127,7 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
         shifted = blocks.copy()
         shifted[:n] += shift * rotation
         try:
-            factor.factorise(packing.values(shifted))
+            factor.factorize(packing.values(shifted))
         except SingularMatrixError:
             continue
         right = packing.rows(residual + shift * rotation[:, :d])

@@ -1,4 +1,4 @@
-"""Sparse Cholesky factorisation of a symmetric matrix of blocks; ordering and structure are found once."""
+"""Sparse Cholesky factorization of a symmetric matrix of blocks; ordering and structure are found once."""
 
 from __future__ import annotations
 
@@ -102,19 +102,19 @@ class Analysis:
     rows: NDArray[np.int64]
 
 
-def analyse(pattern: BlockPattern) -> Analysis:
+def analyze(pattern: BlockPattern) -> Analysis:
     """Fill-reducing order of the variables, and where the factor fills in; the same for blocks of any size."""
-    start, neighbours = _adjacency(pattern)
-    order = _fill_reducing_order(start, neighbours)
-    order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))]
-    parent = graph_symbolic.elimination_tree(start, neighbours, order)
-    return Analysis(order, parent, *graph_symbolic.column_structures(start, neighbours, order, parent))
+    start, neighbors = _adjacency(pattern)
+    order = _fill_reducing_order(start, neighbors)
+    order = order[graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbors, order))]
+    parent = graph_symbolic.elimination_tree(start, neighbors, order)
+    return Analysis(order, parent, *graph_symbolic.column_structures(start, neighbors, order, parent))
 
 
 class SparseCholesky:
     """The factor A = Uᵀ U of a block-sparse matrix; the fill-reducing ordering and the symbolic analysis are kept.
 
-    ``factorise`` may be called any number of times with new values of the same pattern.
+    ``factorize`` may be called any number of times with new values of the same pattern.
     """
 
     def __init__(self, pattern: BlockPattern, analysis: Analysis) -> None:
@@ -142,10 +142,10 @@ class SparseCholesky:
         pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
         return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
 
-    def factorise(self, values: NDArray[np.float64]) -> None:
+    def factorize(self, values: NDArray[np.float64]) -> None:
         """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
         self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
-        failed = graph_cholesky.factorise(
+        failed = graph_cholesky.factorize(
             self._fronts, self._blocks, values, self._floor, self._factor, self._stack, self._work
         )
         if failed >= 0:
@@ -171,24 +171,24 @@ class SparseCholesky:
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Neighbour lists of the variables, without themselves: (start (n + 1,), neighbours)."""
+    """Neighbor lists of the variables, without themselves: (start (n + 1,), neighbors)."""
     both = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]])
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     start = np.searchsorted(both[:, 0], np.arange(len(pattern.sizes) + 1))
     return start.astype(np.int64), np.ascontiguousarray(both[:, 1])
 
 
-def _fill_reducing_order(start: NDArray[np.int64], neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64]) -> NDArray[np.int64]:
     """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as SuperLU has it.
 
-    An incomplete factorisation that drops every entry hands the ordering out without the work of a full one.
+    An incomplete factorization that drops every entry hands the ordering out without the work of a full one.
     """
     n = len(start) - 1
     if n < 2:
         return np.arange(n)
     rows = np.concatenate([np.repeat(np.arange(n), np.diff(start)), np.arange(n)])
-    columns = np.concatenate([neighbours, np.arange(n)])
-    weights = np.concatenate([np.full(len(neighbours), -1.0), np.diff(start) + 1.0])
+    columns = np.concatenate([neighbors, np.arange(n)])
+    weights = np.concatenate([np.full(len(neighbors), -1.0), np.diff(start) + 1.0])
     matrix = coo_matrix((weights, (rows, columns)), shape=(n, n)).tocsc()
     factor = spilu(
         matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}

@@ -13,8 +13,8 @@ from scanchain.graph.cholesky import BlockPattern, SparseCholesky
 def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
     """Poses (K, d+1, d+1) from two linear least-squares problems (Martinec & Pajdla 2007; Carlone et al. 2015).
 
-    Rotations: minimise Σ κ ‖R_j − R_i R_z‖² over any matrices, then take the nearest rotation of each.
-    Translations: minimise Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the mean rotational and translational
+    Rotations: minimize Σ κ ‖R_j − R_i R_z‖² over any matrices, then take the nearest rotation of each.
+    Translations: minimize Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the mean rotational and translational
     information of the edge. The problem's fixed poses stay where ``poses`` has them.
     """
     d = poses.shape[-1] - 1
@@ -35,7 +35,7 @@ def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
 def _least_squares(
     problem: BetweenProblem, A: Matrix, weight: NDArray[np.float64], offset: Matrix, known: Matrix
 ) -> Matrix:
-    """X (K, b, m) that minimises Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed."""
+    """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed."""
     size, columns = known.shape[1:]
     n = len(problem.free)
     blocks = np.zeros((n + len(problem.pattern.pairs), size, size))
@@ -56,7 +56,7 @@ def _least_squares(
     blocks[:n] = degree[:, None, None] * np.eye(size)
     pattern = BlockPattern(np.full(n, size, np.int64), problem.pattern.pairs)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
-    factor.factorise(blocks.reshape(-1))
+    factor.factorize(blocks.reshape(-1))
     result = known.copy()
     result[problem.free] = factor.solve(right.reshape(-1, columns)).reshape(-1, size, columns)
     return result

@@ -12,7 +12,7 @@ from scanchain.words import counted
 
 
 class Landscape(Protocol[E]):
-    """A cost to minimise."""
+    """A cost to minimize."""
 
     def model(self, now: E) -> LocalModel:
         """Its quadratic model there."""
@@ -25,7 +25,7 @@ class Landscape(Protocol[E]):
 
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[E]):
-    """Where a minimisation ended, after how many steps, and why."""
+    """Where a minimization ended, after how many steps, and why."""
 
     end: E
     iterations: int

@@ -1,4 +1,4 @@
-"""Where a minimisation is, and where it ended."""
+"""Where a minimization is, and where it ended."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a minimisation ended, with what robust weights (E,), after how many linear solves, and why."""
+    """Where a minimization ended, with what robust weights (E,), after how many linear solves, and why."""
 
     estimate: Estimate
     weights: NDArray[np.float64]

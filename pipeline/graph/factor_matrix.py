@@ -1,4 +1,4 @@
-"""The factor of a sparse Cholesky factorisation as a matrix, for those who draw it or invert parts of it."""
+"""The factor of a sparse Cholesky factorization as a matrix, for those who draw it or invert parts of it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scanchain.kernels.graph_fronts import Fronts
 
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
-    """U of the last factorisation, A = Uᵀ U, in the order of elimination; zeros kept where it may fill in."""
+    """U of the last factorization, A = Uᵀ U, in the order of elimination; zeros kept where it may fill in."""
     return front_rows(cholesky._fronts, cholesky._factor)
 
 

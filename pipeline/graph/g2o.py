@@ -15,7 +15,7 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
-from scanchain.graph.initialise import follow_odometry
+from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.soundness import nearest_semidefinite, positive_semidefinite
 
@@ -226,7 +226,7 @@ def _measurements(path: Path, rows: Rows, dimension: int) -> tuple[Matrix, Matri
 
 
 def _poses(path: Path, rows: Rows, numbers: Matrix) -> Matrix:
-    """Poses of rows x y θ, or x y z qx qy qz qw; quaternions are normalised."""
+    """Poses of rows x y θ, or x y z qx qy qz qw; quaternions are normalized."""
     d = 2 if numbers.shape[1] == 3 else 3
     result = np.tile(lie.identity(d), (len(numbers), 1, 1))
     result[:, :d, d] = numbers[:, :d]

@@ -136,7 +136,7 @@ def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, r
         if abs(value) > LARGEST:
             raise InputError(
                 f"{path}:{number}: {' '.join(words[: 1 + ids])} has the value {value:g}, over {LARGEST:g}; "
-                "write metres and radians, and an inverse covariance of these"
+                "write meters and radians, and an inverse covariance of these"
             )
     rows.numbers.append(values)
     rows.lines.append(number)

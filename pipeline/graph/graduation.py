@@ -1,4 +1,4 @@
-"""Robust minimisation: from a convex loss to the loss itself, then verdicts that the other edges bear out."""
+"""Robust minimization: from a convex loss to the loss itself, then verdicts that the other edges bear out."""
 
 from __future__ import annotations
 
@@ -10,72 +10,72 @@ from numpy.typing import NDArray
 
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.estimate import Estimate, Minimum
-from scanchain.graph.optimiser import Minimiser
+from scanchain.graph.optimizer import Minimizer
 from scanchain.graph.robust import GRADUATED, RobustLoss, rejection_limit
 from scanchain.graph.soundness import is_connected
 from scanchain.graph.verdicts import Verdicts, contradictions, fair_price
 
-Judgement = Literal["graduated", "mended"]
+Judgment = Literal["graduated", "mended"]
 
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _MOST_ROUNDS = 50  # of mending verdicts
 _FEWER, _FEWEST = 0.3, 1e-3  # after changes that do not help, of those that promise the most
 
 
-def minimise(
-    minimiser: Minimiser,
+def minimize(
+    minimizer: Minimizer,
     poses: Matrix,
     loss: RobustLoss,
     max_iterations: int,
     tolerance: float,
-    judgement: Judgement,
+    judgment: Judgment,
 ) -> Minimum:
-    """Minimise from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
+    """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    judgement : of truncated edges: as the graduation leaves them, or mended by what the other edges bear out
+    judgment : of truncated edges: as the graduation leaves them, or mended by what the other edges bear out
     """
-    now, used = minimiser.evaluate(poses, loss), 0
-    if loss.kernel in GRADUATED and len(minimiser.loops):
-        now, loss, used = _graduate(minimiser, now, loss)
-    if judgement == "mended" and loss.kernel == "truncated" and len(minimiser.loops):
-        minimum = _judge(minimiser, now, loss, max_iterations, tolerance)
+    now, used = minimizer.evaluate(poses, loss), 0
+    if loss.kernel in GRADUATED and len(minimizer.loops):
+        now, loss, used = _graduate(minimizer, now, loss)
+    if judgment == "mended" and loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _judge(minimizer, now, loss, max_iterations, tolerance)
     else:
-        minimum = minimiser.descend(now, loss, max_iterations, tolerance)
+        minimum = minimizer.descend(now, loss, max_iterations, tolerance)
         if loss.kernel not in ("none", "truncated"):
-            minimum = _settle_without_outliers(minimiser, minimum, loss, max_iterations, tolerance)
+            minimum = _settle_without_outliers(minimizer, minimum, loss, max_iterations, tolerance)
     return replace(minimum, iterations=used + minimum.iterations)
 
 
-def _graduate(minimiser: Minimiser, now: Estimate, loss: RobustLoss) -> tuple[Estimate, RobustLoss, int]:
+def _graduate(minimizer: Minimizer, now: Estimate, loss: RobustLoss) -> tuple[Estimate, RobustLoss, int]:
     """Follow the minimum from the convex loss to the loss itself, one step for each level."""
-    used, focus = 0, _Focus(minimiser)
-    loss = loss.started(now.chi2[minimiser.loops])
-    while not loss.settled(now.chi2[minimiser.loops]):
-        chosen = focus.on(minimiser.weights(now.chi2, loss))
+    used, focus = 0, _Focus(minimizer)
+    loss = loss.started(now.chi2[minimizer.loops])
+    while not loss.settled(now.chi2[minimizer.loops]):
+        chosen = focus.on(minimizer.weights(now.chi2, loss))
         minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, 1, 0.0)
-        now, used = minimiser.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
+        now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
         loss = loss.tightened()
-    return minimiser.reweighed(now, loss), loss, used
+    return minimizer.reweighed(now, loss), loss, used
 
 
 def _settle_without_outliers(
-    minimiser: Minimiser, minimum: Minimum, loss: RobustLoss, max_iterations: int, tolerance: float
+    minimizer: Minimizer, minimum: Minimum, loss: RobustLoss, max_iterations: int, tolerance: float
 ) -> Minimum:
     """The minimum without the edges that this one shows to be false, whose weight becomes 0.
 
     A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
     """
-    problem, limit = minimiser.problem, rejection_limit(loss.scale, minimiser.problem.freedom)
-    rejected = minimiser.is_loop & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
+    problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom)
+    rejected = minimizer.is_loop & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
     if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
         return minimum
-    rest = minimiser.restricted(~rejected)
+    rest = minimizer.restricted(~rejected)
     settled = rest.descend(rest.evaluate(minimum.estimate.poses, loss), loss, max_iterations, tolerance)
     weights = np.zeros(len(rejected))
     weights[~rejected] = settled.weights
     return replace(
         settled,
-        estimate=minimiser.evaluate(settled.estimate.poses, loss),
+        estimate=minimizer.evaluate(settled.estimate.poses, loss),
         weights=weights,
         iterations=minimum.iterations + settled.iterations,
     )
@@ -84,14 +84,14 @@ def _settle_without_outliers(
 class _Focus:
     """Leaves out edges of weight zero, which fill in the factor for nothing: soon most of the wrong ones."""
 
-    def __init__(self, minimiser: Minimiser) -> None:
-        self._whole = self._chosen = minimiser
-        self._kept = np.ones(len(minimiser.is_loop), np.bool_)
-        problem = minimiser.problem
-        self._is_free = is_connected(problem.edges[~minimiser.is_loop], problem.variable < 0)
+    def __init__(self, minimizer: Minimizer) -> None:
+        self._whole = self._chosen = minimizer
+        self._kept = np.ones(len(minimizer.is_loop), np.bool_)
+        problem = minimizer.problem
+        self._is_free = is_connected(problem.edges[~minimizer.is_loop], problem.variable < 0)
 
-    def on(self, weights: NDArray[np.float64]) -> Minimiser:
-        """A minimiser of the edges with weight, (E,), and of hardly any other."""
+    def on(self, weights: NDArray[np.float64]) -> Minimizer:
+        """A minimizer of the edges with weight, (E,), and of hardly any other."""
         wanted = weights > 0.0
         wasted = 1.0 - wanted.sum() / self._kept.sum()
         if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
@@ -100,46 +100,46 @@ class _Focus:
 
 
 def _judge(
-    minimiser: Minimiser, now: Estimate, loss: RobustLoss, max_iterations: int, tolerance: float
+    minimizer: Minimizer, now: Estimate, loss: RobustLoss, max_iterations: int, tolerance: float
 ) -> Minimum:
     """The minimum with the verdicts of now, and then with those that the other edges bear out."""
-    kept, nominal = loss.weight(now.chi2[minimiser.loops]) > 0.5, loss.scale**2
-    minimum = _settle(minimiser, now, Verdicts(kept, nominal), max_iterations, tolerance)
-    problem = minimiser.problem
+    kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
+    minimum = _settle(minimizer, now, Verdicts(kept, nominal), max_iterations, tolerance)
+    problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
-    against = _against(minimiser, minimum, nominal)
+    against = _against(minimizer, minimum, nominal)
     price = fair_price(against[kept], nominal, problem.freedom)
-    minimum = replace(minimum, estimate=minimiser.reweighed(minimum.estimate, Verdicts(kept, price)))
+    minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, Verdicts(kept, price)))
     share = 1.0
     for _ in range(_MOST_ROUNDS):
         gain = np.where(kept, against - price, price - against)
         if share < _FEWEST or not (gain > 0.0).any():
             break
         verdicts = Verdicts(kept ^ (gain > (1.0 - share) * gain.max()), price)
-        trial = _settle(minimiser, minimum.estimate, verdicts, max_iterations, tolerance)
+        trial = _settle(minimizer, minimum.estimate, verdicts, max_iterations, tolerance)
         used = minimum.iterations + trial.iterations
         if not trial.estimate.cost < minimum.estimate.cost:
             minimum, share = replace(minimum, iterations=used), _FEWER * share
             continue
         minimum, kept, share = replace(trial, iterations=used), verdicts.kept, 1.0
-        against = _against(minimiser, minimum, price)
+        against = _against(minimizer, minimum, price)
     return minimum
 
 
 def _settle(
-    minimiser: Minimiser, start: Estimate, verdicts: Verdicts, max_iterations: int, tolerance: float
+    minimizer: Minimizer, start: Estimate, verdicts: Verdicts, max_iterations: int, tolerance: float
 ) -> Minimum:
     """The minimum with these verdicts."""
-    weights = minimiser.weights(start.chi2, verdicts)
-    chosen = _Focus(minimiser).on(weights)
+    weights = minimizer.weights(start.chi2, verdicts)
+    chosen = _Focus(minimizer).on(weights)
     kept = verdicts.kept
-    inner = Verdicts(kept if chosen is minimiser else kept[kept], verdicts.price)
+    inner = Verdicts(kept if chosen is minimizer else kept[kept], verdicts.price)
     minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
-    return replace(minimum, estimate=minimiser.evaluate(minimum.estimate.poses, verdicts), weights=weights)
+    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, verdicts), weights=weights)
 
 
-def _against(minimiser: Minimiser, minimum: Minimum, price: float) -> NDArray[np.float64]:
+def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
     """What every loop edge costs the others, (L,)."""
     kept = minimum.weights > 0.5
-    return contradictions(minimiser.problem, minimum.estimate.poses, kept, price)[minimiser.loops]
+    return contradictions(minimizer.problem, minimum.estimate.poses, kept, price)[minimizer.loops]

@@ -55,7 +55,7 @@ class Minorants:
     kappa: NDArray[np.float64]
 
 
-def minorise(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
+def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
     """Bounds that touch the χ² of every edge, times its weight (E,), at these poses."""
     d = poses.shape[-1] - 1
     i, j = problem.edges.T

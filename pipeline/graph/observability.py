@@ -88,9 +88,9 @@ def _bodies(problem: BetweenProblem, poses: Matrix, null: Matrix) -> list[NDArra
     """The poses that move in the null space (n, k, m), those together that have the same twists in the world."""
     moving = np.flatnonzero((np.abs(null) > _MOVES).any(axis=(1, 2)))
     middle = poses[problem.free, :-1, -1].mean(axis=0)
-    centred = poses[problem.free[moving]]
-    centred[:, :-1, -1] -= middle
-    twists = (lie.adjoint(centred) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
+    centered = poses[problem.free[moving]]
+    centered[:, :-1, -1] -= middle
+    twists = (lie.adjoint(centered) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
     largest = np.abs(twists).max(initial=0.0) or 1.0
     _, body = np.unique(np.round(twists / largest, 6), axis=0, return_inverse=True)
     body = np.where(problem.is_point[problem.free[moving]], len(moving) + np.arange(len(moving)), body.reshape(-1))
@@ -164,7 +164,7 @@ def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apa
     while len(vanished) <= _MOST:
         values[pattern.diagonal] = bare[pattern.diagonal] + held
         try:
-            problem.cholesky.factorise(values)
+            problem.cholesky.factorize(values)
             scalar = _overlooked(problem, poses, information, held, prior)
         except SingularMatrixError as error:
             scalar = error.scalar

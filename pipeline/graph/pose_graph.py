@@ -16,9 +16,9 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import own_covariances, relative_covariance
-from scanchain.graph.graduation import Judgement
+from scanchain.graph.graduation import Judgment
 from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.initialise import Initialisation
+from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
     FreePose,
     free_poses,
@@ -28,7 +28,7 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimisation import Optimisation
+from scanchain.graph.optimization import Optimization
 from scanchain.graph.solve import solve
 from scanchain.graph.soundness import check_connected, check_edges, ranks
 from scanchain.words import counted
@@ -101,12 +101,12 @@ class PoseGraph:
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Weight that the last optimisation left to every edge, (E,); 1 before."""
+        """Weight that the last optimization left to every edge, (E,); 1 before."""
         return self._weight.rows
 
     @property
     def is_rejected(self) -> NDArray[np.bool_]:
-        """Which edges the last optimisation put out of force, (E,)."""
+        """Which edges the last optimization put out of force, (E,)."""
         return self.weight < REJECTED_WEIGHT
 
     @property
@@ -195,28 +195,28 @@ class PoseGraph:
         self._changed()
         self._fixed.add(index)
 
-    def optimise(
-        self, config: GraphConfig, *, initialise: Initialisation = "auto", judgement: Judgement = "mended"
-    ) -> Optimisation:
+    def optimize(
+        self, config: GraphConfig, *, initialize: Initialization = "auto", judgment: Judgment = "mended"
+    ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        judgement : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
+        judgment : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
-        checks.one_of(initialise, get_args(Initialisation), "initialise")
-        checks.one_of(judgement, get_args(Judgement), "judgement")
+        checks.one_of(initialize, get_args(Initialization), "initialize")
+        checks.one_of(judgment, get_args(Judgment), "judgment")
         begin = working_s()
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            solved = solve(problem, self.poses, self.is_loop, config, initialise, judgement)
+            solved = solve(problem, self.poses, self.is_loop, config, initialize, judgment)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         minimum = solved.minimum
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
-        return Optimisation(
+        return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
             chi2_after=self._in_force(minimum.estimate.chi2),
@@ -224,12 +224,12 @@ class PoseGraph:
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
-            initialisation=solved.initialisation,
+            initialization=solved.initialization,
             time_s=working_s() - begin,
         )
 
     def certify(self) -> Certificate:
-        """Whether the poses are the global minimum of χ², edges weighed as the last optimisation left them."""
+        """Whether the poses are the global minimum of χ², edges weighed as the last optimization left them."""
         return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
 
     def free_poses(self) -> tuple[FreePose, ...]:
@@ -274,7 +274,7 @@ class PoseGraph:
         self._factor_is_now = False
         try:
             information = self._weight_in_force[:, None, None] * self.information
-            problem.cholesky.factorise(own_equations(problem, self.poses, information))
+            problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         return own_covariances(problem)
@@ -290,9 +290,9 @@ class PoseGraph:
         """The problem, with the factor of the undamped H in its solver."""
         problem = self._prepared()
         if not self._factor_is_now:
-            equations = problem.linearise(self.poses, problem.errors(self.poses), self.weight)
+            equations = problem.linearize(self.poses, problem.errors(self.poses), self.weight)
             try:
-                problem.cholesky.factorise(equations.values)
+                problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
                 raise self._singular(error, problem) from error
             self._factor_is_now = True

@@ -11,9 +11,9 @@ from scanchain.config import GraphConfig
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.estimate import Minimum
-from scanchain.graph.graduation import Judgement, minimise
-from scanchain.graph.initialise import Initialisation, first_guess
-from scanchain.graph.optimiser import Minimiser
+from scanchain.graph.graduation import Judgment, minimize
+from scanchain.graph.initialize import Initialization, first_guess
+from scanchain.graph.optimizer import Minimizer
 from scanchain.graph.robust import robust_loss
 
 
@@ -23,7 +23,7 @@ class Solved:
 
     poses: Matrix
     minimum: Minimum
-    initialisation: Initialisation
+    initialization: Initialization
 
 
 def solve(
@@ -31,20 +31,20 @@ def solve(
     poses: Matrix,
     is_loop: NDArray[np.bool_],
     config: GraphConfig,
-    initialise: Initialisation,
-    judgement: Judgement,
+    initialize: Initialization,
+    judgment: Judgment,
 ) -> Solved:
-    """Minimise from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
+    """Minimize from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
 
-    Raises SingularMatrixError where the edges leave a pose free, and the optimiser minds.
+    Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
     """
     trusted = config.robust == "none" or not is_loop.any()
-    guess, source = first_guess(problem, poses, initialise, trusted=trusted)
+    guess, source = first_guess(problem, poses, initialize, trusted=trusted)
     shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
-    minimiser = Minimiser(problem, is_loop, config.optimiser)
-    minimum = minimise(minimiser, guess, loss, config.max_iterations, config.tolerance, judgement)
+    minimizer = Minimizer(problem, is_loop, config.optimizer)
+    minimum = minimize(minimizer, guess, loss, config.max_iterations, config.tolerance, judgment)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0

@@ -1,4 +1,4 @@
-"""Whether a pose graph can be optimised at all; what is wrong with it, where it cannot."""
+"""Whether a pose graph can be optimized at all; what is wrong with it, where it cannot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
         for index in np.flatnonzero(np.isfinite(largest) & (largest > LARGEST))[:1]:
             i, j = edges[index]
             raise InputError(
-                f"edge {i}-{j}: {what} of {largest[index]:g}, over {LARGEST:g}; give metres and radians, "
+                f"edge {i}-{j}: {what} of {largest[index]:g}, over {LARGEST:g}; give meters and radians, "
                 "and an inverse covariance of these"
             )
     for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
@@ -70,7 +70,7 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
 def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:
     """Refuse a graph with poses that no chain of edges joins to a fixed one; ``names`` (K,) are the poses'."""
     if not len(fixed):
-        raise InputError("the pose graph has no poses; add some before optimising")
+        raise InputError("the pose graph has no poses; add some before optimizing")
     apart = loose(edges, fixed)
     if len(apart):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Step rules of the optimisers: where to go from a local model of the cost."""
+"""Step rules of the optimizers: where to go from a local model of the cost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain.graph.cholesky import SingularMatrixError
 
-Optimiser = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
 Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
@@ -22,7 +22,7 @@ _SHORTEST = 1e-12  # share of the first trust region, or of the best length, at 
 
 
 class Estimate(Protocol):
-    """Where a minimisation is."""
+    """Where a minimization is."""
 
     @property
     def cost(self) -> float:
@@ -67,13 +67,13 @@ class StepRule(Protocol):
         ...
 
 
-def step_rule(optimiser: Optimiser, first_damping: float = _FIRST_DAMPING) -> StepRule:
+def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
     """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
-    if optimiser == "gauss-newton":
+    if optimizer == "gauss-newton":
         return GaussNewton()
-    if optimiser in ("levenberg-marquardt", "newton"):
+    if optimizer in ("levenberg-marquardt", "newton"):
         return Damped(first_damping)
-    return Dogleg() if optimiser == "dogleg" else GradientDescent()
+    return Dogleg() if optimizer == "dogleg" else GradientDescent()
 
 
 class GaussNewton:
@@ -119,9 +119,9 @@ class Damped:
 
 
 class Dogleg:
-    """Along the steepest descent and then towards the Gauss-Newton step, within a trust region (Powell 1970).
+    """Along the steepest descent and then toward the Gauss-Newton step, within a trust region (Powell 1970).
 
-    Lengths are measured with diag H, so that metres and radians compare.
+    Lengths are measured with diag H, so that meters and radians compare.
     """
 
     def __init__(self) -> None:

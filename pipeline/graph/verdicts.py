@@ -59,13 +59,13 @@ def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool
     It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
     predict: with P the covariance of the prediction, given all kept edges,
         eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
-    The residual alone says less: a kept edge bends the graph towards itself. Where a lower bound of the second,
+    The residual alone says less: a kept edge bends the graph toward itself. Where a lower bound of the second,
     by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
     """
     errors, k = problem.errors(poses), problem.freedom
     jacobians = problem.jacobians(poses, errors)
     sparse = problem.restricted(kept)
-    sparse.cholesky.factorise(sparse.linearise(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
     blocks = sparse.packing.blocks(sparse.cholesky.inverse_blocks())
     blocks = np.concatenate([blocks, np.zeros((1, k, k))])  # found by -1, a fixed pose
     i, j = problem.variable[problem.edges].T

@@ -11,7 +11,7 @@ from scanchain.kernels.voxels import move
 def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
     """Fill ``partner`` (N,) with the row of the nearest voxel mean, −1 where none is near enough.
 
-    points : (N, d) metres; T moves them into the map's frame
+    points : (N, d) meters; T moves them into the map's frame
     reach : voxels searched to each side: the 2ʳᵉᵃᶜʰ-fold of each axis around the point, (2·reach)ᵈ voxels
     A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all
     that lies nearer than r − ½ voxels. Returns the number of points with a partner.

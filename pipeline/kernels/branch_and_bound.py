@@ -15,7 +15,7 @@ RIVAL = 0.8  # share of the best score, from which on another answer is told
 def draw_hits(means, origin, resolution_m: float, grid):
     """Score HIT where a surface point lies, NEAR in the eight cells around it.
 
-    means : (V, ≥ 2) metres; origin : (2,) corner of cell (0, 0); grid : (rows, columns) uint8, row along y
+    means : (V, ≥ 2) meters; origin : (2,) corner of cell (0, 0); grid : (rows, columns) uint8, row along y
     Every mean lies within the grid, a cell or more from its border.
     """
     for v in range(means.shape[0]):
@@ -58,7 +58,7 @@ def search(
     to the best pose elsewhere, more than APART_M or APART_RAD away, with at least RIVAL of that score.
 
     pyramid : of ``fill_pyramid``; its first 2ᵗᵒᵖ − 1 rows and columns are empty
-    points : (N, 2) metres, lidar frame; T : (3, 3)
+    points : (N, 2) meters, lidar frame; T : (3, 3)
     least : share of the highest score possible, below which nothing counts
     Returns x, y (m), yaw, the share of the best pose (−1 for none) and that of its rival (0 for none).
     """

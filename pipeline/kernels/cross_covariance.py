@@ -9,7 +9,7 @@ from scanchain.kernels.voxels import move
 def weighted_pairs(voxels, points, T, partner, scale_m: float, source, target, weight):
     """Write every pair's moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))², one row a pair.
 
-    points : (N, d) metres, source frame; partner : (N,) rows of the map, −1 for none
+    points : (N, d) meters, source frame; partner : (N,) rows of the map, −1 for none
     source, target : (N, d) and weight : (N,), room for the pairs. Returns the number of pairs.
     """
     pairs = 0

@@ -1,4 +1,4 @@
-"""The steps of the four optimisers, and the damping that Levenberg–Marquardt keeps between them."""
+"""The steps of the four optimizers, and the damping that Levenberg–Marquardt keeps between them."""
 
 import math
 
@@ -8,17 +8,17 @@ GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True)
-def step(optimiser: int, H, b, damping: float, factor, x) -> bool:
-    """Write the step ξ of one iteration to ``x`` (k,); ``factor`` (k, k) is room for the factorisation.
+def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
+    """Write the step ξ of one iteration to ``x`` (k,); ``factor`` (k, k) is room for the factorization.
 
-    Gradient descent    ξ = −(bᵀb / bᵀHb) b, the exact minimiser along the gradient (Cauchy's point)
+    Gradient descent    ξ = −(bᵀb / bᵀHb) b, the exact minimizer along the gradient (Cauchy's point)
     Newton              ξ = −H⁻¹b with the full Hessian; where that is indefinite the diagonal is raised
     Gauss–Newton        ξ = −(JᵀJ)⁻¹Jᵀr
     Levenberg–Marquardt ξ = −(JᵀJ + λ diag(JᵀJ))⁻¹Jᵀr (Marquardt 1963)
     Returns whether the system could be solved.
     """
     k = b.shape[0]
-    if optimiser == GRADIENT_DESCENT:
+    if optimizer == GRADIENT_DESCENT:
         along = square = 0.0
         for i in range(k):
             square += b[i] * b[i]
@@ -27,10 +27,10 @@ def step(optimiser: int, H, b, damping: float, factor, x) -> bool:
         for i in range(k):
             x[i] = -b[i] * square / along if along > 0.0 else 0.0
         return along > 0.0
-    if optimiser != LEVENBERG_MARQUARDT:
+    if optimizer != LEVENBERG_MARQUARDT:
         damping = 0.0
     solved = solve(H, b, damping, factor, x)
-    while not solved and optimiser == NEWTON and damping < 1e6:
+    while not solved and optimizer == NEWTON and damping < 1e6:
         damping = max(4.0 * damping, 1e-3)
         solved = solve(H, b, damping, factor, x)
     return solved

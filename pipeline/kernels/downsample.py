@@ -13,8 +13,8 @@ _BLOCK = 2048  # points whose keys are computed at once, which the compiler make
 def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, chosen):
     """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
 
-    points : (N, d) metres from the lidar; chosen : (N,) int32. Returns how many were chosen.
-    Neighbours on a ring mostly share a voxel, so the last key is tried before the table.
+    points : (N, d) meters from the lidar; chosen : (N,) int32. Returns how many were chosen.
+    Neighbors on a ring mostly share a voxel, so the last key is tried before the table.
     """
     n = points.shape[0]
     slots = 1024
@@ -67,7 +67,7 @@ def gather(points, chosen, out):
 def deskew(points, shares, twist):
     """Move each point, in place, to where the lidar would see it at one instant, as a rule the scan's middle.
 
-    points : (N, d) metres, each in the lidar frame of its own instant
+    points : (N, d) meters, each in the lidar frame of its own instant
     shares : (N,) time from that instant to the point's own, in units of the time in which the lidar moves by twist
     twist : (k,) constant velocity; the pose at share τ is T exp(τ ξ), so that p ← exp(τ ξ) p
     """

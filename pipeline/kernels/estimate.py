@@ -26,7 +26,7 @@ class Terms(NamedTuple):
     insertions : into the map so far
     """
 
-    optimiser: int
+    optimizer: int
     max_iterations: int
     reach: int
     max_distance_m: float
@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def linearise(problem, scale_m: float, estimate):
+def linearize(problem, scale_m: float, estimate):
     """Fill the estimate's normal equations and sums at its pose, the prediction's pull included."""
     terms = problem.terms
     cost, weights, squares = normal_equations(
@@ -77,7 +77,7 @@ def linearise(problem, scale_m: float, estimate):
         problem.partner,
         problem.trust,
         scale_m,
-        1.0 if terms.optimiser == NEWTON else 0.0,
+        1.0 if terms.optimizer == NEWTON else 0.0,
         estimate.H,
         estimate.b,
     )

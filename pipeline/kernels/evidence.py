@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.descent import solve
 from scanchain.kernels.eigen import eigensystem
-from scanchain.kernels.poses import adjoint, centred
+from scanchain.kernels.poses import adjoint, centered
 
 WEAK = 10.0  # times the limits, below which the data alone are not believed
 _FIRM = 1e3  # times what all residuals together know of a direction
@@ -129,8 +129,8 @@ def seen_from_source(T, T_first, H, direction, variance: float):
     H (k, k), of residuals with this variance, and the direction are about the position of T_first, in map axes.
     """
     k = H.shape[0]
-    information, turned = congruent(adjoint(centred(T, T_first)), H), np.zeros(k)
-    Ad = adjoint(centred(T, T))
+    information, turned = congruent(adjoint(centered(T, T_first)), H), np.zeros(k)
+    Ad = adjoint(centered(T, T))
     for i in range(k):
         for j in range(k):
             information[i, j] /= variance

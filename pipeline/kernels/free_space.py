@@ -10,7 +10,7 @@ FAR = 1e9  # m, in bins that no ray fell into
 def nearest_ranges(points, ranges_m):
     """Fill ``ranges_m`` (E, A) with the least range in each bin of direction, FAR where no point is.
 
-    points : (N, 3) metres, lidar frame; rows are E equal steps of elevation from −π/2 to π/2, columns A equal
+    points : (N, 3) meters, lidar frame; rows are E equal steps of elevation from −π/2 to π/2, columns A equal
     steps of azimuth from −π
     """
     ranges_m[:] = FAR
@@ -24,7 +24,7 @@ def nearest_ranges(points, ranges_m):
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     """How many points (N, 3), moved by T (4, 4) into the lidar's frame, agree with its ranges and contradict.
 
-    A point agrees where its range is that of its bin, within the margin: so many metres and such a share of the
+    A point agrees where its range is that of its bin, within the margin: so many meters and such a share of the
     range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.
     """
     agreeing = contradicting = 0
@@ -58,9 +58,9 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_throug
     rays do on ground that they graze, and where one is within a bin of its direction. Otherwise it is hidden or
     out of sight.
 
-    points : (N, 3) metres, world; spans : (S, 2) int64 first and last + 1 of the points to look at
+    points : (N, 3) meters, world; spans : (S, 2) int64 first and last + 1 of the points to look at
     T : (4, 4) T_lidar_world; ranges_m : (E, A) of ``nearest_ranges``; one row for scans in a plane
-    limits : (6,) reach m; window m; margin of a range m, and per metre; margin of a height m, and per metre
+    limits : (6,) reach m; window m; margin of a range m, and per meter; margin of a height m, and per meter
     enough : points that so many scans saw are not looked at again
     seen, looked_through : (N,) int32, changed in place
     """

@@ -24,7 +24,7 @@ def chart_blocks(
 
     r is also the translation and the angle of E = Z⁻¹ T_i⁻¹ T_j, the argument of the logarithm.
 
-    T_i, T_j, Z : (3, 3) poses, metres; Z maps frame j to frame i
+    T_i, T_j, Z : (3, 3) poses, meters; Z maps frame j to frame i
     r (3,), A (3, 3), B (3, 3) : filled
     """
     c_i, s_i, c_z, s_z = T_i[0, 0], T_i[1, 0], Z[0, 0], Z[1, 0]

@@ -1,4 +1,4 @@
-"""Numeric sparse Cholesky factorisation A = Uᵀ U by dense fronts, and the solves with it; compiled.
+"""Numeric sparse Cholesky factorization A = Uᵀ U by dense fronts, and the solves with it; compiled.
 
 Multifrontal method (Duff & Reid 1983; Liu 1992): every front gathers its entries of A and the update matrices of
 its children, eliminates its pivots and hands the rest on. Fronts are row-major and only their upper triangle is
@@ -17,7 +17,7 @@ _TILE = 256  # columns of the rest that are updated together, so that the panel 
 
 
 @njit(cache=True)
-def factorise(
+def factorize(
     fronts: Fronts, blocks: Blocks, values: _Array, floor: _Array, factor: _Array, stack: _Array, work: _Array
 ) -> int:
     """Fill the factor; return -1, or the position in the elimination order of the first pivot that failed.
@@ -108,7 +108,7 @@ def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
 
 @njit(cache=True)
 def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: NDArray[np.int64]) -> None:
-    """Add a child's update matrix, row by row, in runs of columns that are neighbours in the front too."""
+    """Add a child's update matrix, row by row, in runs of columns that are neighbors in the front too."""
     size, count = place.size, 0
     for b in range(size):
         if b == 0 or place[b] != place[b - 1] + 1:

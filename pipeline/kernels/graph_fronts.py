@@ -1,4 +1,4 @@
-"""Layout of the frontal matrices of a multifrontal Cholesky factorisation, done once per pattern; compiled."""
+"""Layout of the frontal matrices of a multifrontal Cholesky factorization, done once per pattern; compiled."""
 
 from typing import NamedTuple
 

@@ -20,7 +20,7 @@ def selected_inverse(
         Z_ac = −Σ_{m>a} U_am Z_mc / U_aa for c > a,      Z_aa = (1 / U_aa − Σ_{m>a} U_am Z_ma) / U_aa
     What a front needs of Z beyond its pivots its parent has; it waits on the stack, as the update matrices did.
 
-    factor : as ``graph_cholesky.factorise`` left it; inverse : block values, laid out as those of A, filled
+    factor : as ``graph_cholesky.factorize`` left it; inverse : block values, laid out as those of A, filled
     stack : fronts.stack_size scalars of room, work : fronts.widest² scalars of room
     """
     first_child, sibling = _families(fronts)

@@ -1,4 +1,4 @@
-"""Symbolic analysis for the sparse Cholesky factorisation: elimination tree, structure, fronts; compiled.
+"""Symbolic analysis for the sparse Cholesky factorization: elimination tree, structure, fronts; compiled.
 
 Everything here works on blocks (variables such as poses), not on scalars, and is done once per pattern.
 """
@@ -11,10 +11,10 @@ _Index = NDArray[np.int64]
 
 
 @njit(cache=True)
-def elimination_tree(start: _Index, neighbours: _Index, order: _Index) -> _Index:
+def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
     """Parent of every position of the elimination order, -1 at a root (Liu 1990, algorithm 4.2).
 
-    start (n + 1,), neighbours : adjacency lists of the n variables, without the diagonal
+    start (n + 1,), neighbors : adjacency lists of the n variables, without the diagonal
     order (n,) : variable eliminated at each position
     """
     n = order.size
@@ -24,7 +24,7 @@ def elimination_tree(start: _Index, neighbours: _Index, order: _Index) -> _Index
     parent, ancestor = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
     for k in range(n):
         for q in range(start[order[k]], start[order[k] + 1]):
-            i = place[neighbours[q]]
+            i = place[neighbors[q]]
             while i != -1 and i < k:
                 following = ancestor[i]
                 ancestor[i] = k
@@ -65,7 +65,7 @@ def postorder(parent: _Index) -> _Index:
 
 
 @njit(cache=True)
-def column_structures(start: _Index, neighbours: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
+def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
     """Positions below the diagonal in every block column of the factor, ascending: (start (n + 1,), rows).
 
     struct(j) = adjacent(j) ∪ struct(children of j), without j and what precedes it. ``order`` is a postorder.
@@ -80,12 +80,12 @@ def column_structures(start: _Index, neighbours: _Index, order: _Index, parent: 
             sibling[j] = first_child[parent[j]]
             first_child[parent[j]] = j
     begin = np.zeros(n + 1, np.int64)
-    rows = np.empty(max(4 * neighbours.size, 16), np.int64)
+    rows = np.empty(max(4 * neighbors.size, 16), np.int64)
     mark = np.full(n, -1, np.int64)
     for j in range(n):
         if begin[j] + n > rows.size:
             rows = np.concatenate((rows, np.empty(rows.size + n, np.int64)))
-        adjacent = place[neighbours[start[order[j]] : start[order[j] + 1]]]
+        adjacent = place[neighbors[start[order[j]] : start[order[j] + 1]]]
         end = _join(adjacent, j, mark, rows, begin[j])
         child = first_child[j]
         while child != -1:

@@ -16,7 +16,7 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 @njit(cache=True, inline="always")
 def key_of(x: float, y: float, z: float, scale: float) -> int:
-    """Key of the voxel that holds a point; scale : voxels a metre."""
+    """Key of the voxel that holds a point; scale : voxels a meter."""
     return pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
 
 

@@ -22,7 +22,7 @@ from scanchain.kernels.evidence import (
     worst,
 )
 from scanchain.kernels.pose_log import twist_3d
-from scanchain.kernels.poses import adjoint, between, centred, inverse, twist_2d
+from scanchain.kernels.poses import adjoint, between, centered, inverse, twist_2d
 from scanchain.kernels.registration import NO_PARTNERS, align, position_of
 from scanchain.kernels.residuals import information, robust_sums
 from scanchain.kernels.signal import listen, weakest_signal
@@ -211,7 +211,7 @@ def answer_of(T, T_first, outcome, spectrum, surface_signal: float, quality, ran
 
 @njit(cache=True, nogil=True)
 def root_mean_square_range(points) -> float:
-    """Of points (N, d) as the lidar sees them; metres."""
+    """Of points (N, d) as the lidar sees them; meters."""
     total = 0.0
     for i in range(points.shape[0]):
         for axis in range(points.shape[1]):
@@ -222,7 +222,7 @@ def root_mean_square_range(points) -> float:
 @njit(cache=True, nogil=True)
 def _turned(information, T, variance: float):
     """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
-    out = congruent(adjoint(inverse(centred(T, T))), information)
+    out = congruent(adjoint(inverse(centered(T, T))), information)
     for i in range(out.shape[0]):
         for j in range(out.shape[0]):
             out[i, j] *= variance
@@ -232,7 +232,7 @@ def _turned(information, T, variance: float):
 @njit(cache=True, nogil=True)
 def _twist_between(T_from, T_to):
     """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
-    motion = between(inverse(centred(T_to, T_to)), inverse(centred(T_from, T_to)))
+    motion = between(inverse(centered(T_to, T_to)), inverse(centered(T_from, T_to)))
     if T_to.shape[0] == 3:
         return twist_2d(motion)
     out = np.empty(6)
@@ -242,7 +242,7 @@ def _twist_between(T_from, T_to):
 
 @njit(cache=True, nogil=True)
 def _doubt_of(expected, range_m: float) -> float:
-    """How far a point at that range may be from where it is expected: one standard deviation, metres."""
+    """How far a point at that range may be from where it is expected: one standard deviation, meters."""
     k = expected.widest.shape[0]
     d = 2 if k == 3 else 3
     variance = 0.0

@@ -10,7 +10,7 @@ HEIGHTS = 64  # bits of a cell
 def mark_heights(points, T, cell_m: float, masks):
     """Set the bit of every cube that holds a point.
 
-    points : (N, 3) metres; T : (4, 4) moves them into the view's frame, x and y from the middle of the square, z
+    points : (N, 3) meters; T : (4, 4) moves them into the view's frame, x and y from the middle of the square, z
     from the middle of its heights. Cubes have edges of ``cell_m``.
     masks : (S, S) uint64, row along y, changed in place; points outside are left out
     """

@@ -7,7 +7,7 @@ from numba import njit
 def keep_valid(x, y, z, low_square: float, high_square: float, points, kept):
     """Copy the points whose squared range is finite, above low_square and at most high_square, in their order.
 
-    x, y, z : (N,) float32 metres, strided as the records are
+    x, y, z : (N,) float32 meters, strided as the records are
     points : (N, 3) float32, filled from the front; kept : (N,) int32, the place of each in the cloud
     Returns how many were kept. NaN fails both comparisons.
     """

@@ -12,8 +12,8 @@ _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no lim
 def add_points(T, points, max_range_m, voxel_m, slots, cells, sums, counts, used):
     """Move points by a pose and add each to the sum of its voxel, until the table is full.
 
-    T : (d+1, d+1); points : (N, d) metres. slots : (S,) int64 keys and cells : (S,) int32 the row that each key
-    has; sums : (C, d) metres and counts : (C,) int64, of which the first ``used`` rows are taken.
+    T : (d+1, d+1); points : (N, d) meters. slots : (S,) int64 keys and cells : (S,) int32 the row that each key
+    has; sums : (C, d) meters and counts : (C,) int64, of which the first ``used`` rows are taken.
     Returns the rows taken now and the number of points done: fewer than N where C rows did not suffice.
     """
     d = points.shape[1]

@@ -67,7 +67,7 @@ def _rotation_vector(R, out):
 
 @njit(cache=True)
 def _quaternion(R, out):
-    """Write the quaternion xyzw of the rotation in R to ``out`` (4,), normalised, w ≥ 0."""
+    """Write the quaternion xyzw of the rotation in R to ``out`` (4,), normalized, w ≥ 0."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
         out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]

@@ -14,7 +14,7 @@ def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
     Returns outside the slice or the usable range are left out. Where the slice does not hold the lidar's height,
     a beam starts where it enters the slice: at the share limit / z of its length.
 
-    T : (d+1, d+1) pose of the lidar; points : (N, d) metres, lidar frame; starts, ends : (N, 2) metres, world.
+    T : (d+1, d+1) pose of the lidar; points : (N, d) meters, lidar frame; starts, ends : (N, 2) meters, world.
     In 2D every return is in the slice. Returns how many beams were kept.
     """
     d = points.shape[1]
@@ -63,8 +63,8 @@ def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, mis
     grazing angle erase it. Bayes' rule in log-odds (Moravec & Elfes 1985; Thrun, Burgard & Fox 2005, table 9.1)
     with clamping (Hornung et al. 2013, eq. 5).
 
-    starts, ends : (N, 2) metres, world; beams of scan k are ``offsets[k]`` to ``offsets[k + 1]``
-    origin : (2,) metres, outer corner of cell (0, 0); every start and end lies within the grid
+    starts, ends : (N, 2) meters, world; beams of scan k are ``offsets[k]`` to ``offsets[k + 1]``
+    origin : (2,) meters, outer corner of cell (0, 0); every start and end lies within the grid
     first_scan : number of the first of these scans; numbers start at 1 and never repeat
     hit, miss : log-odds added; low, high : limits of a cell
     log_odds : (rows, columns) float32, row along y, changed in place

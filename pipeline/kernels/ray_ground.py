@@ -47,7 +47,7 @@ def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
         t += step
         if t > max_range_m or t < 0.0:
             return np.inf
-        if left < 1e-9:  # metres that the step may have left to go
+        if left < 1e-9:  # meters that the step may have left to go
             return t
     return np.inf
 

@@ -23,12 +23,12 @@ def cast_rays(
     solids of its azimuth sector from near to far, passes over those it goes above or below, and stops where the
     next cannot begin before its best hit.
 
-    origins, rotations : (P, 3) metres and (P, 3, 3), sensor poses in the world, near to each other
+    origins, rotations : (P, 3) meters and (P, 3, 3), sensor poses in the world, near to each other
     pose_of_ray : (N,) int32, the pose that ray n is fired from
     directions : (N, 3) unit, sensor frame
-    boxes : (B, 8) centre x, y, half lengths x, y, bottom, top, cos and sin of the yaw
-    cylinders : (C, 5) centre x, y, radius, bottom, top
-    ellipsoids : (E, 6) centre x, y, z, radii x, y, z
+    boxes : (B, 8) center x, y, half lengths x, y, bottom, top, cos and sin of the yaw
+    cylinders : (C, 5) center x, y, radius, bottom, top
+    ellipsoids : (E, 6) center x, y, z, radii x, y, z
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
     max_range_m : reach
     ranges_m : (N,) out

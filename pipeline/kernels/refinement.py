@@ -11,7 +11,7 @@ from scanchain.kernels.registration import CONVERGED, align
 def refine(voxels, points, starts, poses, prior, least_share, terms):
     """Move every pose, in place, to where its scan fits the map; where it does not fit, the pose stays.
 
-    points : (N, d) metres of all scans, each in its own lidar frame; starts : (K + 1,) scan k is points[starts[k]
+    points : (N, d) meters of all scans, each in its own lidar frame; starts : (K + 1,) scan k is points[starts[k]
     : starts[k + 1]]; poses : (K, d+1, d+1)
     prior : (k, k) information of each pose as it is, twists along the map's axes, times the variance of a residual
     least_share : of a scan's points that find a partner, below which it does not fit

@@ -1,4 +1,4 @@
-"""Point-to-shape ICP against a voxel map: associate, linearise, step, until the pose stands still."""
+"""Point-to-shape ICP against a voxel map: associate, linearize, step, until the pose stands still."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,14 @@ from scanchain.kernels.estimate import (
     Estimate,
     Problem,
     leave_out_points,
-    linearise,
+    linearize,
     pull,
     take,
     weigh_up,
 )
 from scanchain.kernels.residuals import information
 from scanchain.kernels.trust import weigh
-from scanchain.kernels.twist import orthonormalise, perturb
+from scanchain.kernels.twist import orthonormalize, perturb
 
 CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
 
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
     unweighted (k, k) : the same without robust weights
     cost : robust cost in m², every unpaired point at its limit ½s²
     weights, squares : Σ w and Σ w r² (m²)
-    pairs, iterations, ending : points with a partner, linearisations, one of the codes above
+    pairs, iterations, ending : points with a partner, linearizations, one of the codes above
     origin (3,), partner (N,), trust (N,) : what twists turn about, and the last pairs, points without a shape
         out of trust
     """
@@ -92,7 +92,7 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
                 break
             weigh(voxels, points, T, partner, terms.variance, trust)
         if moved_m == 0.0 or scale_m != last_scale_m:
-            linearise(problem, scale_m, now)
+            linearize(problem, scale_m, now)
         slack_m = -1.0  # a scale that shrinks changes all weights
         if scale_m <= terms.scale_m:
             slack_m = SLACK * voxels.size_m - moved_m if settled + 1 < PATIENCE else np.inf
@@ -106,7 +106,7 @@ def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, 
             settled += 1
         moved_m += _largest_move(x, range_m)
         last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
-    orthonormalise(T)
+    orthonormalize(T)
     cost = now.sums[COST] - pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
     leave_out_points(voxels, partner, trust)
     information(voxels, points, T, origin, partner, trust, terms.scale_m, now.H, trial.H)
@@ -144,16 +144,16 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
     """
     terms = problem.terms
     growth = 2.0
-    while step(terms.optimiser, now.H, now.b, now.sums[DAMPING], factor, x):
+    while step(terms.optimizer, now.H, now.b, now.sums[DAMPING], factor, x):
         perturb(x, now.T, problem.origin, trial.T)
         for i in range(x.shape[0]):
             trial.away[i] = now.away[i] + x[i]
         if _largest_move(x, range_m) > slack_m:
             weigh_up(problem, scale_m, trial)
         else:
-            linearise(problem, scale_m, trial)
+            linearize(problem, scale_m, trial)
         lowered = now.sums[COST] - trial.sums[COST]
-        if terms.optimiser != LEVENBERG_MARQUARDT or lowered >= 0.0:
+        if terms.optimizer != LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
             trial.sums[DAMPING] = max(relax(now.sums[DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
             take(now, trial)
@@ -168,7 +168,7 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
 
 @njit(cache=True, inline="always")
 def _largest_move(x, range_m: float) -> float:
-    """How far a step x moves a point at that range, at most; metres."""
+    """How far a step x moves a point at that range, at most; meters."""
     shift, turn = _squares(x)
     return np.sqrt(shift) + np.sqrt(turn) * range_m
 

@@ -8,7 +8,7 @@ from scanchain.kernels.voxels import DIRECTION, LINE, PLANE, SHAPE, move
 
 @njit(cache=True, nogil=True)
 def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, curvature: float, H, b):
-    """Linearise every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
+    """Linearize every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
 
     With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
     ``origin`` (all lengths counted from there, so that rotation and translation stay apart), T ← exp(ξ) T,
@@ -18,7 +18,7 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
     weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985)
     times the trust in the pair.
 
-    points : (N, d) metres, source frame; origin : (3,), map frame
+    points : (N, d) meters, source frame; origin : (3,), map frame
     partner : (N,) rows of the map's voxels, −1 for none; trust : (N,) in [0, 1], what each pair counts
     scale_m : s; residuals far above it are all but ignored
     curvature : 1 adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights

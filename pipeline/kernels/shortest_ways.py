@@ -12,7 +12,7 @@ def shortest_ways(edges, lengths, count: int, source: int, limit: float):
 
     edges : (E, 2) int64 node pairs, walked both ways; lengths : (E,) ≥ 0, infinite for an edge that is closed
     """
-    first, neighbours, ways = _neighbours(edges, lengths, count)
+    first, neighbors, ways = _neighbors(edges, lengths, count)
     result = np.full(count, np.inf)
     result[source] = 0.0
     heap = [(0.0, source)]
@@ -22,26 +22,26 @@ def shortest_ways(edges, lengths, count: int, source: int, limit: float):
             continue
         for k in range(first[node], first[node + 1]):
             there = length + ways[k]
-            if there <= limit and there < result[neighbours[k]]:
-                result[neighbours[k]] = there
-                heapq.heappush(heap, (there, neighbours[k]))
+            if there <= limit and there < result[neighbors[k]]:
+                result[neighbors[k]] = there
+                heapq.heappush(heap, (there, neighbors[k]))
     return result
 
 
 @njit(cache=True, nogil=True)
-def _neighbours(edges, lengths, count: int):
-    """The neighbours of node n and the lengths to them: rows first[n] to first[n + 1]."""
+def _neighbors(edges, lengths, count: int):
+    """The neighbors of node n and the lengths to them: rows first[n] to first[n + 1]."""
     first = np.zeros(count + 2, np.int64)
     for e in range(edges.shape[0]):
         first[edges[e, 0] + 2] += 1
         first[edges[e, 1] + 2] += 1
     for node in range(1, count + 2):
         first[node] += first[node - 1]
-    neighbours = np.empty(2 * edges.shape[0], np.int64)
+    neighbors = np.empty(2 * edges.shape[0], np.int64)
     ways = np.empty(2 * edges.shape[0])
     for e in range(edges.shape[0]):
         for end in range(2):
             row = first[edges[e, end] + 1]
             first[edges[e, end] + 1] += 1
-            neighbours[row], ways[row] = edges[e, 1 - end], lengths[e]
-    return first, neighbours, ways
+            neighbors[row], ways[row] = edges[e, 1 - end], lengths[e]
+    return first, neighbors, ways

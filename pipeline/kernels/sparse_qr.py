@@ -1,8 +1,8 @@
-"""Sparse orthogonal factorisation A = Q R by dense Householder fronts; Q is applied to b and forgotten; compiled.
+"""Sparse orthogonal factorization A = Q R by dense Householder fronts; Q is applied to b and forgotten; compiled.
 
 The multifrontal method (Matstoms 1994; Davis 2011) on the structure of R, which is at most that of the Cholesky
 factor of AᵀA (George & Heath 1980): a front gathers the rows of A that begin at its pivots and the rows that its
-children hand on, triangularises them by Householder reflections (Golub & Van Loan 2013, section 5.1; Davis 2006,
+children hand on, triangularizes them by Householder reflections (Golub & Van Loan 2013, section 5.1; Davis 2006,
 chapter 5), keeps a row of R for each pivot and hands the rest on. Its rows are sorted by where they begin, so that
 a reflection touches no row that is still zero there.
 """
@@ -64,7 +64,7 @@ def assign_rows(
 
 
 @njit(cache=True)
-def factorise(
+def factorize(
     fronts: Fronts,
     begin: _Index,
     own: _Index,
@@ -106,7 +106,7 @@ def factorise(
         stairs, target = _sort_by_lead(leads, width)
         _place_own(front, target, mine, row_start, columns, values, b, place, local)
         depth = _place_children(front, target, mine.size, fronts, children, height, stack, depth)
-        _triangularise(front, width, stairs, sums)
+        _triangularize(front, width, stairs, sums)
         _keep(front, columns_f, pivots, factor[fronts.factor_start[f] :], z)
         rest = width - pivots
         for a in range(_handed_on(height[f], rest, pivots)):
@@ -227,7 +227,7 @@ def _sort_by_lead(leads: _Index, width: int) -> tuple[_Index, _Index]:
 
 
 @njit(cache=True)
-def _triangularise(front: _Array, width: int, stairs: _Index, sums: _Array) -> None:
+def _triangularize(front: _Array, width: int, stairs: _Index, sums: _Array) -> None:
     """Reflect the front to an upper trapezoid, column after column: F ← F − v (2 vᵀF / vᵀv)."""
     for k in range(min(front.shape[0], width)):
         end = max(stairs[k], k + 1)

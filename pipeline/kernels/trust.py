@@ -34,7 +34,7 @@ def weigh(voxels, points, T, partner, variance: float, trust):
     Other lines are rings, mostly, and like voxels without a shape their mean stands for a surface to within s/2
     of a voxel of size s.
 
-    points : (N, d) metres, source frame; partner : (N,) rows of the map's voxels, −1 for none
+    points : (N, d) meters, source frame; partner : (N,) rows of the map's voxels, −1 for none
     T : (d+1, d+1), the lidar's z axis is that of its rings
     variance : σ² of the sensor, m²
     """

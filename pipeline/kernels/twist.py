@@ -70,7 +70,7 @@ def _rotate(x, y, z, a, b, u, v, w):
 
 
 @njit(cache=True)
-def orthonormalise(T):
+def orthonormalize(T):
     """Make the rotation of T exactly orthonormal again, in place, by Gram–Schmidt.
 
     Rounding that a transpose takes for an inverse grows 2.4-fold from scan to scan under constant velocity.

@@ -1,6 +1,6 @@
 """A hash map of voxels that keep running moments of their points and the local shape fitted to them.
 
-A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's centre, so
+A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's center, so
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
 (3), direction (3), shape; of a line or plane the variance across it; and of a plane in space its second
 direction (3), and how that variance carries over to the fit: at the mean, and by squared distance along both
@@ -47,7 +47,7 @@ class Voxels(NamedTuple):
 def insert(voxels, points, T, tick: int, alone: float):
     """Add points (N, d), moved by T into the map's frame, and fit the voxels anew that have grown by enough.
 
-    alone : points from which on a voxel is fitted without its neighbours
+    alone : points from which on a voxel is fitted without its neighbors
     Room for N more voxels must be there.
     """
     touched = np.empty(points.shape[0], np.int32)
@@ -138,9 +138,9 @@ def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
 
 @njit(cache=True, nogil=True)
 def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
-    """Mean of the voxel's own points; shape and direction from them, or from the neighbours' too.
+    """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
 
-    The neighbours help where the points are few or show no width: a ring that passes again and again while the
+    The neighbors help where the points are few or show no width: a ring that passes again and again while the
     lidar stands still leaves many points and no surface.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
@@ -152,7 +152,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
     if m[0] >= alone and _fit_shape(m, dimension, cell) >= (_BROAD * size) ** 2:
         return
-    _sum_neighbourhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+    _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
     _fit_shape(sums, dimension, cell)
 
 
@@ -163,8 +163,8 @@ def _fit_shape(m, dimension: int, cell) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _sum_neighbourhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
-    """Moments of the 3ᵈ voxels around one, relative to its centre, written to ``sums`` (10,)."""
+def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
+    """Moments of the 3ᵈ voxels around one, relative to its center, written to ``sums`` (10,)."""
     sums.fill(0.0)
     size = voxels.size_m
     for dx in range(-1, 2):

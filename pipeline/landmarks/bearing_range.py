@@ -18,7 +18,7 @@ _ANCHOR = 0.01  # noise of the first pose, in shares of a step's
 
 
 @dataclass(frozen=True, slots=True)
-class Linearisation:
+class Linearization:
     """Whitened residuals r at a state and the values of A = ∂r/∂x there.
 
     Attributes
@@ -134,7 +134,7 @@ class BearingRangeProblem:
         self._slope = -self.motion_whitening @ given.calibration.slope
         self._observation = whitening(given.measured_covariance)
 
-    def linearise(self, state: State) -> Linearisation:
+    def linearize(self, state: State) -> Linearization:
         """Residuals and Jacobians at a state."""
         given, p = self.measurements, state.poses.shape[1]
         calibration = given.calibration
@@ -155,9 +155,9 @@ class BearingRangeProblem:
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
         own = (state.calibration - calibration.mean) / calibration.sigma
-        return Linearisation(self._first @ off, own, motion, seen, self._first, J_motion, J_seen)
+        return Linearization(self._first @ off, own, motion, seen, self._first, J_motion, J_seen)
 
-    def system(self, at: Linearisation, weights: NDArray[np.float64]) -> LinearSystem:
+    def system(self, at: Linearization, weights: NDArray[np.float64]) -> LinearSystem:
         """The step's system A x = −r, observations weighed by √w (N,)."""
         root = np.sqrt(weights)[:, None]
         seen = at.observation_rows * root[..., None]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.landmarks.bearing_range import BearingRangeProblem
-from scanchain.landmarks.minimise import Optimiser, minimise
+from scanchain.landmarks.minimize import Optimizer, minimize
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
@@ -58,12 +58,12 @@ def compare_linear(system: LinearSystem, methods: Sequence[str], repeats: int) -
 
 
 def compare_nonlinear(
-    problem: BearingRangeProblem, guess: State, optimiser: Optimiser, methods: Sequence[str], repeats: int
+    problem: BearingRangeProblem, guess: State, optimizer: Optimizer, methods: Sequence[str], repeats: int
 ) -> tuple[MethodResult, ...]:
-    """Minimise from the guess with every method, interleaved; slow ones once only."""
+    """Minimize from the guess with every method, interleaved; slow ones once only."""
 
     def solve(solver: _Tally) -> NDArray[np.float64]:
-        return minimise(problem, guess, solver, optimiser=optimiser).state.unknowns
+        return minimize(problem, guess, solver, optimizer=optimizer).state.unknowns
 
     return _compare(solve, methods, repeats)
 

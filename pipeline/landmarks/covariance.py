@@ -12,7 +12,7 @@ from scanchain.landmarks.system import LinearSystem
 
 
 class Covariance:
-    """(AᵀA)⁻¹ between neighbouring poses, between poses and landmarks, and between landmarks."""
+    """(AᵀA)⁻¹ between neighboring poses, between poses and landmarks, and between landmarks."""
 
     def __init__(self, system: LinearSystem) -> None:
         """Raises UndeterminedError where A has not full column rank."""

@@ -24,7 +24,7 @@ _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are ta
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoise:
-    """White noise of a robot's wheels: what its motion is off by after a metre, and after a radian turned.
+    """White noise of a robot's wheels: what its motion is off by after a meter, and after a radian turned.
 
     It grows with the root of either. The values at hand are of a small differential drive on a smooth floor.
     """
@@ -36,7 +36,7 @@ class OdometryNoise:
 
     @property
     def densities(self) -> NDArray[np.float64]:
-        """Variances after a metre, a metre, a metre and a radian, (4,)."""
+        """Variances after a meter, a meter, a meter and a radian, (4,)."""
         return np.square([self.forward_m, self.sideways_m, self.drift_rad, self.turn_rad])
 
 

@@ -11,7 +11,7 @@ from scanchain.data import Matrix
 from scanchain.graph.robust import RobustLoss
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
 from scanchain.landmarks.dead_reckoning import chain
-from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.minimize import minimize
 from scanchain.landmarks.problem import LandmarkData, State
 from scanchain.landmarks.solvers import LinearSolver
 
@@ -50,7 +50,7 @@ def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
 def growing(measurements: Measurements, solver: LinearSolver) -> State:
     """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
 
-    Dead reckoning over the whole log may be metres off, where a robust loss finds but a local minimum; over a
+    Dead reckoning over the whole log may be meters off, where a robust loss finds but a local minimum; over a
     half of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
     """
     count = len(measurements.motion) + 1
@@ -64,7 +64,7 @@ def growing(measurements: Measurements, solver: LinearSolver) -> State:
         guess, _ = _first_seen(part, poses)
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
-        state = minimise(
+        state = minimize(
             BearingRangeProblem(part), State(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
         ).state
         poses, landmarks[known], own = state.poses, state.landmarks, state.calibration

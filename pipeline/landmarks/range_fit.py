@@ -13,7 +13,7 @@ from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.dead_reckoning import OWN, OdometryNoise, Reckoning, reckon
 from scanchain.landmarks.guess import from_odometry, growing
 from scanchain.landmarks.likeness import Likeness
-from scanchain.landmarks.minimise import Minimum, minimise
+from scanchain.landmarks.minimize import Minimum, minimize
 from scanchain.landmarks.mrclam import RangeLog
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import LinearSolver
@@ -65,7 +65,7 @@ class LogFit:
     Attributes
     ----------
     reckoned : by the velocities as they were logged, every landmark where it was first seen
-    problem, guess, minimum : with the noise as estimated; where the first minimisation began; where the last ended
+    problem, guess, minimum : with the noise as estimated; where the first minimization began; where the last ended
     variances : (6,) of the odometry's sources as ``OdometryNoise`` has them, of bearing and range
     loss : of the observations
     covariance, consistency : at the minimum
@@ -137,7 +137,7 @@ def _settled(
     tolerance: float,
 ) -> _Settled:
     """The minimum with noise as it is."""
-    minimum = minimise(
+    minimum = minimize(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )
     covariance = Covariance(problem.system(minimum.at, minimum.weights))

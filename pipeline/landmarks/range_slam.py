@@ -36,7 +36,7 @@ class RangeSolution:
     motion_chi2, observation_chi2 : χ² per degree of freedom of either kind, observations weighed; 1 is a noise
         model that fits
     iterations, converged, reason, time_s : of the whole, reading left out
-    problem, guess : the problem with that noise, and where its minimisation began
+    problem, guess : the problem with that noise, and where its minimization began
     """
 
     nodes_s: NDArray[np.float64]

@@ -12,7 +12,7 @@ from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.landmarks.accuracy import Accuracy
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.dead_reckoning import OdometryNoise
-from scanchain.landmarks.minimise import Optimiser
+from scanchain.landmarks.minimize import Optimizer
 from scanchain.landmarks.problem import State
 
 Guess = Literal["odometry", "disturbed", "origin"]
@@ -24,7 +24,7 @@ class Options:
 
     ``methods`` are the linear solvers by name, or "all"; the first one estimates what a file holds.
     ``robot`` and ``noise`` are for MRCLAM folders, where a noise of None is to be estimated; ``guess`` and
-    ``optimiser`` for nonlinear files.
+    ``optimizer`` for nonlinear files.
     """
 
     methods: tuple[str, ...]
@@ -32,7 +32,7 @@ class Options:
     robot: int
     noise: OdometryNoise | None
     guess: Guess
-    optimiser: Optimiser
+    optimizer: Optimizer
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Study:
     Attributes
     ----------
     name, facts : of the problem, and lines about it
-    before, after : optimisation
+    before, after : optimization
     converged : whether every iteration came to an end by itself
     pose_covariance, landmark_covariance : (K, p, p), (L, 2, 2) after it; m, rad
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown

@@ -14,7 +14,7 @@ from scanchain.landmarks.assembly import landmark_columns, pose_columns
 from scanchain.landmarks.bearing_range import BearingRangeProblem, world_referenced
 from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from scanchain.landmarks.covariance import Covariance
-from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.minimize import minimize
 from scanchain.landmarks.problem import LandmarkData, State
 from scanchain.landmarks.relative_position import linear_system, state_of
 from scanchain.landmarks.solvers import create_solver, methods_for
@@ -61,21 +61,21 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     problem = BearingRangeProblem(world_referenced(data))
     guess = _guess(problem, options.guess)
     names, left_out = methods_for(options.methods, problem.pattern.shape[1])
-    minimum = minimise(problem, guess, create_solver(names[0]), optimiser=options.optimiser)
+    minimum = minimize(problem, guess, create_solver(names[0]), optimizer=options.optimizer)
     begin = working_s()
-    system = problem.system(problem.linearise(minimum.state), minimum.weights)
+    system = problem.system(problem.linearize(minimum.state), minimum.weights)
     build_s = working_s() - begin
-    if options.optimiser == "gradient-descent":  # solves no linear system: compare them on the one at its end
+    if options.optimizer == "gradient-descent":  # solves no linear system: compare them on the one at its end
         methods = compare_linear(system, names, options.repeats)
     else:
-        methods = compare_nonlinear(problem, guess, options.optimiser, names, options.repeats)
+        methods = compare_nonlinear(problem, guess, options.optimizer, names, options.repeats)
     ended = "converged" if minimum.converged else "DID NOT CONVERGE"
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
         Fact("guess", options.guess),
         Fact(
             "iteration",
-            f"{options.optimiser} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
+            f"{options.optimizer} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
         ),
         chi2_fact(minimum.cost, len(system.b), system.pattern.shape[1]),
         *left_out_fact(left_out),

@@ -33,7 +33,7 @@ def study_log(folder: Path, options: Options) -> Study:
     log = read_mrclam(folder, options.robot)
     solution = solve_range_log(log, options.noise)
     begin = working_s()
-    at = solution.problem.linearise(solution.guess)
+    at = solution.problem.linearize(solution.guess)
     system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
@@ -76,7 +76,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     noise = solution.odometry_noise
     wheels = (
         f"{noise.forward_m:.3g} m forward, {noise.sideways_m:.3g} m sideways, {noise.drift_rad:.3g} rad"
-        f" after a metre, {noise.turn_rad:.3g} rad after a radian"
+        f" after a meter, {noise.turn_rad:.3g} rad after a radian"
     )
     own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix
 from scanchain.landmarks.bearing_range import BearingRangeProblem
 from scanchain.landmarks.covariance import Covariance
-from scanchain.landmarks.minimise import Minimum
+from scanchain.landmarks.minimize import Minimum
 
 _STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that what was stated counts as
 _LEAST_REDUNDANCY = 0.05  # of what the sightings count as

@@ -23,7 +23,7 @@ _MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use
 _SOME_BELOW = 0.05  # of beams, below range_min
 _STUCK_SHARE = 0.01  # of beams, all at the farthest range
 _LONG_REST_S = 5.0
-_WHEELS_MOVE = 0.02  # metres, or the sine of a turn
+_WHEELS_MOVE = 0.02  # meters, or the sine of a turn
 _FEW_POINTS = 50
 _OPEN = 0.003  # information about the weakest motion, below which matches are degenerate as a rule
 

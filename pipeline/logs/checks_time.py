@@ -24,7 +24,7 @@ _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # of the period, where a unit of time is hard to believe
 _SPINS_AT_S = (0.04, 0.25)
-_WIDE_VOXELS, _WIDE_M = 4, 6  # of a search for motions of metres between scans; either alone does not help
+_WIDE_VOXELS, _WIDE_M = 4, 6  # of a search for motions of meters between scans; either alone does not help
 _SURE = 0.9  # share of the scans that turn alike, and how alike they begin
 _NEAR_NS = 500_000_000  # as far as a run looks for the wheels' reading
 

@@ -21,7 +21,7 @@ class Stamp(Struct, frozen=True):
 
 
 class Vector(Struct, frozen=True):
-    """Metres."""
+    """Meters."""
 
     x: float = 0.0
     y: float = 0.0

@@ -37,7 +37,7 @@ class LogInfo:
     """A log: its files and topics, what a run would take of it, and what is wrong with it.
 
     ``sensors`` are those beside lidar and wheels.
-    ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Metres, radians,
+    ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Meters, radians,
     nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
     ``base_frame`` is empty where the log does not tell it. ``idle_keys`` are the settings that have no effect on
     it, and why.

@@ -19,7 +19,7 @@ _FARTHEST_M = float(np.finfo(np.float32).max)
 
 
 class LaserScanMessage(NamedTuple):
-    """A sensor_msgs/LaserScan as it is: radians, seconds, metres; intensities are passed over.
+    """A sensor_msgs/LaserScan as it is: radians, seconds, meters; intensities are passed over.
 
     ``T_frame_scan`` (4, 4) is where the scan lies in its frame, None where that is its origin.
     """

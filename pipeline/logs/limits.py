@@ -13,7 +13,7 @@ from scanchain.words import counted
 
 
 class RangeLimits(NamedTuple):
-    """Metres; what lies outside is dropped at the reader and counted."""
+    """Meters; what lies outside is dropped at the reader and counted."""
 
     min_m: float
     max_m: float
@@ -22,7 +22,7 @@ class RangeLimits(NamedTuple):
 class Returns(NamedTuple):
     """The valid returns of one scan message.
 
-    ``points`` (N, d) float32 metres, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
+    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
     counts what was left out, ``why`` says for what where nothing is left.
     """
 

@@ -17,7 +17,7 @@ _FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "
 
 
 class Place(NamedTuple):
-    """A pose as messages tell it: metres and a unit quaternion."""
+    """A pose as messages tell it: meters and a unit quaternion."""
 
     x: float
     y: float

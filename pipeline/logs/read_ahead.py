@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
-_PIECE_BYTES = 4_000_000  # neighbours are fetched together up to this size
+_PIECE_BYTES = 4_000_000  # neighbors are fetched together up to this size
 _GAP_BYTES = 65_536  # read along with what lies on both sides of it, as asking anew takes longer
 _AHEAD = 3  # pieces
 _KEPT = 2  # pieces behind, as threads that read them overtake each other

@@ -92,7 +92,7 @@ _LANGUAGES = {
 
 
 def _ros(type_names: tuple[str, ...], read: Read) -> dict[Kind, _Bind]:
-    """A type that ROS 1 and ROS 2 lay out alike, each in its own serialisation."""
+    """A type that ROS 1 and ROS 2 lay out alike, each in its own serialization."""
     forms = {"cdr": CdrReader, "ros1": Ros1Reader}
     return {
         Kind(encoding, name): partial(_form_bound, read, form)

@@ -39,8 +39,8 @@ class ScanFacts(NamedTuple):
     start_rad : azimuth of the first point
     rings : rings with returns, 0 where points do not tell
     digest : of the measurements, equal for equal ones
-    points : (N, d) metres, those that are kept
-    outline : (C,) metres, mean distance in each cell of direction, NaN where nothing was seen
+    points : (N, d) meters, those that are kept
+    outline : (C,) meters, mean distance in each cell of direction, NaN where nothing was seen
     """
 
     stamp_ns: int

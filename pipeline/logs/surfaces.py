@@ -38,7 +38,7 @@ class Weakest(NamedTuple):
 def weakest_motion(points: RawPoints, config: PreprocessConfig) -> Weakest:
     """The least eigenvalue of the information Σ JᵀJ / n of point-to-plane residuals, J = [nᵀ, (p × n)ᵀ / range].
 
-    points : (N, d) metres, lidar frame
+    points : (N, d) meters, lidar frame
     """
     from scipy.spatial import KDTree
 

@@ -33,7 +33,7 @@ class Survey:
     ----------
     scans : facts of each readable scan, in the order of log time, their points and outlines left out
     log_ns, stamps_ns : (N,) int64 log times and header stamps of those scans
-    samples : (N, d) metres, points of some ten scans from all over the log
+    samples : (N, d) meters, points of some ten scans from all over the log
     rests : when the surroundings stayed as they were, for a second or more
     wheels : poses of the wheels, in the order of log time; empty where there are none
     malformed : what is wrong with each message that is not readable

@@ -31,7 +31,7 @@ class WheelTrack:
         return stamp_ns in self.poses or bool(self.stamps_ns and self.stamps_ns[-1] >= stamp_ns)
 
     def at(self, stamp_ns: int) -> Pose | None:
-        """The reading at the instant, or between its neighbours, or the nearest within half a second."""
+        """The reading at the instant, or between its neighbors, or the nearest within half a second."""
         if stamp_ns in self.poses:
             return self.poses[stamp_ns]
         after = bisect_left(self.stamps_ns, stamp_ns)

@@ -109,7 +109,7 @@ class LogWriter:
     ) -> None:
         """Append a sensor_msgs/PointCloud2 of one row.
 
-        points : (N, 3) metres
+        points : (N, 3) meters
         times_s : (N,) seconds after ``stamp_ns``; written as ``t`` (uint32 ns, from 0 up) or ``time`` (float32 s)
         ring, intensity : (N,) written as uint16 and float32
         """

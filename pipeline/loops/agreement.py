@@ -17,7 +17,7 @@ _MARGIN_SHARE = 0.05  # of a range, by which it may differ in any case
 def free_space_agreement(surroundings: LocalMap, points: Points, T_target_source: Pose, margin_m: float) -> float:
     """Share, of the source's points that the target's lidar could see, that lie where it did see a surface.
 
-    points : (N, 3) metres, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
+    points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
     """
     ranges_m = np.empty(_BINS)
     agreeing = contradicting = 0

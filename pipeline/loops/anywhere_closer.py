@@ -38,12 +38,12 @@ class AnywhereCloser:
         groups : (K,) numbers of ``Pieces.groups``
         """
         begun = self.pieces.beginnings[-1]
-        way_m = keyframes[-1].travelled_m - keyframes[begun].travelled_m
+        way_m = keyframes[-1].traveled_m - keyframes[begun].traveled_m
         unknown = np.flatnonzero(groups != groups[-1])
-        is_time = way_m >= _FIRST_M and keyframes[-1].travelled_m >= self.next_m
+        is_time = way_m >= _FIRST_M and keyframes[-1].traveled_m >= self.next_m
         if not len(unknown) or not is_time or self.near.search is None:
             return ()
-        self.next_m = keyframes[-1].travelled_m + max(_PATIENCE * way_m, _APART_M)
+        self.next_m = keyframes[-1].traveled_m + max(_PATIENCE * way_m, _APART_M)
         found = self.near.search.find_anywhere(
             keyframes, graph.poses, self._sought(unknown, groups), len(keyframes) - begun
         )

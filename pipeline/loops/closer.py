@@ -1,4 +1,4 @@
-"""Loop closures: where a keyframe may be by position and drift and, in 3D, places recognised by their looks."""
+"""Loop closures: where a keyframe may be by position and drift and, in 3D, places recognized by their looks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LoopCloser:
         self.near = NearCloser(config, dimension, self.pieces)
         self.anywhere = AnywhereCloser(self.near, self.pieces) if dimension == 2 else None
         self.places = (
-            PlaceCloser(config, self.pieces) if dimension == 3 and config.loops.recognise_places else None
+            PlaceCloser(config, self.pieces) if dimension == 3 and config.loops.recognize_places else None
         )
 
     def begin_piece(self, keyframe: int) -> None:
@@ -29,7 +29,7 @@ class LoopCloser:
         self.pieces.begin(keyframe)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to an older place near it, and of places recognised; accepted or not.
+        """Closures of the newest keyframe to an older place near it, and of places recognized; accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are joined
         """

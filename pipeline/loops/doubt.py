@@ -20,17 +20,17 @@ class Doubt:
     """
 
     def __init__(self, drift: float) -> None:
-        """By how much odometry drifts, metres a metre."""
+        """By how much odometry drifts, meters a meter."""
         self.drift = drift
         self.lengths = GrowingArray((), np.float64)
 
     def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
-        """Metres (K,) that each keyframe of the graph may be off as seen from one of them, at most the limit."""
+        """Meters (K,) that each keyframe of the graph may be off as seen from one of them, at most the limit."""
         self._learn(graph)
         is_open = ~graph.is_loop | (graph.weight > _CLOSED)
         lengths = np.where(is_open, self.lengths.rows, np.inf)
-        metres = shortest_ways(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
-        return np.minimum(self.drift * metres, limit_m)
+        meters = shortest_ways(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
+        return np.minimum(self.drift * meters, limit_m)
 
     def _learn(self, graph: PoseGraph) -> None:
         """Measure the edges that are new."""

@@ -27,9 +27,9 @@ class Gallery:
         self.tree: KDTree | None = None
         self.planted = 0
 
-    def add(self, place: Place, travelled_m: float) -> None:
-        """Keep a place for later; it was passed after so many metres."""
-        self.waiting.append((travelled_m, place))
+    def add(self, place: Place, traveled_m: float) -> None:
+        """Keep a place for later; it was passed after so many meters."""
+        self.waiting.append((traveled_m, place))
 
     def alike(self, place: Place, count: int, before_m: float) -> list[Place]:
         """The places with the most similar keys, of those passed before; what was asked for may only grow."""

@@ -35,7 +35,7 @@ class LocalMap:
             yield T_anchor_odom @ member.T_odom_lidar, member.points
 
     def points(self) -> Points:
-        """(M, 3) metres within the radius, anchor's frame."""
+        """(M, 3) meters within the radius, anchor's frame."""
         total = sum(len(member.points) for member in self.members)
         count = max(len(self.members) * _POINTS // max(total, _POINTS), 1)
         moved = np.vstack([lie.transform(T, points) for T, points in self.views(count)])
@@ -44,12 +44,12 @@ class LocalMap:
 
 def local_map(keyframes: Sequence[Keyframe], anchor: int, radius_m: float, pieces: Pieces) -> LocalMap:
     """The surroundings of a keyframe, as far as they are known."""
-    here_m = keyframes[anchor].travelled_m
+    here_m = keyframes[anchor].traveled_m
     begin, end = pieces.span(anchor, len(keyframes))
-    first = bisect_left(keyframes, here_m - PAST * radius_m, begin, end, key=_travelled_m)
-    last = bisect_left(keyframes, here_m + FUTURE * radius_m, begin, end, key=_travelled_m)
+    first = bisect_left(keyframes, here_m - PAST * radius_m, begin, end, key=_traveled_m)
+    last = bisect_left(keyframes, here_m + FUTURE * radius_m, begin, end, key=_traveled_m)
     return LocalMap(keyframes[anchor], keyframes[first:last], radius_m)
 
 
-def _travelled_m(keyframe: Keyframe) -> float:
-    return keyframe.travelled_m
+def _traveled_m(keyframe: Keyframe) -> float:
+    return keyframe.traveled_m

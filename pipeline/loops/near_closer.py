@@ -63,9 +63,9 @@ class NearCloser:
 
     def _old(self, keyframes: Sequence[Keyframe]) -> int:
         """How many of the first keyframes lie far enough back along the way to count as revisited."""
-        limit_m = keyframes[-1].travelled_m - self.config.min_travel_m
+        limit_m = keyframes[-1].traveled_m - self.config.min_travel_m
         old = len(keyframes)
-        while old > 0 and keyframes[old - 1].travelled_m > limit_m:
+        while old > 0 and keyframes[old - 1].traveled_m > limit_m:
             old -= 1
         return old
 

@@ -1,4 +1,4 @@
-"""What a place looks like from above, whichever way one came and a few metres aside."""
+"""What a place looks like from above, whichever way one came and a few meters aside."""
 
 from __future__ import annotations
 

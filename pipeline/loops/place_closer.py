@@ -1,4 +1,4 @@
-"""Loop closures of places recognised: described once complete, compared with all older ones, measured, judged."""
+"""Loop closures of places recognized: described once complete, compared with all older ones, measured, judged."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class PlaceCloser:
         while self.examined < len(keyframes):
             keyframe = keyframes[self.examined]
             radius_m = self._radius_m(keyframe)
-            if keyframes[-1].travelled_m < keyframe.travelled_m + FUTURE * radius_m and not finish:
+            if keyframes[-1].traveled_m < keyframe.traveled_m + FUTURE * radius_m and not finish:
                 return
             self.examined += 1
-            if keyframe.travelled_m >= self.next_m:
-                self.next_m = keyframe.travelled_m + _SPACING * radius_m
+            if keyframe.traveled_m >= self.next_m:
+                self.next_m = keyframe.traveled_m + _SPACING * radius_m
                 yield keyframe
 
     def _closures(
@@ -77,7 +77,7 @@ class PlaceCloser:
         candidates = self.recognition.candidates(
             place,
             self._expected(anchor, keyframes, T_world),
-            before_m=anchor.travelled_m - apart_m,
+            before_m=anchor.traveled_m - apart_m,
             radius_m=radius_m,
             keyframes=keyframes,
             T_world=T_world,
@@ -118,8 +118,8 @@ class PlaceCloser:
         if T_world is not None:
             moved = lie.inverse(T_world[j]) @ T_world[i] @ measured.match.T_target_source
             moved_m = float(np.linalg.norm(moved[:3, 3]))
-        travelled_m = source.anchor.travelled_m - target.anchor.travelled_m
-        problem = self._problem(candidate, measured, moved_m, travelled_m)
+        traveled_m = source.anchor.traveled_m - target.anchor.traveled_m
+        problem = self._problem(candidate, measured, moved_m, traveled_m)
         return Closure(
             target=i,
             source=j,
@@ -130,10 +130,10 @@ class PlaceCloser:
             proposed_by=candidate.proposed_by,
         )
 
-    def _problem(self, candidate: Candidate, measured: Measurement, moved_m: float, travelled_m: float) -> str:
+    def _problem(self, candidate: Candidate, measured: Measurement, moved_m: float, traveled_m: float) -> str:
         """Why a measurement is no closure, empty if it is one."""
         limits, match = self.config, measured.match
-        plausible_m = max(limits.place_drift * travelled_m, limits.min_radius_m)
+        plausible_m = max(limits.place_drift * traveled_m, limits.min_radius_m)
         if not match.is_fit:
             return match.reason
         if measured.overlap < limits.min_place_overlap:

@@ -15,8 +15,8 @@ from scanchain.loops.submaps import Submaps
 from scanchain.matching import CorrelativeMap, Seed, VoxelMap
 
 _BASIN_M = 0.5  # of doubt, up to which matching needs no search
-_SHARE_OF_DOUBT = 0.2  # that is travelled between two searches: wide windows cost most and run out last
-_RADIANS_A_METRE = 0.2  # of doubt: who is off by a metre after five looks that far to the side
+_SHARE_OF_DOUBT = 0.2  # that is traveled between two searches: wide windows cost most and run out last
+_RADIANS_A_METER = 0.2  # of doubt: who is off by a meter after five looks that far to the side
 _LEAST_RAD = 0.1
 _SPACING_M = 4.0  # between the submaps that are searched
 _SUBMAPS = 6  # of them at most
@@ -54,9 +54,9 @@ class PlanarSearch:
         near : older keyframes within reach; doubts_m : by how much each of the older keyframes may be off
         """
         source = keyframes[-1]
-        if doubts_m[near].max() <= _BASIN_M or source.travelled_m < self.next_m:
+        if doubts_m[near].max() <= _BASIN_M or source.traveled_m < self.next_m:
             return None
-        self.next_m = source.travelled_m + _SHARE_OF_DOUBT * float(doubts_m[near].max())
+        self.next_m = source.traveled_m + _SHARE_OF_DOUBT * float(doubts_m[near].max())
         anchors = self._anchors(near, T_world)
         points = self._surroundings(keyframes, self.submaps.half_width)
         T_first = lie.between(T_world[anchors], T_world[-1])
@@ -66,7 +66,7 @@ class PlanarSearch:
                 self.submaps.around(anchor, keyframes, len(doubts_m) - 1),
                 T,
                 doubt_m,
-                _LEAST_RAD + _RADIANS_A_METRE * doubt_m,
+                _LEAST_RAD + _RADIANS_A_METER * doubt_m,
             )
             for anchor, T, doubt_m in zip(anchors, T_first, doubts_m[anchors].tolist(), strict=True)
         ]

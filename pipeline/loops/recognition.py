@@ -55,7 +55,7 @@ class Recognition:
         anchor = keyframes[place.anchor]
         gallery = self.galleries.setdefault(anchor.scale, Gallery())
         alike = gallery.alike(place, _CANDIDATES, before_m)
-        gallery.add(place, anchor.travelled_m)
+        gallery.add(place, anchor.traveled_m)
         if not alike:
             return []
         best = self._most_alike(place, alike, radius_m, keyframes, T_world)
@@ -78,7 +78,7 @@ class Recognition:
         for likeness, other in ranked[1:]:
             if likeness.score < _RIVAL * best.score:
                 break
-            between_m = abs(keyframes[other].travelled_m - keyframes[target].travelled_m)
+            between_m = abs(keyframes[other].traveled_m - keyframes[target].traveled_m)
             apart_m = float(np.linalg.norm(_position(T_world, other, likeness) - here))
             if apart_m > max(_APART * radius_m, self.config.drift * between_m):
                 return Candidate(target, best, Proposal.PLACE, rival=other)
@@ -100,15 +100,15 @@ class Recognition:
             )
             likeness = compare(place, other, expected_rad=_yaw(T_expected), within_rad=_HEADING_RAD)
             moved_m = np.linalg.norm(_position(T_world, other.anchor, likeness) - T_world_place[:3, 3])
-            travelled_m = keyframes[place.anchor].travelled_m - keyframes[other.anchor].travelled_m
-            if moved_m <= search_radius_m(self.config, travelled_m):
+            traveled_m = keyframes[place.anchor].traveled_m - keyframes[other.anchor].traveled_m
+            if moved_m <= search_radius_m(self.config, traveled_m):
                 found.append(Candidate(other.anchor, likeness, Proposal.POSITION))
         return sorted(found, key=lambda each: -each.likeness.score)[:1]
 
 
-def search_radius_m(config: LoopsConfig, travelled_m: float) -> float:
-    """How far from where odometry says a place is looked for, so many metres of the way later."""
-    return float(np.clip(config.drift * travelled_m, config.min_radius_m, config.max_radius_m))
+def search_radius_m(config: LoopsConfig, traveled_m: float) -> float:
+    """How far from where odometry says a place is looked for, so many meters of the way later."""
+    return float(np.clip(config.drift * traveled_m, config.min_radius_m, config.max_radius_m))
 
 
 def _position(T_world: Matrix, target: int, likeness: Likeness) -> Matrix:

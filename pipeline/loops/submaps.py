@@ -17,7 +17,7 @@ _HELD = 64  # submaps in memory; the one unused for longest goes first
 class Submaps:
     """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame, its voxels of the size used there.
 
-    Neighbouring keyframes are placed by odometry, which over so short a way is as good as any pose known later;
+    Neighboring keyframes are placed by odometry, which over so short a way is as good as any pose known later;
     those of another piece are left out.
     """
 

@@ -12,7 +12,7 @@ _SCALE_M = 0.001  # LAZ holds whole multiples of it
 
 
 def write_laz(path: Path | str, points: Points) -> None:
-    """Write points (N, d) as LAZ 1.4, to the millimetre; 2D ones lie in the plane z = 0."""
+    """Write points (N, d) as LAZ 1.4, to the millimeter; 2D ones lie in the plane z = 0."""
     import laspy
 
     rows = np.zeros((len(points), 3))

@@ -28,7 +28,7 @@ free_thresh: 0.196
 
 
 def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:
-    """(rows, columns) pixels, the row of largest y first: black occupied, white free, grey unknown."""
+    """(rows, columns) pixels, the row of largest y first: black occupied, white free, gray unknown."""
     probability = grid.probability()
     image = np.full(probability.shape, UNKNOWN, np.uint8)
     image[probability > OCCUPIED_PROBABILITY] = OCCUPIED
@@ -56,7 +56,7 @@ def write_map(folder: Path | str, grid: OccupancyGrid) -> None:
 
 
 def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, float]]:
-    """Cells (rows, columns) of a map that ``write_map`` wrote, the resolution in metres and the origin's x, y.
+    """Cells (rows, columns) of a map that ``write_map`` wrote, the resolution in meters and the origin's x, y.
 
     Cells are 0 free, 100 occupied, −1 unknown; row 0 has the lowest y. Raises InputError where a file is missing
     or of another make.

@@ -32,7 +32,7 @@ class View:
     Attributes
     ----------
     T_world_lidar : (d+1, d+1)
-    points : (M, d) metres, lidar frame
+    points : (M, d) meters, lidar frame
     spacing_m : edge of the voxels that the scan was thinned out with; a surface has a point in each
     """
 
@@ -79,7 +79,7 @@ def _in_space(points: Points) -> Points:
 
 
 class _Cells:
-    """Points sorted by cubes, so that a scan looks at those within reach alone, and at neighbours in turn."""
+    """Points sorted by cubes, so that a scan looks at those within reach alone, and at neighbors in turn."""
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m

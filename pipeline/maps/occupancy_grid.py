@@ -49,7 +49,7 @@ class OccupancyGrid:
         self.skipped = 0
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
-        """Draw one scan: points (N, d), metres, lidar frame."""
+        """Draw one scan: points (N, d), meters, lidar frame."""
         self.insert_batch(T_world_lidar[None], points, np.array([0, len(points)]))
 
     def insert_batch(self, poses: Matrix, points: NDArray[np.floating], offsets: NDArray[np.int64]) -> None:

@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 
 _HEADER = """ply
 format binary_little_endian 1.0
-comment scanchain, metres, world frame
+comment scanchain, meters, world frame
 element vertex {count}
 property float x
 property float y

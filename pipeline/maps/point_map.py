@@ -44,7 +44,7 @@ class PointMap:
         return self.used
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
-        """Add one scan: points (N, d), metres, lidar frame; those beyond ``max_range_m`` are left out."""
+        """Add one scan: points (N, d), meters, lidar frame; those beyond ``max_range_m`` are left out."""
         if not np.isfinite(T_world_lidar).all():
             raise InputError("a scan added to the map has a pose that is not finite")
         done = 0

@@ -34,9 +34,9 @@ def align(
 
     Both clouds are moved to their centroids and scaled so that a voxel has the preset's size; the other lengths
     (search radius, kernel scale, tolerance) are the preset's, too. The unit of the clouds is therefore free: where
-    the text says metres, read that unit.
+    the text says meters, read that unit.
 
-    target, source : (N, d) and (M, d), d = 2 or 3, metres
+    target, source : (N, d) and (M, d), d = 2 or 3, meters
     T_guess : (d+1, d+1), the identity where left out; motions of about three voxels are found from there, in the
         plane of half the target's median range and 1 rad (branch and bound; Olson 2009, Hess et al. 2016)
     voxel_size_m : of the map made of the target; where left out, a fraction of the target's extent such that about

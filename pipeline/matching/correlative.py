@@ -25,7 +25,7 @@ class Seed:
     ----------
     T_target_source : (3, 3), to within a cell
     share : of the highest score that the points could have, 0 where no pose reached the least asked for
-    rival : share of the best pose elsewhere, a metre or a tenth of a radian away; 0 below 0.8 of the best
+    rival : share of the best pose elsewhere, a meter or a tenth of a radian away; 0 below 0.8 of the best
     """
 
     T_target_source: Pose
@@ -39,10 +39,10 @@ class CorrelativeMap:
     A point scores fully in a cell with a surface and half in one beside it; cells are as large as voxels.
     """
 
-    def __init__(self, target: VoxelMap, centre: Pose, radius_m: float = math.inf) -> None:
-        """centre, radius_m : the part of the map that is taken."""
+    def __init__(self, target: VoxelMap, center: Pose, radius_m: float = math.inf) -> None:
+        """center, radius_m : the part of the map that is taken."""
         means = target.points()
-        means = means[np.abs(means - centre[:2, 2]).max(axis=1, initial=0.0) <= radius_m]
+        means = means[np.abs(means - center[:2, 2]).max(axis=1, initial=0.0) <= radius_m]
         self.resolution_m = target.voxels.size_m
         corners = (means.min(axis=0), means.max(axis=0)) if len(means) else (np.zeros(2), np.zeros(2))
         self.origin_m = corners[0] - self.resolution_m * (2**_TOP + 1)
@@ -54,7 +54,7 @@ class CorrelativeMap:
     def best(
         self, points: Points, T_first: Pose, *, half_width_m: float, half_width_rad: float, least: float = 0.0
     ) -> Seed:
-        """The best pose within a window around the first one: points (N, 2) metres, lidar frame.
+        """The best pose within a window around the first one: points (N, 2) meters, lidar frame.
 
         Turns are tried in steps that move a point at the scan's median range by one cell.
         least : share of the highest score, below which nothing counts

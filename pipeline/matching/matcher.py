@@ -17,7 +17,7 @@ from scanchain.kernels.validity import largest_magnitude
 from scanchain.matching.voxel_map import VoxelMap
 from scanchain.words import counted
 
-OPTIMISERS = {
+OPTIMIZERS = {
     "gradient-descent": GRADIENT_DESCENT,
     "newton": NEWTON,
     "gauss-newton": GAUSS_NEWTON,
@@ -35,7 +35,7 @@ _ENDINGS = {
 
 
 class PointToShapeMatcher:
-    """Point-to-line (2D) and point-to-plane (3D) ICP, by one of four optimisers.
+    """Point-to-line (2D) and point-to-plane (3D) ICP, by one of four optimizers.
 
     Residuals n·(R x + t − y) with n from the map (Chen & Medioni 1992; Censi 2008), Geman–McClure weights, and
     Levenberg–Marquardt by default.
@@ -49,7 +49,7 @@ class PointToShapeMatcher:
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one.
 
-        points : (N, d) metres, lidar frame
+        points : (N, d) meters, lidar frame
         prior : what the pose is expected to be, and how surely; its doubt sets the first scale of the kernel
         wide : search far, for a first pose that is little more than a guess
         Raises InputError where points or first pose do not fit the map.
@@ -75,7 +75,7 @@ def terms_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Terms:
     """The numbers a kernel runs under."""
     wide = checks.truth(wide, "wide")
     return Terms(
-        optimiser=OPTIMISERS[config.optimiser],
+        optimizer=OPTIMIZERS[config.optimizer],
         max_iterations=config.max_iterations,
         reach=config.wide_reach_voxels if wide else config.reach_voxels,
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),

@@ -19,14 +19,14 @@ class DegeneratePairsError(ScanchainError):
 
 
 def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] | None = None) -> Pose:
-    """The pose T that minimises Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
+    """The pose T that minimizes Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
 
-    With centred x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
+    With centered x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
         R = V diag(1, …, det(V Uᵀ)) Uᵀ        t = μ_y − R μ_x
     (Arun, Huang & Blostein 1987; the determinant after Umeyama 1991, eq. 43; weights after Sorkine-Hornung &
     Rabinovich 2017, eq. 22). Without the determinant noisy or planar points give a reflection.
 
-    source, target : (N, d) metres, pair by pair; weight : (N,), ≥ 0, 1 where left out
+    source, target : (N, d) meters, pair by pair; weight : (N,), ≥ 0, 1 where left out
     Raises DegeneratePairsError where W leaves the rotation undetermined: rank below d − 1.
     """
     d = checks.dimension_of(source, "source")

@@ -47,7 +47,7 @@ class SvdMatcher:
             except DegeneratePairsError:
                 ending = registration.SINGULAR if pairs else registration.NO_PARTNERS
                 break
-            T = lie.normalise(correction @ T)
+            T = lie.normalize(correction @ T)
             if scale_m <= terms.scale_m and self._stands_still(correction, T):
                 ending = registration.CONVERGED
                 break

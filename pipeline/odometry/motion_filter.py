@@ -43,7 +43,7 @@ class MotionFilter:
         pose, covariance, motion = self._predicted(noise)
         known = np.linalg.inv(np.linalg.inv(pose) + information)
         gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
-        self.motion = lie.normalise(self.motion @ lie.exp(gain @ known @ information @ surprise))
+        self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ surprise))
         self.pose_covariance = known
         self.covariance = known @ gain.T
         self.motion_covariance = motion - gain @ (pose - known) @ gain.T

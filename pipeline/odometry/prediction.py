@@ -52,7 +52,7 @@ class Prediction:
 class Predictor:
     """Remembers the last pose, the last motion and the last wheel reading, and how sure these were.
 
-    Without wheels the motion goes on as it was, by a filter whose noise is learnt from the errors of the
+    Without wheels the motion goes on as it was, by a filter whose noise is learned from the errors of the
     predictions. Where a scan tells nothing along a direction, the motion there goes on and its variance grows.
     """
 
@@ -82,7 +82,7 @@ class Predictor:
     def _prediction(
         self, motion: Pose, covariance: Matrix, experience: Experience, *, is_guess: bool = False
     ) -> Prediction:
-        prior = Prior(lie.normalise(self.T_odom_lidar @ motion), covariance, experience.first_sigma)
+        prior = Prior(lie.normalize(self.T_odom_lidar @ motion), covariance, experience.first_sigma)
         return Prediction(prior, experience, is_guess)
 
     def alternatives(self, scan: Scan) -> tuple[Pose, ...]:
@@ -96,7 +96,7 @@ class Predictor:
         return T @ self.T_previous_current, *stretched, T
 
     def window(self, scan: Scan) -> tuple[float, float]:
-        """How far from the expected pose a scan may be at the most, in the plane: metres and radians."""
+        """How far from the expected pose a scan may be at the most, in the plane: meters and radians."""
         elapsed_s = max(self.intervals.to(scan), self.intervals.usual_s) + self.lost_s
         return (
             min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),

@@ -18,7 +18,7 @@ class Sweep:
 
     Attributes
     ----------
-    points : (M, d) float64 metres, each in the lidar frame of its own instant
+    points : (M, d) float64 meters, each in the lidar frame of its own instant
     times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
     middle_s : seconds from the scan's stamp to its middle
     """

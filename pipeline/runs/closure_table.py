@@ -15,7 +15,7 @@ from scanchain.runs.verdicts import JudgedClosure
 def write_closures(
     path: Path, judged: Sequence[JudgedClosure], keyframes: Sequence[Keyframe], dimension: int
 ) -> None:
-    """Write every closure tried, with its final verdict and the robust weight that the optimiser left to it."""
+    """Write every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -59,6 +59,6 @@ def write_closures(
         "rejected_by": "verification: by matching; back end: verified, but it contradicts the rest of the graph; "
         "empty where it is accepted",
         "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
-        "weight": "robust weight after the last optimisation, 0 for closures that never entered the graph",
+        "weight": "robust weight after the last optimization, 0 for closures that never entered the graph",
     }
     pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")

@@ -45,21 +45,21 @@ class Accuracy(Struct, frozen=True):
 
 
 class GroundTruth(Struct, frozen=True):
-    """How good the run is: after optimisation and before.
+    """How good the run is: after optimization and before.
 
     ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
     """
 
     source: str
     path_length_m: float
-    optimised: Accuracy
+    optimized: Accuracy
     odometry: Accuracy
     max_gap_s: float | None = None
 
     @property
     def complaint(self) -> str:
         """That the trajectory is far off, in words; empty where it is not."""
-        error, share = self.optimised, self.optimised.ate_share_of_path
+        error, share = self.optimized, self.optimized.ate_share_of_path
         if share is None or share <= _FAR_OFF_SHARE or error.ate_rmse_m <= _FAR_OFF_M:
             return ""
         return (
@@ -86,7 +86,7 @@ class Metrics(Struct, frozen=True):
     run_s: float
     scans_per_s: float
     times_real_time: float
-    travelled_m: float
+    traveled_m: float
     scan_points: int
     dropped_points: int
     ok: int
@@ -174,7 +174,7 @@ def measure(
         run_s=run_s,
         scans_per_s=len(steps) / run_s,
         times_real_time=steps.span_s / run_s,
-        travelled_m=float(path_length(result.trajectory.poses)[-1]),
+        traveled_m=float(path_length(result.trajectory.poses)[-1]),
         scan_points=sum(row.points for row in steps.rows),
         dropped_points=sum(row.dropped for row in steps.rows),
         ok=states[State.OK],
@@ -223,9 +223,9 @@ def judge(
 ) -> tuple[GroundTruth, list[str]]:
     """Both trajectories of a result against the ground truth, and why that may mislead, a line each."""
     pairs = pair(result.trajectory, reference, gap_s=gap_s)
-    optimised, length_m = _accuracy(pairs)
+    optimized, length_m = _accuracy(pairs)
     odometry, _ = _accuracy(pair(result.odometry, reference, gap_s=gap_s))
-    return GroundTruth(source, length_m, optimised, odometry, gap_s), pairs.warnings
+    return GroundTruth(source, length_m, optimized, odometry, gap_s), pairs.warnings
 
 
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
@@ -238,7 +238,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, {m.degenerate:,} degenerate, "
         f"{m.lost:,} lost{dropped}",
-        f"way            {m.travelled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
+        f"way            {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
         f"loop closures  {m.closures}",
         f"pose graph     {m.fit}",
         f"map            {counted(m.map_points, 'point')}; "
@@ -279,12 +279,12 @@ def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
 
 
 def _accuracy_lines(truth: GroundTruth) -> list[str]:
-    missing = f"; {truth.optimised.missing}" if truth.optimised.missing else ""
+    missing = f"; {truth.optimized.missing}" if truth.optimized.missing else ""
     lines = [
         f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, "
-        f"{counted(truth.optimised.pairs, 'scan')}{missing}"
+        f"{counted(truth.optimized.pairs, 'scan')}{missing}"
     ]
-    for name, accuracy in (("ATE", truth.optimised), ("ATE odometry", truth.odometry)):
+    for name, accuracy in (("ATE", truth.optimized), ("ATE odometry", truth.odometry)):
         share, rotation = accuracy.ate_share_of_path, np.degrees(accuracy.ate_rotation_rmse_rad)
         of_path = "" if share is None else f" ({100.0 * share:.3f} % of the path)"
         lines.append(

@@ -57,9 +57,9 @@ class Recorder(Protocol):
         ...
 
     def log_trajectory(
-        self, stamps_ns: NDArray[np.int64], poses_optimised: Matrix, indices: NDArray[np.int64]
+        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
     ) -> None:
-        """Record the optimised way: poses (N, d+1, d+1) of the scans ``indices``."""
+        """Record the optimized way: poses (N, d+1, d+1) of the scans ``indices``."""
         ...
 
     def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
@@ -67,7 +67,7 @@ class Recorder(Protocol):
         ...
 
     def log_ground_truth(self, poses: Matrix) -> None:
-        """Record true poses (N, 4, 4), moved onto the optimised way."""
+        """Record true poses (N, 4, 4), moved onto the optimized way."""
         ...
 
     def log_map(self, points: NDArray[np.floating]) -> None:

@@ -25,7 +25,7 @@ _POINTS = 100
 
 
 def rehearse(dimension: int) -> None:
-    """Place scans of a lidar that drives straight on, optimise, draw the maps; write nothing."""
+    """Place scans of a lidar that drives straight on, optimize, draw the maps; write nothing."""
     config = load_settings(dimension).config
     slam = Slam(config, lie.identity(dimension))
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))

@@ -35,7 +35,7 @@ GRAPH_FILE = "graph.g2o"  # what is in force; rejected edges stand in graph_reje
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The point cloud of the world: points (N, d), metres, and how many were left out as having moved."""
+    """The point cloud of the world: points (N, d), meters, and how many were left out as having moved."""
 
     points: Points
     removed: int
@@ -100,6 +100,6 @@ def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
 
 
 def _scans(result: SlamResult) -> Iterator[tuple[Pose, Points]]:
-    """Keyframes with their optimised poses."""
+    """Keyframes with their optimized poses."""
     for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True):
         yield pose, keyframe.points

@@ -134,7 +134,7 @@ class StepTable:
 
 STAGES = ("read", "preprocess", "match", "map", "loops")
 _NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar after optimisation, metres; odom_*: T_odom_lidar before it",
+    "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it",
     "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
     "SE(2) 3x3, SE(3) 6x6; null where the match leaves a direction undetermined",
     "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",

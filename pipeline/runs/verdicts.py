@@ -15,7 +15,7 @@ VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closu
 class JudgedClosure:
     """A closure with its last word: by the matcher, or by the graph that it contradicts.
 
-    ``weight`` and ``chi2_after`` are what the optimiser left to its edge: 0 and NaN if it never became one, 1 and
+    ``weight`` and ``chi2_after`` are what the optimizer left to its edge: 0 and NaN if it never became one, 1 and
     NaN until it is optimized.
     """
 

@@ -46,8 +46,8 @@ def corridor(rng: np.random.Generator) -> Solids:
         for place in rng.uniform([0.5, 2.0, 3.5], [1.5, 3.0, STRUCTURE_M - 0.2]):
             size = (rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.2))
             for side in (-1.0, 1.0):
-                centre = (float(end - outwards * place), side * (_HALF_M - 0.5 * size[1]))
-                scenery.box(centre, size, (0.0, _HEIGHT_M))
+                center = (float(end - outwards * place), side * (_HALF_M - 0.5 * size[1]))
+                scenery.box(center, size, (0.0, _HEIGHT_M))
     return scenery.finish()
 
 
@@ -59,8 +59,8 @@ def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
         y = side * (_LOBBY_HALF_M + 0.5 * _WALL_M)
         scenery.box((end + outwards * 0.5 * _LOBBY_M, y), (_LOBBY_M, _WALL_M), (0.0, _HEIGHT_M))
         width = _LOBBY_HALF_M - _HALF_M
-        centre = (end - outwards * 0.5 * _WALL_M, side * (_HALF_M + 0.5 * width))
-        scenery.box(centre, (_WALL_M, width), (0.0, _HEIGHT_M))
+        center = (end - outwards * 0.5 * _WALL_M, side * (_HALF_M + 0.5 * width))
+        scenery.box(center, (_WALL_M, width), (0.0, _HEIGHT_M))
 
 
 def _furnish(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:

@@ -80,7 +80,7 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
-    """All scans but those in the holes: one second each, centred on the first moment nearest to its place."""
+    """All scans but those in the holes: one second each, centered on the first moment nearest to its place."""
     scans = np.arange(count)
     lacking = round(_HOLE_S * 1e9 / sensor.period_ns)
     kept = np.ones(count, dtype=bool)

@@ -23,7 +23,7 @@ _SIZES_M: dict[Kind, tuple[float, float]] = {
 
 
 class Room(NamedTuple):
-    """A rectangle between the middles of its walls, metres."""
+    """A rectangle between the middles of its walls, meters."""
 
     x0: float
     y0: float
@@ -39,7 +39,7 @@ class Furnisher:
         self._route = route
         self._doors = doors
         self._rng = rng
-        self._taken: list[tuple[Matrix, Matrix]] = []  # centre and half size
+        self._taken: list[tuple[Matrix, Matrix]] = []  # center and half size
 
     def furnish(self, room: Room) -> None:
         """Shelves along the walls, a desk for every 5 m², bins and a plant."""
@@ -55,21 +55,21 @@ class Furnisher:
         half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
         low = np.array([room.x0, room.y0]) + 0.1 + half
         high = np.array([room.x1, room.y1]) - 0.1 - half
-        centre = self._rng.uniform(low, high)
+        center = self._rng.uniform(low, high)
         if kind == "shelf":  # its back to a wall
             axis = 1 - upright
-            centre[axis] = (low, high)[int(self._rng.integers(2))][axis]
-        if not self._is_free(centre, half):
+            center[axis] = (low, high)[int(self._rng.integers(2))][axis]
+        if not self._is_free(center, half):
             return False
-        self._taken.append((centre, half))
-        self._put(kind, float(centre[0]), float(centre[1]), 0.5 * np.pi * upright)
+        self._taken.append((center, half))
+        self._put(kind, float(center[0]), float(center[1]), 0.5 * np.pi * upright)
         return True
 
-    def _is_free(self, centre: Matrix, half: Matrix) -> bool:
-        if any(np.all(np.abs(centre - other) < half + other_half + 0.05) for other, other_half in self._taken):
+    def _is_free(self, center: Matrix, half: Matrix) -> bool:
+        if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in self._taken):
             return False
         free = ((self._route, _ROUTE_M), (self._doors, _DOOR_M))
-        return all(_distance_m(places, centre, half) >= limit for places, limit in free)
+        return all(_distance_m(places, center, half) >= limit for places, limit in free)
 
     def _put(self, kind: Kind, x: float, y: float, yaw_rad: float) -> None:
         match kind:
@@ -99,7 +99,7 @@ class Furnisher:
         self._scenery.cylinder(chair, 0.24, (0.45, 0.52))
 
 
-def _distance_m(places: Matrix, centre: Matrix, half: Matrix) -> float:
+def _distance_m(places: Matrix, center: Matrix, half: Matrix) -> float:
     """Distance from the nearest of (N, 2) places to an upright rectangle."""
-    outside = np.maximum(np.abs(places - centre) - half, 0.0)
+    outside = np.maximum(np.abs(places - center) - half, 0.0)
     return float(np.linalg.norm(outside, axis=1).min())

@@ -33,7 +33,7 @@ def spectrum(information: Matrix) -> tuple[NDArray[np.float64], Matrix]:
     """Shares (6,) of the returns that speak about each direction, least first, and the directions (6, 6) as rows.
 
     Rotations are measured by what they do to the returns: H is scaled by L = √(Σ|p × n|² / N), N = Σ|n|², so that
-    the twist of every row, in metres and radians, moves the returns by about a metre. Shares do not depend on the
+    the twist of every row, in meters and radians, moves the returns by about a meter. Shares do not depend on the
     number of returns nor on units; a share of 1e-4 means that H knows the direction as well as it would if one
     return in ten thousand faced it squarely.
     """

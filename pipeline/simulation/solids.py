@@ -15,13 +15,13 @@ FLAT = np.zeros(7)
 
 @dataclass(frozen=True, slots=True)
 class Solids:
-    """Closed solids above a rolling ground, metres, world frame.
+    """Closed solids above a rolling ground, meters, world frame.
 
     Attributes
     ----------
-    boxes : (B, 8) centre x, y, half lengths x, y, bottom, top, cos and sin of the yaw
-    cylinders : (C, 5) upright: centre x, y, radius, bottom, top
-    ellipsoids : (E, 6) centre x, y, z, radii x, y, z
+    boxes : (B, 8) center x, y, half lengths x, y, bottom, top, cos and sin of the yaw
+    cylinders : (C, 5) upright: center x, y, radius, bottom, top
+    ellipsoids : (E, 6) center x, y, z, radii x, y, z
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
     """
 
@@ -96,21 +96,21 @@ class Scenery:
         self._ellipsoids: list[tuple[float, ...]] = []
 
     def box(
-        self, centre: tuple[float, float], size: tuple[float, float], z: tuple[float, float], yaw_rad: float = 0.0
+        self, center: tuple[float, float], size: tuple[float, float], z: tuple[float, float], yaw_rad: float = 0.0
     ) -> None:
-        """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its centre."""
-        base = self._base(centre)
+        """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
+        base = self._base(center)
         half = (0.5 * size[0], 0.5 * size[1])
-        self._boxes.append((*centre, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
+        self._boxes.append((*center, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
 
-    def cylinder(self, centre: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
-        """Put down an upright cylinder, heights ``z`` above the ground at its centre."""
-        base = self._base(centre)
-        self._cylinders.append((*centre, radius, base + z[0], base + z[1]))
+    def cylinder(self, center: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
+        """Put down an upright cylinder, heights ``z`` above the ground at its center."""
+        base = self._base(center)
+        self._cylinders.append((*center, radius, base + z[0], base + z[1]))
 
-    def ellipsoid(self, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
-        """Put down an ellipsoid; its centre's height counts from the ground there."""
-        x, y, z = centre
+    def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
+        """Put down an ellipsoid; its center's height counts from the ground there."""
+        x, y, z = center
         self._ellipsoids.append((x, y, z + self._base((x, y)), *radii))
 
     def finish(self) -> Solids:
@@ -122,8 +122,8 @@ class Scenery:
             ground=self._ground,
         )
 
-    def _base(self, centre: tuple[float, float]) -> float:
-        return float(_height(self._ground, np.array(centre)))
+    def _base(self, center: tuple[float, float]) -> float:
+        return float(_height(self._ground, np.array(center)))
 
 
 def _height(ground: NDArray[np.float64], xy: Matrix) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""A stairwell of four storeys, walked up and down with the lidar in the hand."""
+"""A stairwell of four storys, walked up and down with the lidar in the hand."""
 
 from __future__ import annotations
 

@@ -99,8 +99,8 @@ def _house(
         scenery.box((float(place), front), (0.35, 0.3), (BELOW_M, height), yaw)
     extra = rng.random()
     if extra < 0.35:  # bay
-        centre = (left + split * rng.uniform(0.4, 0.6), front - facing * 0.4)
-        scenery.box(centre, (rng.uniform(1.6, 2.6), 0.8), (BELOW_M, rng.uniform(2.8, height)), yaw)
+        center = (left + split * rng.uniform(0.4, 0.6), front - facing * 0.4)
+        scenery.box(center, (rng.uniform(1.6, 2.6), 0.8), (BELOW_M, rng.uniform(2.8, height)), yaw)
     elif extra < 0.7:  # steps and the posts of a porch
         door = left + split + 0.3 * (width - split)
         scenery.box((door, front + facing * (recess - 0.6)), (1.6, 1.2), (BELOW_M, 0.35), yaw)

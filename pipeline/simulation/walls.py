@@ -13,7 +13,7 @@ _WALL_M, _DOOR_M = 0.12, 1.0
 
 
 class Wall(NamedTuple):
-    """A wall with doorways ``doors`` metres along it; the leaves open to its left (1), right (−1) or are off."""
+    """A wall with doorways ``doors`` meters along it; the leaves open to its left (1), right (−1) or are off."""
 
     x0: float
     y0: float

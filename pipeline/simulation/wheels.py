@@ -22,13 +22,13 @@ def wheel_odometry(T_world_base: Matrix, *, drift: float, rng: np.random.Generat
     """
     planar = lie.flatten(T_world_base)
     steps = lie.inverse(planar[:-1]) @ planar[1:]
-    travelled = np.linalg.norm(steps[:, :2, 2], axis=1)
+    traveled = np.linalg.norm(steps[:, :2, 2], axis=1)
     scale, turn, bias = drift * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.5, 1.5, 3)
-    noise = drift * np.sqrt(travelled)[:, None] * rng.standard_normal((len(steps), 2))
+    noise = drift * np.sqrt(traveled)[:, None] * rng.standard_normal((len(steps), 2))
     moved = steps[:, :2, 2] * (1.0 + scale * _SCALE_SHARE)
     moved[:, 0] += _NOISE_M * noise[:, 0]
     turned = (
-        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * travelled + _NOISE_RAD * noise[:, 1]
+        lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
     )
     heading = np.concatenate([[0.0], np.cumsum(turned)])
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])

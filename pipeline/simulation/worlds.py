@@ -37,7 +37,7 @@ class World:
     build : draws the place
     way : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
     sight_m : how far any lidar sees there
-    holes : places (x, y) in metres; for 1 s around the moment they are first passed, the log lacks its scans
+    holes : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
     """
 
     build: Callable[[np.random.Generator], Solids]

@@ -1,6 +1,6 @@
-"""Pose-graph optimisation against GTSAM on the published graphs, interleaved: python -m tests.benchmarks.graphs.
+"""Pose-graph optimization against GTSAM on the published graphs, interleaved: python -m tests.benchmarks.graphs.
 
-Each method optimises what it has read; reading is not timed, building the problem and the first guess are. GTSAM
+Each method optimizes what it has read; reading is not timed, building the problem and the first guess are. GTSAM
 runs from the file's guess and from its own (chordal in 3D; LAGO in 2D, which takes diagonal information only and
 gets the diagonal), with Gauss-Newton and with Levenberg-Marquardt. All ½χ² are evaluated by the same code:
 ½ Σ eᵀΩe with e = log(Z⁻¹ T_i⁻¹ T_j).
@@ -37,22 +37,22 @@ class Run:
 
 
 class Ours:
-    def __init__(self, path, optimiser):
-        self.path, self.config = path, GraphConfig(optimiser=optimiser)
+    def __init__(self, path, optimizer):
+        self.path, self.config = path, GraphConfig(optimizer=optimizer)
 
     def run(self):
         graph = read_g2o(self.path).graph
         begin = time.perf_counter()
-        answer = graph.optimise(self.config)
+        answer = graph.optimize(self.config)
         return time.perf_counter() - begin, answer.iterations, graph.poses
 
 
 class Gtsam:
     """GTSAM on the same file, with vertices written where it has none."""
 
-    def __init__(self, path, optimiser, guess):
+    def __init__(self, path, optimizer, guess):
         source = read_g2o(path).graph
-        self.dimension, self.optimiser, self.guess = source.dimension, optimiser, guess
+        self.dimension, self.optimizer, self.guess = source.dimension, optimizer, guess
         self.factors, self.initial = gtsam.readG2o(str(path), self.dimension == 3)
         if not self.initial.size():
             raise ValueError(f"{path} has no vertices")
@@ -77,7 +77,7 @@ class Gtsam:
         if self.guess == "own":
             flat = self.dimension == 2
             initial = gtsam.lago.initialize(self.for_lago) if flat else gtsam.InitializePose3.initialize(factors)
-        if self.optimiser == "gauss-newton":
+        if self.optimizer == "gauss-newton":
             solver = gtsam.GaussNewtonOptimizer(factors, initial, gtsam.GaussNewtonParams())
         else:
             solver = gtsam.LevenbergMarquardtOptimizer(factors, initial, gtsam.LevenbergMarquardtParams())
@@ -145,13 +145,13 @@ def report(name, runs):
 
 
 def certify(path):
-    """How long the certificate takes, beside the optimisation, and what it says."""
+    """How long the certificate takes, beside the optimization, and what it says."""
     graph = read_g2o(path).graph
-    answer = graph.optimise(GraphConfig())
+    answer = graph.optimize(GraphConfig())
     certificate = graph.certify()
     share = certificate.time_s / answer.time_s
     print(
-        f"  certificate: {certificate.verdict}; {1e3 * certificate.time_s:.0f} ms, {share:.2f} × the optimisation"
+        f"  certificate: {certificate.verdict}; {1e3 * certificate.time_s:.0f} ms, {share:.2f} × the optimization"
     )
 
 
@@ -167,7 +167,7 @@ def main():
         file = read_g2o(path)
         for warm in ("levenberg-marquardt", "gauss-newton"):
             graph = read_g2o(path).graph
-            graph.optimise(GraphConfig(optimiser=warm))
+            graph.optimize(GraphConfig(optimizer=warm))
             graph.certify()
         if not file.has_guess:  # GTSAM needs vertices: give it the odometry, as ours gets
             path = options.scratch / f"{name}_with_vertices.g2o"

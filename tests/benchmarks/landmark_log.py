@@ -1,7 +1,7 @@
 """An MRCLAM log against a batch in GTSAM, interleaved: python -m tests.benchmarks.landmark_log [FOLDER].
 
 GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and 0.12 m, and the
-odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of its optimiser,
+odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of its optimizer,
 with the covariance of every pose and landmark where it says so. "ours as given" does just the same, "ours" the
 whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
 """
@@ -19,7 +19,7 @@ from scanchain.landmarks.accuracy import against_truth, truth_at
 from scanchain.landmarks.bearing_range import BearingRangeProblem, no_calibration
 from scanchain.landmarks.dead_reckoning import OWN, OdometryNoise
 from scanchain.landmarks.guess import from_odometry
-from scanchain.landmarks.minimise import minimise
+from scanchain.landmarks.minimize import minimize
 from scanchain.landmarks.mrclam import read_mrclam
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.range_fit import LogModel
@@ -42,7 +42,7 @@ def measurements_of(log):
 def as_given(log):
     given = measurements_of(log)
     begin = time.perf_counter()
-    found = minimise(
+    found = minimize(
         BearingRangeProblem(given), from_odometry(given), create_solver("schur"),
         loss=RobustLoss("huber", HUBER, 1.0), tolerance=1e-6, first_damping=1e-10,
     )  # fmt: skip
@@ -55,7 +55,7 @@ def ours(log):
     return time.perf_counter() - begin, solution.state
 
 
-def with_gtsam(log, optimiser, parameters, *, covariances=False):
+def with_gtsam(log, optimizer, parameters, *, covariances=False):
     given = measurements_of(log)
     guess = from_odometry(given)
     begin = time.perf_counter()
@@ -75,7 +75,7 @@ def with_gtsam(log, optimiser, parameters, *, covariances=False):
         values.insert(k, gtsam.Pose2(*pose))
     for k, position in enumerate(guess.landmarks):
         values.insert(LANDMARK + k, position)
-    found = optimiser(graph, values, parameters).optimize()
+    found = optimizer(graph, values, parameters).optimize()
     if covariances:
         marginals = gtsam.Marginals(graph, found)
         for key in found.keys():  # noqa: SIM118

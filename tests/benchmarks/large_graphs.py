@@ -1,7 +1,7 @@
 """Simulated graphs as large as the largest published ones: python -m tests.benchmarks.large_graphs [FOLDER].
 
 "city": 10,000 poses of a Manhattan grid, most places passed several times, loops between poses near each other.
-"storeys": 5,750 poses in space through the storeys of a building, with ramps between them; information matrices
+"storys": 5,750 poses in space through the storys of a building, with ramps between them; information matrices
 that differ from edge to edge by up to a factor of 100, translation and rotation coupled.
 Both are drawn with the very noise that their information matrices state, so that ½χ² at the minimum is near half
 the degrees of freedom. The files go to FOLDER; each is compared with GTSAM as in ``tests.benchmarks.graphs``, from
@@ -45,11 +45,11 @@ def turned(rng, at, heading, half_m):
     return heading + 2
 
 
-def storey_poses(rng, count=5750, storeys=5):
-    """The same in each storey, 4 m above each other, with ramps between them and a sensor that sways."""
+def story_poses(rng, count=5750, storys=5):
+    """The same in each story, 4 m above each other, with ramps between them and a sensor that sways."""
     flat = city_poses(rng, count, 12)
     poses = lie.lift(flat)
-    climb = np.linspace(0.0, storeys, count)
+    climb = np.linspace(0.0, storys, count)
     poses[:, 2, 3] = 4.0 * (np.floor(climb) + np.clip((climb % 1.0 - 0.9) / 0.1, 0.0, 1.0))
     sway = np.zeros((count, 6))
     sway[:, 3:5] = 0.1 * rng.normal(size=(count, 2))
@@ -95,8 +95,8 @@ def simulated(truth, loops, rng, path):
 def make(folder):
     """The two files, the same each time."""
     rng = np.random.default_rng(0)
-    city, storeys = city_poses(rng), storey_poses(rng)
-    for name, truth, most in (("city", city, 11_000), ("storeys", storeys, 11_000)):
+    city, storys = city_poses(rng), story_poses(rng)
+    for name, truth, most in (("city", city, 11_000), ("storys", storys, 11_000)):
         path = folder / f"{name}.g2o"
         edges = simulated(truth, pairs_in_sight(truth, rng, most), rng, path)
         print(f"{path}: {len(truth):,} poses, {edges:,} edges", flush=True)
@@ -110,10 +110,10 @@ def from_nothing(path):
     for k in range(len(graph)):
         nowhere.add_pose(lie.identity(graph.dimension), k)
     nowhere.add_edges(graph.edges, graph.measurements, graph.information, graph.is_loop)
-    done = nowhere.optimise(GraphConfig())
+    done = nowhere.optimize(GraphConfig())
     print(
         f"  ours, all poses at the origin: ½χ² {0.5 * done.chi2_after:.4f} after {done.iterations} iterations,"
-        f" {1e3 * done.time_s:.0f} ms, first guess {done.initialisation}"
+        f" {1e3 * done.time_s:.0f} ms, first guess {done.initialization}"
     )
 
 
@@ -125,7 +125,7 @@ def main():
     for path in make(options.folder):
         for warm in ("levenberg-marquardt", "gauss-newton"):
             graph = read_g2o(path).graph
-            graph.optimise(GraphConfig(optimiser=warm))
+            graph.optimize(GraphConfig(optimizer=warm))
             graph.certify()
         report(path.stem, compare(path, options.repeats, slow_s=2.0))
         certify(path)

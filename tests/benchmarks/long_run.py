@@ -1,7 +1,7 @@
 """Time and memory of SLAM along a long log: ``python -m tests.benchmarks.long_run [--scans N]``.
 
 A laser scanner goes round the simulated office for hours. Every tenth of the way: the mean CPU time of
-``Slam.process`` a scan, loops and optimisations included, the memory of this process, and what it keeps
+``Slam.process`` a scan, loops and optimizations included, the memory of this process, and what it keeps
 in a file instead.
 """
 

@@ -1,8 +1,8 @@
 """Loop closure in the plane with drift turned up: ``python -m tests.benchmarks.loops2d``.
 
 Each log is run as it is, which is what the rest is measured against, and with every motion of its odometry made
-longer by a share of itself and turned by so much a metre. A closure is false where its relative pose is more than
-half a metre from that reference. ATE is over all scans after rigid alignment. Prints a Markdown table.
+longer by a share of itself and turned by so much a meter. A closure is false where its relative pose is more than
+half a meter from that reference. ATE is over all scans after rigid alignment. Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scanchain.slam import SlamResult
 from tests.drifting import drifting_slam, stretched
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-DRIFTS = ((0.01, 0.002), (0.01, -0.005), (-0.03, 0.01))  # share of the way, radians a metre
+DRIFTS = ((0.01, 0.002), (0.01, -0.005), (-0.03, 0.01))  # share of the way, radians a meter
 FALSE_M = 0.5
 
 

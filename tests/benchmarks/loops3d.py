@@ -4,14 +4,14 @@
         [--turn 0.0002] [--false 0.3]
 
 A world is driven with every sensor; what odometry says of each motion is made longer by ``--scale`` of itself and
-turned left by ``--turn`` and up by a quarter of that, radians a metre, before the rest of the chain sees it.
+turned left by ``--turn`` and up by a quarter of that, radians a meter, before the rest of the chain sees it.
 
 A keyframe is a revisit where the truth has it within 5 m of an older one that lies 100 m or more of the way back,
 and an opposite one where all those were driven the other way (headings 135° apart or more). It is found where an
 accepted closure starts within 10 m of the way from it. A closure is true where its relative pose is within 2 m
 and 3° of the truth (drift bends the local maps, too): precision is the share of true ones among those accepted in
 the end. ATE is over all scans, after alignment, with drift and after closure. With ``--false``, wrong closures
-make up so large a share of those that go into the last optimisation; "named" is the share of them that end as
+make up so large a share of those that go into the last optimization; "named" is the share of them that end as
 rejected.
 """
 
@@ -78,8 +78,8 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
     named = [item.verdict is Verdict.REJECTED for item in everything if item.closure.reason == MADE_UP]
     accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
     true_poses = _true_poses(result.keyframes, truth)
-    revisit, opposite = revisits(true_poses, _travelled_m(true_poses))
-    found = _found(accepted, _travelled_m(true_poses))
+    revisit, opposite = revisits(true_poses, _traveled_m(true_poses))
+    found = _found(accepted, _traveled_m(true_poses))
     true = [is_true(item, true_poses) for item in accepted]
     return Score(
         revisits=int(revisit.sum()),
@@ -98,11 +98,11 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
     )
 
 
-def revisits(poses: Matrix, travelled_m: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def revisits(poses: Matrix, traveled_m: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which of the keyframes (K,) return to a place, and which of these only the other way than before."""
     revisit, opposite = np.zeros((2, len(poses)), np.bool_)
     for k, T in enumerate(poses):
-        old = poses[: np.searchsorted(travelled_m, travelled_m[k] - BACK_M)]
+        old = poses[: np.searchsorted(traveled_m, traveled_m[k] - BACK_M)]
         near = old[np.linalg.norm(old[:, :3, 3] - T[:3, 3], axis=1) <= NEAR_M]
         revisit[k] = len(near) > 0
         opposite[k] = revisit[k] and bool(np.all(near[:, :3, 0] @ T[:3, 0] <= np.cos(OPPOSITE_RAD)))
@@ -117,9 +117,9 @@ def is_true(item: JudgedClosure, poses: Matrix) -> bool:
     return bool(np.linalg.norm(error[:3, 3]) <= TRUE_M) and float(lie.rotation_angle(error)) <= TRUE_RAD
 
 
-def _found(accepted: list[JudgedClosure], travelled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    sources = travelled_m[[item.closure.source for item in accepted]]
-    return np.any(np.abs(travelled_m[:, None] - sources) <= ALONG_M, axis=1)
+def _found(accepted: list[JudgedClosure], traveled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    sources = traveled_m[[item.closure.source for item in accepted]]
+    return np.any(np.abs(traveled_m[:, None] - sources) <= ALONG_M, axis=1)
 
 
 def _true_poses(keyframes: tuple[Keyframe, ...], truth: Trajectory) -> Matrix:
@@ -127,7 +127,7 @@ def _true_poses(keyframes: tuple[Keyframe, ...], truth: Trajectory) -> Matrix:
     return truth.poses[places]
 
 
-def _travelled_m(poses: Matrix) -> NDArray[np.float64]:
+def _traveled_m(poses: Matrix) -> NDArray[np.float64]:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
 
 
@@ -144,7 +144,7 @@ def main() -> None:
     parser.add_argument("--sensors", default=",".join(LIDARS), help="default: %(default)s")
     parser.add_argument("--worlds", default="rounds", help="default: %(default)s")
     parser.add_argument("--scale", type=float, default=0.01, help="default: %(default)s")
-    parser.add_argument("--turn", type=float, default=0.0002, help="radians a metre, default: %(default)s")
+    parser.add_argument("--turn", type=float, default=0.0002, help="radians a meter, default: %(default)s")
     parser.add_argument("--false", type=float, default=0.0, help="share of wrong closures, default: %(default)s")
     parser.add_argument("--scans", type=int, default=1600, help="at most, default: %(default)s")
     parser.add_argument("--cache", type=Path, default=CACHE)

@@ -129,7 +129,7 @@ def report(
 
 
 def accuracy(run: Run, ground_truth: Trajectory | None) -> tuple[float, float, float, float]:
-    """ATE in metres, RPE in mm, KITTI in % and deg/m; NaN where there is no ground truth or too short a path."""
+    """ATE in meters, RPE in mm, KITTI in % and deg/m; NaN where there is no ground truth or too short a path."""
     if ground_truth is None or not run.is_whole:
         return np.nan, np.nan, np.nan, np.nan
     pairs = pair(run.trajectory, ground_truth)

@@ -6,7 +6,7 @@ Every world of scanchain.simulation that is driven with a 3D lidar, with every 3
 folder unless it lies there already; the cache is named after the simulator's source, so that worlds which changed
 are made anew. Every log has a process of its own.
 
-A cell is the KITTI translation error in % over stretches of 10, 20 and 40 m, and the ATE in metres. Where the path
+A cell is the KITTI translation error in % over stretches of 10, 20 and 40 m, and the ATE in meters. Where the path
 is shorter than 20 m the first number is the ATE over the length of the path, marked *. LOST: the last pose, seen
 from the first, is off by more than 5 % of the path or 2 m, whichever is larger, or there is none.
 """

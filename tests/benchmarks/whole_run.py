@@ -120,7 +120,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("opening the log", run, "open_log")
     watch.over("odometry", Odometry, "track")
     watch.over("loops", LoopCloser, "close", "finish")
-    watch.over("optimising", PoseGraph, "optimise")
+    watch.over("optimizing", PoseGraph, "optimize")
     watch.over("points kept", PointStore, "add", "read")
     watch.over("journal", Journal, "append")
     watch.over("map", results, "build_point_map", "write_ply", "draw_grid", "write_map")

@@ -72,14 +72,14 @@ def moved_along(graph, i, j, step, T_ij):
 
 
 def try_wrong_loops(path, share, kind, seed, robust="truncated"):
-    """Optimise with and without them."""
+    """Optimize with and without them."""
     clean = read_g2o(path).graph
-    clean.optimise(GraphConfig())
+    clean.optimize(GraphConfig())
     alone = read_g2o(path, loops="suspect").graph
-    alone.optimise(GraphConfig(robust=robust))
+    alone.optimize(GraphConfig(robust=robust))
     graph = read_g2o(path, loops="suspect").graph
     is_wrong = add_wrong_loops(graph, share, kind, np.random.default_rng(seed))
-    answer = graph.optimise(GraphConfig(robust=robust))
+    answer = graph.optimize(GraphConfig(robust=robust))
     rejected = np.empty(len(is_wrong), bool)
     rejected[np.argsort(graph.is_loop, kind="stable")] = answer.rejected
     return Outcome(

@@ -6,7 +6,7 @@ for (const canvas of document.querySelectorAll("canvas.scene")) show(canvas);
 function show(canvas) {
   const scene = JSON.parse(canvas.dataset.scene), [low, high] = scene.box;
   const middle = low.map((v, i) => (v + high[i]) / 2), half = low.map((v, i) => (high[i] - v) / 2);
-  const place = text => {  // metres from the middle of the box
+  const place = text => {  // meters from the middle of the box
     const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0)), numbers = new Uint16Array(bytes.buffer);
     return Float32Array.from(numbers, (v, i) => (v / 32767.5 - 1) * half[i % 3]);
   };
@@ -38,7 +38,7 @@ function show(canvas) {
     depths = new Float32Array(width * height);
   }
 
-  function camera() {  // right, up and into the picture of a point (x, y, z), and the size of a metre at distance 1
+  function camera() {  // right, up and into the picture of a point (x, y, z), and the size of a meter at distance 1
     const focal = 1.2 * Math.min(canvas.width, canvas.height);
     if (!view.away) {
       const tall = bulk[1] * Math.sin(view.tilt) + bulk[2] * Math.cos(view.tilt);
@@ -95,8 +95,8 @@ function show(canvas) {
     ask();
   }
   function move(du, dv) {  // along the ground, so that what is under the pointer stays there
-    const metre = view.away / (1.2 * Math.min(canvas.clientWidth, canvas.clientHeight));
-    const right = -du * metre, up = dv * metre / Math.max(Math.sin(view.tilt), 0.3);
+    const meter = view.away / (1.2 * Math.min(canvas.clientWidth, canvas.clientHeight));
+    const right = -du * meter, up = dv * meter / Math.max(Math.sin(view.tilt), 0.3);
     view.x += Math.cos(view.turn) * right + Math.sin(view.turn) * up;
     view.y += Math.cos(view.turn) * up - Math.sin(view.turn) * right;
     ask();

@@ -1,4 +1,4 @@
-"""``cholesky``: the project's own sparse factorisation of AᵀA in a fill-reducing order, its analysis kept."""
+"""``cholesky``: the project's own sparse factorization of AᵀA in a fill-reducing order, its analysis kept."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
 from scanchain.graph.factor_matrix import upper_factor
 from scanchain.kernels import normal_equations
 from scanchain.landmarks.solvers.solution import Factor, Solution, Stopwatch, undetermined
@@ -48,7 +48,7 @@ class CholeskySolver:
         H, g = equations.form(system)
         build_s = watch.lap()
         try:
-            cholesky.factorise(H)
+            cholesky.factorize(H)
         except SingularMatrixError as error:
             raise undetermined(system) from error
         factor_s = watch.lap()
@@ -59,7 +59,7 @@ class CholeskySolver:
     def _prepared(self, pattern: Pattern) -> tuple[NormalEquations, SparseCholesky]:
         if self._known is None or self._known[0] is not pattern:
             equations = NormalEquations(pattern)
-            cholesky = SparseCholesky(equations.pattern, analyse(equations.pattern))
+            cholesky = SparseCholesky(equations.pattern, analyze(equations.pattern))
             self._known = pattern, equations, cholesky
         return self._known[1:]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bmat, bsr_matrix, coo_matrix, csc_matrix
 
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyse
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
 from scanchain.graph.factor_matrix import upper_factor
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem
@@ -16,7 +16,7 @@ from scanchain.landmarks.system import LinearSystem
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """What is left for the poses, as the sparse Cholesky factorisation takes it: its pattern, with the factor."""
+    """What is left for the poses, as the sparse Cholesky factorization takes it: its pattern, with the factor."""
 
     rows: NDArray[np.int32]
     columns: NDArray[np.int32]
@@ -75,12 +75,12 @@ class LandmarkElimination:
         if known is None or not (np.array_equal(rows, known.rows) and np.array_equal(columns, known.columns)):
             pairs = np.stack([rows, columns], axis=1).astype(np.int64)
             pattern = BlockPattern(np.ones(len(diagonal), np.int64), pairs)
-            known = _Reduced(rows, columns, SparseCholesky(pattern, analyse(pattern)))
+            known = _Reduced(rows, columns, SparseCholesky(pattern, analyze(pattern)))
             self._known = known
         if not np.all(_diagonal(S) > LOST_DIGITS * diagonal):
             raise undetermined(system)
         try:
-            known.cholesky.factorise(
+            known.cholesky.factorize(
                 np.concatenate([_diagonal(S), lower.data[beyond]]).astype(np.float64, copy=False)
             )
         except SingularMatrixError as error:

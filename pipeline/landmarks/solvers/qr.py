@@ -1,4 +1,4 @@
-"""``qr`` and ``qr_colamd``: sparse orthogonal factorisation A = Q R, R x = Qᵀb, without ever forming AᵀA."""
+"""``qr`` and ``qr_colamd``: sparse orthogonal factorization A = Q R, R x = Qᵀb, without ever forming AᵀA."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class QrSolver:
         build_s = watch.lap()
         fronts, pattern, n = analysis.fronts, system.pattern, system.pattern.shape[1]
         R, z = np.zeros(int(fronts.factor_start[-1])), np.zeros(n)
-        sparse_qr.factorise(
+        sparse_qr.factorize(
             fronts, analysis.begin, analysis.rows, analysis.height, pattern.row_start, pattern.columns,
             system.values, system.b, analysis.place, R, z, np.empty(analysis.stack_size),
         )  # fmt: skip
@@ -68,11 +68,11 @@ class QrSolver:
 
     def _analysis(self, pattern: Pattern) -> _Analysis:
         if self._known is None or self._known[0] is not pattern:
-            self._known = pattern, _analyse(pattern, self._ordering)
+            self._known = pattern, _analyze(pattern, self._ordering)
         return self._known[1]
 
 
-def _analyse(pattern: Pattern, ordering: Ordering) -> _Analysis:
+def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
     """Order the columns and lay out the fronts.
 
     Within the asked order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
@@ -84,11 +84,11 @@ def _analyse(pattern: Pattern, ordering: Ordering) -> _Analysis:
     if ordering == "colamd":
         order = column_order.column_minimum_degree(pattern.row_start, pattern.columns, column_start, rows)
     start, partners, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
-    start, neighbours = _neighbour_lists(start, partners)
-    after = graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbours, order))
+    start, neighbors = _neighbor_lists(start, partners)
+    after = graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbors, order))
     eliminated = order[after]
-    parent = graph_symbolic.elimination_tree(start, neighbours, eliminated)
-    begin, below = graph_symbolic.column_structures(start, neighbours, eliminated, parent)
+    parent = graph_symbolic.elimination_tree(start, neighbors, eliminated)
+    begin, below = graph_symbolic.column_structures(start, neighbors, eliminated, parent)
     sizes = np.ones(n, np.int64)
     fronts = graph_fronts.lay_out_fronts(
         graph_symbolic.group_columns(parent, begin, below, sizes), begin, below, sizes
@@ -99,10 +99,10 @@ def _analyse(pattern: Pattern, ordering: Ordering) -> _Analysis:
     return _Analysis(order, place, fronts, *found)
 
 
-def _neighbour_lists(
+def _neighbor_lists(
     start: NDArray[np.int64], partners: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every column's partners on either side, from those beyond it: (start (n + 1,), neighbours)."""
+    """Every column's partners on either side, from those beyond it: (start (n + 1,), neighbors)."""
     n = len(start) - 1
     beyond = csr_matrix((np.ones(len(partners), np.int8), partners, start), shape=(n, n))
     both = csr_matrix(beyond + beyond.T)

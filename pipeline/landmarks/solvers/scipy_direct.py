@@ -52,7 +52,7 @@ def check_pinv(unknowns: int) -> None:
 class DefaultSolver:
     """``default``: scipy's spsolve, which keeps its factor to itself.
 
-    Its time counts as factorisation. The factor is that of splu with the same settings as spsolve has.
+    Its time counts as factorization. The factor is that of splu with the same settings as spsolve has.
     """
 
     def solve(self, system: LinearSystem) -> Solution:
@@ -63,7 +63,7 @@ class DefaultSolver:
         with _naming_the_undetermined(system):
             x = spsolve(H, g)
         factor_s = watch.lap()
-        return Solution(np.asarray(x), build_s, factor_s, 0.0, lambda: _upper(_factorise(H, "COLAMD", system)))
+        return Solution(np.asarray(x), build_s, factor_s, 0.0, lambda: _upper(_factorize(H, "COLAMD", system)))
 
 
 class LuSolver:
@@ -77,7 +77,7 @@ class LuSolver:
         watch = Stopwatch()
         H, g = _normal_equations(system)
         build_s = watch.lap()
-        lu = _factorise(H, self._ordering, system)
+        lu = _factorize(H, self._ordering, system)
         factor_s = watch.lap()
         x = lu.solve(g)
         solve_s = watch.lap()
@@ -100,7 +100,7 @@ def _normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.floa
     return csc_matrix(A.T @ A), A.T @ system.b
 
 
-def _factorise(H: csc_matrix, ordering: str, system: LinearSystem) -> SuperLU:
+def _factorize(H: csc_matrix, ordering: str, system: LinearSystem) -> SuperLU:
     try:
         lu = splu(H, permc_spec=ordering)
     except RuntimeError as error:  # an exact zero

@@ -48,7 +48,7 @@ class Solution:
     ----------
     x : (n,)
     build_s : time to form what is factored (AᵀA and Aᵀb), or to sort the rows of A
-    factor_s : time of ordering, symbolic analysis (where not kept from before) and factorisation
+    factor_s : time of ordering, symbolic analysis (where not kept from before) and factorization
     solve_s : time of the triangular solves
     factor : makes the factor as a matrix; not part of the times
     """

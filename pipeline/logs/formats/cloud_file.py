@@ -114,7 +114,7 @@ def _layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[np.void
 
 
 def _are_plausible(values: NDArray[np.floating]) -> bool:
-    """Whether bytes that are read as such numbers look like metres and the like: random bits would not."""
+    """Whether bytes that are read as such numbers look like meters and the like: random bits would not."""
     with np.errstate(invalid="ignore"):
         size = np.abs(values.astype(np.float64))
     return bool(np.mean((size == 0.0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))) > _MOSTLY)

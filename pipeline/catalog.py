@@ -1,4 +1,4 @@
-"""The catalogue of sequences: what each folder under sequences/ says, and how the log is made."""
+"""The catalog of sequences: what each folder under sequences/ says, and how the log is made."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     dimension: Literal[2, 3]
     conversion: str
     ground_truth: str
-    licence: str
+    license: str
     source: Simulated | Download | Page | Local
 
 
 def names() -> tuple[str, ...]:
-    """The sequences of the catalogue, in order of name."""
+    """The sequences of the catalog, in order of name."""
     return tuple(sorted(file.parent.name for file in _folder().glob(f"*/{_FILE}")))
 
 
 def load(name: str) -> Sequence:
-    """What the catalogue says about a sequence."""
+    """What the catalog says about a sequence."""
     if name not in names():
-        raise InputError(f"sequence {name!r} is not in the catalogue; choose one of {', '.join(names())}")
+        raise InputError(f"sequence {name!r} is not in the catalog; choose one of {', '.join(names())}")
     return read(_folder() / name / _FILE)
 
 

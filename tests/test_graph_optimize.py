@@ -12,7 +12,7 @@ from scanchain.graph.curvature import full_curvature
 from scanchain.graph.estimate import Estimate
 from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.steps import Optimiser
+from scanchain.graph.steps import Optimizer
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
@@ -48,50 +48,50 @@ def ring(dimension, count=12, *, noise=0.0, seed=0):
     return graph, np.array(true)
 
 
-@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "gauss-newton"])
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton"])
 @pytest.mark.parametrize("name", list(BEST_HALF_CHI2))
-def test_the_published_graphs_reach_the_best_known_chi2_from_their_files(name, optimiser):
-    answer = read(name).optimise(GraphConfig(optimiser=optimiser))
+def test_the_published_graphs_reach_the_best_known_chi2_from_their_files(name, optimizer):
+    answer = read(name).optimize(GraphConfig(optimizer=optimizer))
     assert answer.converged, answer.reason
     assert 0.5 * answer.chi2_after <= BEST_HALF_CHI2[name] * (1.0 + 2e-5)
     assert 0.5 * answer.chi2_after >= BEST_HALF_CHI2[name] * (1.0 - 2e-5)
 
 
-def test_small_grid_reaches_one_minimum_by_both_optimisers():
-    optimisers = ("levenberg-marquardt", "gauss-newton")
-    answers = [read("smallGrid3D").optimise(GraphConfig(optimiser=optimiser)) for optimiser in optimisers]
+def test_small_grid_reaches_one_minimum_by_both_optimizers():
+    optimizers = ("levenberg-marquardt", "gauss-newton")
+    answers = [read("smallGrid3D").optimize(GraphConfig(optimizer=optimizer)) for optimizer in optimizers]
     assert all(answer.converged for answer in answers)
     assert answers[0].chi2_after == pytest.approx(answers[1].chi2_after, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["intel", "manhattan", "smallGrid3D", "sphere2500"])
-@pytest.mark.parametrize("optimiser", ["dogleg", "newton"])
-def test_dogleg_and_newton_reach_the_same_minimum(name, optimiser):
-    answer = read(name).optimise(GraphConfig(optimiser=optimiser, robust="none"))
-    reference = read(name).optimise(PLAIN)
+@pytest.mark.parametrize("optimizer", ["dogleg", "newton"])
+def test_dogleg_and_newton_reach_the_same_minimum(name, optimizer):
+    answer = read(name).optimize(GraphConfig(optimizer=optimizer, robust="none"))
+    reference = read(name).optimize(PLAIN)
     assert answer.converged and answer.chi2_after == pytest.approx(reference.chi2_after, rel=2e-5)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_every_optimiser_ends_in_the_same_minimum_of_a_ring(dimension):
+def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
     """Gradient descent too, only that it takes its time."""
     chi2 = {}
-    for optimiser in get_args(Optimiser):
+    for optimizer in get_args(Optimizer):
         graph, _ = ring(dimension, noise=0.05)
-        config = GraphConfig(optimiser=optimiser, max_iterations=20_000, tolerance=1e-10, robust="none")
-        answer = graph.optimise(config)
-        assert answer.converged, (optimiser, answer.reason)
-        chi2[optimiser] = answer.chi2_after
+        config = GraphConfig(optimizer=optimizer, max_iterations=20_000, tolerance=1e-10, robust="none")
+        answer = graph.optimize(config)
+        assert answer.converged, (optimizer, answer.reason)
+        chi2[optimizer] = answer.chi2_after
     assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
 
 
-@pytest.mark.parametrize("optimiser", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
-def test_no_step_of_a_guarded_optimiser_raises_chi2(optimiser):
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
+def test_no_step_of_a_guarded_optimizer_raises_chi2(optimizer):
     graph = read("smallGrid3D")
     before = np.inf
     for _ in range(6):
-        answer = graph.optimise(
-            GraphConfig(optimiser=optimiser, max_iterations=1, robust="none"), initialise="given"
+        answer = graph.optimize(
+            GraphConfig(optimizer=optimizer, max_iterations=1, robust="none"), initialize="given"
         )
         assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
         before = answer.chi2_after
@@ -104,7 +104,7 @@ def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
     weights = np.array([1.0, 0.5, 1.0, 0.7])
     errors = problem.errors(poses)
     now = Estimate(poses, errors, problem.chi2(errors), 0.0)
-    values = full_curvature(problem, now, problem.linearise(poses, errors, weights))
+    values = full_curvature(problem, now, problem.linearize(poses, errors, weights))
     n, step = problem.pattern.scalars, 1e-3
 
     def cost(a, b):
@@ -118,21 +118,21 @@ def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
 
 
 def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
-    assert read("MIT").optimise(PLAIN).initialisation == "chordal"
-    assert read("intel").optimise(PLAIN).initialisation == "given"
+    assert read("MIT").optimize(PLAIN).initialization == "chordal"
+    assert read("intel").optimize(PLAIN).initialization == "given"
 
 
-@pytest.mark.parametrize("initialise", ["odometry", "spanning-tree", "chordal", "given"])
-def test_every_way_to_start_ends_in_the_same_minimum(initialise):
-    answer = read("intel").optimise(PLAIN, initialise=initialise)
-    assert answer.initialisation == initialise
+@pytest.mark.parametrize("initialize", ["odometry", "spanning-tree", "chordal", "given"])
+def test_every_way_to_start_ends_in_the_same_minimum(initialize):
+    answer = read("intel").optimize(PLAIN, initialize=initialize)
+    assert answer.initialization == initialize
     assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2["intel"], rel=2e-5)
 
 
 def test_levenberg_marquardt_lowers_chi2_where_gauss_newton_fails():
     """From the file's own guess of MIT, plain Gauss-Newton is lost; the damped one at least goes down."""
     graph = read("MIT")
-    answer = graph.optimise(PLAIN, initialise="given")
+    answer = graph.optimize(PLAIN, initialize="given")
     assert answer.chi2_after < answer.chi2_before
 
 
@@ -150,7 +150,7 @@ def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimensio
         graph.add_pose(lie.identity(dimension), index)
     for i, j, T in measured:
         graph.add_edge(i, j, raise_dimension(T), np.eye(k))
-    answer = graph.optimise(PLAIN)
+    answer = graph.optimize(PLAIN)
     assert answer.chi2_after < 1e-11
     assert np.allclose(graph.poses[1], raise_dimension(ahead @ quarter), atol=1e-6)
     assert np.allclose(graph.poses[2][:dimension, dimension], [1.0, 1.0, 0.0][:dimension], atol=1e-6)
@@ -160,7 +160,7 @@ def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimensio
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_perfect_ring_returns_the_true_poses(dimension):
     graph, true = ring(dimension)
-    answer = graph.optimise(PLAIN)
+    answer = graph.optimize(PLAIN)
     assert answer.converged and answer.chi2_after < 1e-12
     assert np.allclose(graph.poses, true, atol=1e-7)
 
@@ -176,54 +176,54 @@ def test_the_answer_moves_with_the_world_frame(dimension):
     for pose, stamp in zip(near.poses, near.stamps_ns, strict=True):
         far.add_pose(T @ pose, int(stamp))
     far.add_edges(near.edges, near.measurements, near.information, near.is_loop)
-    assert near.optimise(PLAIN).converged and far.optimise(PLAIN).converged
+    assert near.optimize(PLAIN).converged and far.optimize(PLAIN).converged
     assert k == far.freedom
     # 1e-9 relative of the distance is all that double precision keeps
     assert np.allclose(lie.inverse(T) @ far.poses, near.poses, atol=1e-7)
 
 
-def test_metres_or_centimetres_same_shape():
-    metres, _ = ring(2, noise=0.05)
+def test_meters_or_centimeters_same_shape():
+    meters, _ = ring(2, noise=0.05)
     scale, back = np.diag([100.0, 100.0, 1.0]), np.diag([0.01, 0.01, 1.0])
-    centimetres = PoseGraph(2)
-    for pose in metres.poses:
-        centimetres.add_pose(scale @ pose @ back, 0)
-    centimetres.add_edges(
-        metres.edges, scale @ metres.measurements @ back, back @ metres.information @ back, metres.is_loop
+    centimeters = PoseGraph(2)
+    for pose in meters.poses:
+        centimeters.add_pose(scale @ pose @ back, 0)
+    centimeters.add_edges(
+        meters.edges, scale @ meters.measurements @ back, back @ meters.information @ back, meters.is_loop
     )
     for robust in ("none", "huber", "cauchy", "geman-mcclure", "truncated"):
-        a, b = (graph.optimise(GraphConfig(robust=robust)) for graph in (metres, centimetres))
+        a, b = (graph.optimize(GraphConfig(robust=robust)) for graph in (meters, centimeters))
         assert a.chi2_after == pytest.approx(b.chi2_after, rel=1e-4)
-        assert np.allclose(back @ centimetres.poses @ scale, metres.poses, atol=1e-4)
+        assert np.allclose(back @ centimeters.poses @ scale, meters.poses, atol=1e-4)
 
 
 def test_a_fixed_pose_stays_to_the_bit():
     graph, _ = ring(3, noise=0.05)
     graph.fix(4)
     before = graph.poses.copy()
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     assert np.array_equal(graph.poses[4], before[4])
     assert not np.array_equal(graph.poses[0], before[0])
 
 
-def test_the_same_optimisation_twice_is_equal_to_the_bit():
-    answers = [read("intel").optimise(GraphConfig()) for _ in range(2)]
+def test_the_same_optimization_twice_is_equal_to_the_bit():
+    answers = [read("intel").optimize(GraphConfig()) for _ in range(2)]
     assert np.array_equal(answers[0].state.poses, answers[1].state.poses)
     assert answers[0].chi2_after == answers[1].chi2_after
 
 
 def test_every_reason_to_stop_is_reported():
-    assert read("MIT").optimise(GraphConfig(max_iterations=1, robust="none")).reason == "1 iteration reached"
-    assert "χ² change" in read("intel").optimise(PLAIN).reason
+    assert read("MIT").optimize(GraphConfig(max_iterations=1, robust="none")).reason == "1 iteration reached"
+    assert "χ² change" in read("intel").optimize(PLAIN).reason
     graph, _ = ring(2, noise=0.05)
-    graph.optimise(GraphConfig(robust="none", tolerance=1e-10))
-    assert "gradient" in graph.optimise(PLAIN).reason
+    graph.optimize(GraphConfig(robust="none", tolerance=1e-10))
+    assert "gradient" in graph.optimize(PLAIN).reason
     graph, _ = ring(2)
-    assert graph.optimise(PLAIN).reason.split()[0] in {"gradient", "step", "χ²"}
+    assert graph.optimize(PLAIN).reason.split()[0] in {"gradient", "step", "χ²"}
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_graph_grown_between_optimisations_equals_one_built_at_once(dimension):
+def test_a_graph_grown_between_optimizations_equals_one_built_at_once(dimension):
     whole, _ = ring(dimension, count=60, noise=0.03)
     grown = PoseGraph(dimension)
     for index, pose in enumerate(whole.poses):
@@ -232,8 +232,8 @@ def test_a_graph_grown_between_optimisations_equals_one_built_at_once(dimension)
             i, j = whole.edges[edge]
             grown.add_edge(i, j, whole.measurements[edge], whole.information[edge], bool(whole.is_loop[edge]))
         if index % 20 == 19:
-            grown.optimise(PLAIN)
-    whole.optimise(PLAIN)
+            grown.optimize(PLAIN)
+    whole.optimize(PLAIN)
     assert np.allclose(grown.poses, whole.poses, atol=1e-6)
     assert grown.stamps_ns.tolist() == [10 * index for index in range(60)]
 
@@ -241,7 +241,7 @@ def test_a_graph_grown_between_optimisations_equals_one_built_at_once(dimension)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_relative_covariance_equals_the_dense_inverse(dimension):
     graph, _ = ring(dimension, count=8, noise=0.02)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     k, i, j = graph.freedom, 2, 6
     H, _ = normal_equations(
         graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
@@ -269,7 +269,7 @@ def test_covariances_are_those_of_right_twists_as_the_information_of_edges_is(di
         graph.add_pose(lie.identity(dimension), index)
     for index, (motion, spread) in enumerate(zip(motions, spreads, strict=True)):
         graph.add_edge(index, index + 1, motion, np.linalg.inv(spread @ spread))
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     drawn = [
         motion @ lie.exp(rng.normal(size=(20_000, k)) @ spread)
         for motion, spread in zip(motions, spreads, strict=True)
@@ -284,7 +284,7 @@ def test_covariances_are_those_of_right_twists_as_the_information_of_edges_is(di
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_covariances_equal_the_dense_inverse(dimension):
     graph, _ = ring(dimension, count=9, noise=0.02)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     k = graph.freedom
     H, _ = normal_equations(
         graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
@@ -302,7 +302,7 @@ def test_covariances_equal_the_dense_inverse(dimension):
 def test_covariances_equal_those_of_gtsam(name):
     gtsam = pytest.importorskip("gtsam")
     graph = read(name)
-    graph.optimise(PLAIN)
+    graph.optimize(PLAIN)
     flat = graph.dimension == 2
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for index, T in enumerate(graph.poses):
@@ -323,7 +323,7 @@ def test_covariances_equal_those_of_gtsam(name):
         theirs = marginals.marginalCovariance(pose)
         spread = np.sqrt(np.diag(theirs))
         ours = found[pose][np.ix_(order, order)]
-        # GTSAM linearises its residual in another chart where the residual is large, hence a few thousandths
+        # GTSAM linearizes its residual in another chart where the residual is large, hence a few thousandths
         assert np.abs((ours - theirs) / np.outer(spread, spread)).max() < (1e-3 if flat else 0.05)
 
 
@@ -341,7 +341,7 @@ def test_a_pose_that_nothing_joins_is_named():
     graph, _ = ring(2)
     graph.add_pose(lie.identity(2), 99)
     with pytest.raises(InputError, match=r"1 of 13 poses are not joined to a fixed one: 12;"):
-        graph.optimise(PLAIN)
+        graph.optimize(PLAIN)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +357,7 @@ def test_a_pose_that_nothing_joins_is_named():
             np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
             "not symmetric positive semidefinite",
         ),
-        (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give metres"),
+        (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give meters"),
         (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
     ],
 )
@@ -383,18 +383,18 @@ def test_gauss_newton_names_the_pose_that_its_edges_leave_free():
     graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), np.eye(3))
     graph.add_edge(1, 2, lie.pose_2d(1.0, 0.0, 0.0), np.diag([1.0, 1.0, 0.0]))
     with pytest.raises(InputError, match=r"leave 1 pose free: 2 \(yaw\)"):
-        graph.optimise(GraphConfig(optimiser="gauss-newton", robust="none"), initialise="given")
+        graph.optimize(GraphConfig(optimizer="gauss-newton", robust="none"), initialize="given")
 
 
 def test_an_empty_graph_says_so():
     with pytest.raises(InputError, match="has no poses"):
-        PoseGraph(2).optimise(PLAIN)
+        PoseGraph(2).optimize(PLAIN)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_poses_without_edges_but_the_first_are_already_optimal(dimension):
     graph = PoseGraph(dimension)
     graph.add_pose(lie.identity(dimension), 5)
-    answer = graph.optimise(GraphConfig())
+    answer = graph.optimize(GraphConfig())
     assert answer.converged and answer.chi2_after == 0.0
     assert np.array_equal(graph.poses[0], lie.identity(dimension))

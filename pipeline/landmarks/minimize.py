@@ -1,4 +1,4 @@
-"""Bearing-range problems minimised by the step rules of pose graphs, with any of the linear solvers."""
+"""Bearing-range problems minimized by the step rules of pose graphs, with any of the linear solvers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from scanchain.graph.descent import descend
 from scanchain.graph.robust import RobustLoss
 from scanchain.graph.steps import step_rule
 from scanchain.kernels import normal_equations
-from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearisation
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearization
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 from scanchain.landmarks.system import LinearSystem
 
-Optimiser = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 
 
 class Loss(Protocol):
@@ -38,7 +38,7 @@ QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a minimisation ended.
+    """Where a minimization ended.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Minimum:
     """
 
     state: State
-    at: Linearisation
+    at: Linearization
     weights: NDArray[np.float64]
     cost: float
     iterations: int
@@ -57,26 +57,26 @@ class Minimum:
     reason: str
 
 
-def minimise(
+def minimize(
     problem: BearingRangeProblem,
     guess: State,
     solver: LinearSolver,
     *,
     loss: Loss = QUADRATIC,
-    optimiser: Optimiser = "levenberg-marquardt",
+    optimizer: Optimizer = "levenberg-marquardt",
     max_iterations: int = 100,
     tolerance: float = 1e-10,
     first_damping: float = 1e-4,
 ) -> Minimum:
-    """Follow the residuals downhill from the guess; a linearised step at a time, each solved by ``solver``.
+    """Follow the residuals downhill from the guess; a linearized step at a time, each solved by ``solver``.
 
     It ends where ``descend`` says. The first damping is for a guess that may be poor; near the minimum 1e-10
     serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
-    start = problem.linearise(guess)
+    start = problem.linearize(guess)
     here = Evaluation(guess, start, _cost(start, loss))
     descent = descend(
-        _Landscape(problem, solver, loss), here, step_rule(optimiser, first_damping), max_iterations, tolerance
+        _Landscape(problem, solver, loss), here, step_rule(optimizer, first_damping), max_iterations, tolerance
     )
     end = descent.end
     weights = loss.weight(end.at.observation_chi2)
@@ -88,7 +88,7 @@ class Evaluation:
     """A state with its residuals and the cost of them."""
 
     state: State
-    at: Linearisation
+    at: Linearization
     cost: float
 
 
@@ -104,7 +104,7 @@ class _Landscape:
 
     def moved(self, now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
         state = now.state.moved(step)
-        at = self._problem.linearise(state)
+        at = self._problem.linearize(state)
         return Evaluation(state, at, _cost(at, self._loss))
 
 
@@ -133,6 +133,6 @@ class _Model:
         return self._system.A.T @ (self._system.A @ step)
 
 
-def _cost(at: Linearisation, loss: Loss) -> float:
+def _cost(at: Linearization, loss: Loss) -> float:
     trusted = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
     return trusted + float(loss.loss(at.observation_chi2).sum())

@@ -1,4 +1,4 @@
-"""What an optimisation of the pose graph did."""
+"""What an optimization of the pose graph did."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import GraphState, fit_text
-from scanchain.graph.initialise import Initialisation
+from scanchain.graph.initialize import Initialization
 from scanchain.graph.soundness import has_loop
 from scanchain.words import counted
 
@@ -35,17 +35,17 @@ def has_loops(state: GraphState) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Optimisation:
-    """The answer of ``PoseGraph.optimise``.
+class Optimization:
+    """The answer of ``PoseGraph.optimize``.
 
     Attributes
     ----------
     state : the graph as it is now
     chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, at the poses of then
-    cost_after : what was minimised: Σ eᵀΩe of all edges, with the robust loss of the loop edges
+    cost_after : what was minimized: Σ eᵀΩe of all edges, with the robust loss of the loop edges
     iterations : linear solves
     converged, reason : whether and why the iteration stopped
-    initialisation : where the first guess came from
+    initialization : where the first guess came from
     time_s : wall time
     """
 
@@ -56,7 +56,7 @@ class Optimisation:
     iterations: int
     converged: bool
     reason: str
-    initialisation: Initialisation
+    initialization: Initialization
     time_s: float
 
     @property

@@ -15,31 +15,31 @@ from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.chordal import relax_chordally
 from scanchain.kernels.graph_tree import follow_tree
 
-Initialisation = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
+Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 
 _GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the poses at hand need no better guess
 
 
 def first_guess(
-    problem: BetweenProblem, poses: Matrix, initialise: Initialisation, *, trusted: bool
-) -> tuple[Matrix, Initialisation]:
+    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
+) -> tuple[Matrix, Initialization]:
     """Poses to start from, and which of the ways they come from.
 
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
     not every edge is trusted it keeps them in any case: no other guess is safe from a false loop.
     """
     if problem.is_point.any():
-        return _with_points(problem, poses, initialise, trusted=trusted)
+        return _with_points(problem, poses, initialize, trusted=trusted)
     fixed = problem.variable < 0
-    if initialise == "odometry":
-        return follow_odometry(poses, fixed, problem.edges, problem.measurements), initialise
-    if initialise == "spanning-tree":
-        return follow_spanning_tree(poses, fixed, problem.edges, problem.measurements), initialise
-    if initialise == "chordal":
-        return relax_chordally(problem, poses), initialise
+    if initialize == "odometry":
+        return follow_odometry(poses, fixed, problem.edges, problem.measurements), initialize
+    if initialize == "spanning-tree":
+        return follow_spanning_tree(poses, fixed, problem.edges, problem.measurements), initialize
+    if initialize == "chordal":
+        return relax_chordally(problem, poses), initialize
     chi2 = problem.chi2(problem.errors(poses)).sum()
     redundancy = problem.freedom * max(len(problem.edges) - len(problem.free), 1)
-    if initialise == "auto" and trusted and chi2 > _GOOD_GUESS * redundancy:
+    if initialize == "auto" and trusted and chi2 > _GOOD_GUESS * redundancy:
         try:
             relaxed = relax_chordally(problem, poses)
         except SingularMatrixError:
@@ -63,8 +63,8 @@ def place_points(problem: BetweenProblem, poses: Matrix) -> Matrix:
 
 
 def _with_points(
-    problem: BetweenProblem, poses: Matrix, initialise: Initialisation, *, trusted: bool
-) -> tuple[Matrix, Initialisation]:
+    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
+) -> tuple[Matrix, Initialization]:
     """The guess for the poses alone, and the points as they are seen from there, if that fits better."""
     ways = np.flatnonzero(~problem.is_point)
     place = np.cumsum(~problem.is_point) - 1
@@ -76,13 +76,13 @@ def _with_points(
         problem.variable[ways] < 0,
     )
     try:
-        guess, source = first_guess(alone, poses[ways], initialise, trusted=trusted)
+        guess, source = first_guess(alone, poses[ways], initialize, trusted=trusted)
     except SingularMatrixError:
         return poses.copy(), "given"
     result = poses.copy()
     result[ways] = guess
     placed = place_points(problem, result)
-    if source != "given" or initialise == "auto":
+    if source != "given" or initialize == "auto":
         chi2 = [problem.chi2(problem.errors(candidate)).sum() for candidate in (poses, placed)]
         if source != "given" or chi2[1] < chi2[0]:
             return placed, source

@@ -11,21 +11,21 @@ from scanchain.graph.curvature import full_curvature
 from scanchain.graph.descent import descend
 from scanchain.graph.estimate import Estimate, Minimum
 from scanchain.graph.robust import RobustLoss
-from scanchain.graph.steps import Optimiser, Vector, step_rule
+from scanchain.graph.steps import Optimizer, Vector, step_rule
 from scanchain.graph.verdicts import Verdicts
 
 Loss = RobustLoss | Verdicts
 
 
-class Minimiser:
-    """Minimises Σ χ² of trusted edges plus Σ ρ(χ²) of loop edges; its step rule keeps what it learns."""
+class Minimizer:
+    """Minimizes Σ χ² of trusted edges plus Σ ρ(χ²) of loop edges; its step rule keeps what it learns."""
 
-    def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimiser: Optimiser) -> None:
+    def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
         self.problem = problem
-        self.optimiser: Optimiser = optimiser
+        self.optimizer: Optimizer = optimizer
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
-        self._rule = step_rule(optimiser)
+        self._rule = step_rule(optimizer)
 
     def evaluate(self, poses: Matrix, loss: Loss) -> Estimate:
         """Residuals, χ² and cost at these poses."""
@@ -37,9 +37,9 @@ class Minimiser:
         """The same poses at the cost of another loss."""
         return Estimate(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
-    def restricted(self, kept: NDArray[np.bool_]) -> Minimiser:
+    def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same with some of the edges, kept (E,)."""
-        return Minimiser(self.problem.restricted(kept), self.is_loop[kept], self.optimiser)
+        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the trusted ones."""
@@ -63,19 +63,19 @@ class Minimiser:
 class _Landscape:
     """The cost of a graph with one loss."""
 
-    def __init__(self, minimiser: Minimiser, loss: Loss) -> None:
-        self._minimiser, self._loss = minimiser, loss
+    def __init__(self, minimizer: Minimizer, loss: Loss) -> None:
+        self._minimizer, self._loss = minimizer, loss
 
     def model(self, now: Estimate) -> _Model:
-        minimiser = self._minimiser
-        weights = minimiser.weights(now.chi2, self._loss)
-        equations = minimiser.problem.linearise(now.poses, now.errors, weights)
-        is_full = minimiser.optimiser == "newton"
-        curvature = full_curvature(minimiser.problem, now, equations) if is_full else equations.values
-        return _Model(minimiser.problem, equations, curvature)
+        minimizer = self._minimizer
+        weights = minimizer.weights(now.chi2, self._loss)
+        equations = minimizer.problem.linearize(now.poses, now.errors, weights)
+        is_full = minimizer.optimizer == "newton"
+        curvature = full_curvature(minimizer.problem, now, equations) if is_full else equations.values
+        return _Model(minimizer.problem, equations, curvature)
 
     def moved(self, now: Estimate, step: Vector) -> Estimate:
-        return self._minimiser.evaluate(self._minimiser.problem.moved(now.poses, step), self._loss)
+        return self._minimizer.evaluate(self._minimizer.problem.moved(now.poses, step), self._loss)
 
 
 class _Model:
@@ -89,7 +89,7 @@ class _Model:
     def solve(self, damping: float) -> Vector:
         damped = self._curvature.copy()
         damped[self._problem.pattern.diagonal] += damping * np.where(self.diagonal > 0.0, self.diagonal, 1.0)
-        self._problem.cholesky.factorise(damped)
+        self._problem.cholesky.factorize(damped)
         return self._problem.cholesky.solve(-self.gradient)
 
     def bend(self, step: Vector) -> Vector:
