@@ -157,7 +157,9 @@ def test_the_same_solution_twice_is_equal_to_the_bit():
 
 
 def test_methods_are_parsed_and_unknown_ones_refused():
-    assert parse_methods("lu, qr,lu") == ("lu", "qr")
+    assert parse_methods("lu, qr") == ("lu", "qr")
+    with pytest.raises(InputError, match="names one twice: lu, qr, lu"):
+        parse_methods("lu, qr,lu")
     assert methods_for(parse_methods("qr,all"), 100) == (("qr", *(name for name in METHODS if name != "qr")), "")
     for text in ("lu,chol", ""):
         with pytest.raises(InputError, match="choose from all, default, pinv"):

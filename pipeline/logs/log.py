@@ -318,6 +318,8 @@ class Log:
         where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
         if not isinstance(returns, Returns):
             return f"{where} is malformed: {returns}"
+        if message.log_time_ns >= 1 << 63:
+            return f"{where} has the log time {message.log_time_ns} ns, which no clock shows"
         farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
         if farthest_s > LONGEST_SWEEP_S:
             return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
