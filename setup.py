@@ -11,5 +11,9 @@ FOLDERS = {
 
 setup(
     package_dir=FOLDERS,
-    packages=[*FOLDERS, *(f"scanchain.{name}" for name in find_packages("pipeline"))],
+    packages=[
+        *FOLDERS,
+        *(f"scanchain.{name}" for name in find_packages("pipeline")),
+        *(f"scanchain.viz.{name}" for name in find_packages("viz")),
+    ],
 )

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
-    from scanchain.graph.g2o import read_g2o
-    from scanchain.graph.g2o_write import write_g2o
+    from scanchain.graph.files.g2o import read_g2o
+    from scanchain.graph.files.g2o_write import write_g2o
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.logs import open_log
     from scanchain.matching import VoxelMap, align, create_matcher, rigid_transform

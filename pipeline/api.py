@@ -111,22 +111,22 @@ def open_recorder(
     path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
 ) -> Recorder:
     """A rerun recording, which takes half a second to import."""
-    from scanchain.viz.recording import Recording
+    from scanchain.viz.recording.recording import Recording
 
     return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
 
 
 def write_report(directory: Path) -> None:
     """Add report.html to a run directory."""
-    from scanchain.viz.run_report import write_run_report
+    from scanchain.viz.report.run import write_run_report
 
     write_run_report(directory)
 
 
 def present_comparison(directory: Path) -> None:
     """Add report.html and a recording to the directory of a comparison."""
-    from scanchain.viz.compare_recording import record_comparison
-    from scanchain.viz.compare_report import write_compare_report
+    from scanchain.viz.recording.comparison import record_comparison
+    from scanchain.viz.report.comparison import write_compare_report
 
     write_compare_report(directory)
     record_comparison(directory)

@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 
 from scanchain.download import fetch
 from scanchain.errors import InputError
-from scanchain.logs.convert import convert
+from scanchain.logs.writing.convert import convert
 from scanchain.simulation import simulate
 
 Sha256 = Annotated[str, Meta(pattern="^([0-9a-f]{64}|unknown)$")]

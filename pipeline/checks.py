@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from scanchain.errors import InputError, shown
-from scanchain.kernels.validity import largest_magnitude, largest_moved, rigidity_error
+from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix, Pose
-from scanchain.kernels import pose_log, poses
-from scanchain.kernels.twist import orthonormalize
+from scanchain.kernels.geometry import pose_log, poses
+from scanchain.kernels.geometry.twist import orthonormalize
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 

@@ -28,9 +28,9 @@ from scanchain.data import (
     Verdict,
 )
 from scanchain.errors import InputError
-from scanchain.graph.graduation import Judgment
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.robust.graduation import Judgment
 from scanchain.loops import LoopCloser, refined, spread
 from scanchain.odometry import FrontEnd, Located, checked_start
 from scanchain.point_store import PointStore

@@ -21,12 +21,13 @@ from scenes import shared_data
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.logs.cdr import MalformedMessageError
-from scanchain.logs.laser_scan import LaserScanDecoder
-from scanchain.logs.limits import RangeLimits
-from scanchain.logs.point_cloud import PointCloudDecoder
-from scanchain.logs.point_times import PointTimes
-from scanchain.logs.readers import (
+from scanchain.logs.mcap.records import Channel
+from scanchain.logs.messages.cdr import MalformedMessageError
+from scanchain.logs.messages.laser_scan import LaserScanDecoder
+from scanchain.logs.messages.limits import RangeLimits
+from scanchain.logs.messages.point_cloud import PointCloudDecoder
+from scanchain.logs.messages.point_times import PointTimes
+from scanchain.logs.messages.readers import (
     cloud_reader,
     has_poses,
     has_transforms,
@@ -36,7 +37,6 @@ from scanchain.logs.readers import (
     scan_reader,
     transforms_reader,
 )
-from scanchain.logs.records import Channel
 
 LONGEST_S = 5.0  # of CPU, so that a busy machine makes no difference
 LONGEST_WAIT_S = 120.0

@@ -13,13 +13,13 @@ import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 from scenes import ROOT
 
-from scanchain.graph.g2o import read_g2o
+from scanchain.graph.files.g2o import read_g2o
 from scanchain.maps import read_map, read_ply
-from scanchain.runs.checkpoint import read_checkpoint
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from scanchain.runs.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.resume.checkpoint import read_checkpoint
+from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.trajectory import read_kitti, read_tum
-from scanchain.viz import entities
+from scanchain.viz.recording import entities
 
 _KILLS_A_RUN = 3  # then it may go on to its end
 COLUMNS = ["index", "stamp_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "odom_x", "odom_qz", "covariance", "state",

@@ -6,9 +6,9 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
-from scanchain.kernels.downsample import first_per_voxel
+from scanchain.kernels.voxels.downsample import first_per_voxel
 from scanchain.simulation.drive import plan
-from scanchain.simulation.town import town
+from scanchain.simulation.worlds.town import town
 
 PLACE_SEED = 3
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from scanchain import lie
-from scanchain.kernels.hashing import unpack
-from scanchain.kernels.voxels import (
+from scanchain.kernels.voxels.hashing import unpack
+from scanchain.kernels.voxels.voxel_shapes import (
     ACROSS,
     BORN,
     DIRECTION,

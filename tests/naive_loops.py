@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from scanchain import lie
-from scanchain.kernels.registration import CONVERGED, align
+from scanchain.kernels.registration.icp import CONVERGED, align
 
 
 def heights(points, T, cell_m, size):

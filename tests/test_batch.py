@@ -19,11 +19,11 @@ from web_server import serving
 from scanchain.__main__ import main
 from scanchain.batch.collecting import collect
 from scanchain.errors import InputError
-from scanchain.logs.write import LogWriter
+from scanchain.logs.writing.writer import LogWriter
 from scanchain.memory import resident_mib
 from scanchain.simulation import simulate
 from scanchain.source import Address
-from scanchain.viz.batch_report import names_of
+from scanchain.viz.report.batch import names_of
 
 POISON = """
 import sys

@@ -32,8 +32,8 @@ from scanchain import lie
 from scanchain.__main__ import scanchain
 from scanchain.commands.override_command import OnceCommand
 from scanchain.data import Trajectory
-from scanchain.graph.g2o import read_g2o
-from scanchain.logs.write import LogWriter
+from scanchain.graph.files.g2o import read_g2o
+from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum, write_kitti, write_tum

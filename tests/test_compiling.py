@@ -38,15 +38,19 @@ def kernel(module):
 def test_each_module_of_kernels_is_named_once_and_others_are_not():
     told = Told()
     with telling_of_compilation(told):
-        for module in ("scanchain.kernels.voxels", "scanchain.kernels.voxels", "numba.np.arrayobj"):
+        for module in (
+            "scanchain.kernels.voxels.voxel_shapes",
+            "scanchain.kernels.voxels.voxel_shapes",
+            "numba.np.arrayobj",
+        ):
             assert kernel(module)(2) == 4
-    kernel("scanchain.kernels.eigen")(2)
+    kernel("scanchain.kernels.geometry.eigen")(2)
     assert told.lines == ["compiling, once after the installation:", "  kernels.voxels"]
 
 
 def test_what_is_compiled_already_is_not_told():
     told = Told()
-    compiled = kernel("scanchain.kernels.voxels")
+    compiled = kernel("scanchain.kernels.voxels.voxel_shapes")
     compiled(2)
     with telling_of_compilation(told):
         compiled(3)
@@ -63,7 +67,7 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
     monkeypatch.setattr(subprocess, "Popen", remembered)
     with telling_of_compilation(Told(), ("http.server", "0")):
         assert not begun
-        for module in ("scanchain.kernels.voxels", "scanchain.kernels.eigen"):
+        for module in ("scanchain.kernels.voxels.voxel_shapes", "scanchain.kernels.geometry.eigen"):
             kernel(module)(2)
         assert len(begun) == 1 and begun[0].poll() is None
     assert begun[0].poll() is not None
@@ -98,7 +102,7 @@ def _remembering(made, name):
 
 
 def test_the_clock_stands_still_while_a_kernel_and_those_it_calls_are_compiled():
-    inner = kernel("scanchain.kernels.voxels")
+    inner = kernel("scanchain.kernels.voxels.voxel_shapes")
 
     @njit
     def outer(x):
@@ -132,7 +136,7 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
         if not compiled:
             before_s = compiled_s()
             while compiled_s() - before_s < 0.6:
-                kernel("scanchain.kernels.voxels")(2)
+                kernel("scanchain.kernels.voxels.voxel_shapes")(2)
             compiled.append(compiled_s() - before_s)
         return insert(self, *words)
 

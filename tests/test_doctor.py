@@ -24,7 +24,7 @@ from scanchain.__main__ import main
 from scanchain.config import Config, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.logs.doctor import examine
+from scanchain.logs.doctor.doctor import examine
 from scanchain.simulation import simulate
 
 STEP_NS = SECOND // 10

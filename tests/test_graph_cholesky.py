@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
+from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
 
 
 def _matrix(sizes, pairs, seed):

@@ -8,11 +8,11 @@ from scenes import shared_data
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.curvature import full_curvature
-from scanchain.graph.estimate import Estimate
-from scanchain.graph.g2o import read_g2o
+from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.steps import Optimizer
+from scanchain.graph.solvers.curvature import full_curvature
+from scanchain.graph.solvers.estimate import Estimate
+from scanchain.graph.solvers.steps import Optimizer
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {

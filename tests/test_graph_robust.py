@@ -5,9 +5,9 @@ from scenes import shared_data
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.g2o import read_g2o
+from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.verdicts import contradictions
+from scanchain.graph.robust.verdicts import contradictions
 from tests.benchmarks.wrong_edges import try_wrong_loops
 
 

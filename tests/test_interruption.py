@@ -18,14 +18,14 @@ from test_recording import column
 
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.runs.checkpoint import _CLASSES, Checkpoints, read_checkpoint
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from scanchain.runs.journal import JOURNAL_FILE, read_journal
-from scanchain.runs.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.runs.resume.checkpoint import _CLASSES, Checkpoints, read_checkpoint
+from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
-from scanchain.viz import entities
+from scanchain.viz.recording import entities
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
@@ -116,7 +116,10 @@ def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was
 
 @pytest.mark.parametrize(
     "module, kind, method",
-    [("scanchain.viz.recording", "Recording", "go_on"), ("scanchain.runs.checkpoint", "Checkpoints", "write")],
+    [
+        ("scanchain.viz.recording.recording", "Recording", "go_on"),
+        ("scanchain.runs.resume.checkpoint", "Checkpoints", "write"),
+    ],
 )
 def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
     office, whole, tmp_path, module, kind, method

@@ -32,7 +32,7 @@ def test_a_change_to_any_kernel_gives_all_of_them_a_new_folder(tmp_path):
     kernels, cache = package_at(tmp_path), tmp_path / "cache"
     before = cache_of(tmp_path, cache)
     assert before.startswith(str(cache / "scanchain" / "kernels")) and before == cache_of(tmp_path, cache)
-    with (kernels / "trust.py").open("a") as file:
+    with (kernels / "registration" / "weights.py").open("a") as file:
         file.write("# changed\n")
     assert cache_of(tmp_path, cache) != before
 

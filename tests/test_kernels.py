@@ -5,13 +5,15 @@ from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
-from scanchain.kernels import descent, downsample, eigen, hashing
-from scanchain.kernels.association import associate
-from scanchain.kernels.residuals import normal_equations
-from scanchain.kernels.shortest_ways import shortest_ways
-from scanchain.kernels.trust import weigh
-from scanchain.kernels.twist import orthonormalize, perturb
-from scanchain.kernels.voxels import DIRECTION, SHAPE
+from scanchain.kernels.geometry import eigen
+from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.graph.shortest_paths import shortest_ways
+from scanchain.kernels.registration import descent
+from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration.residuals import normal_equations
+from scanchain.kernels.registration.weights import weigh
+from scanchain.kernels.voxels import downsample, hashing
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE
 from scanchain.matching import VoxelMap
 
 SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}

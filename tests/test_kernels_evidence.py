@@ -8,9 +8,10 @@ from naive_evidence import hold, seen_from_source, spectrum
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
-from scanchain.kernels import evidence, poses
-from scanchain.kernels.eigen import eigensystem
-from scanchain.kernels.matching import root_mean_square_range
+from scanchain.kernels.geometry import poses
+from scanchain.kernels.geometry.eigen import eigensystem
+from scanchain.kernels.registration import observability
+from scanchain.kernels.registration.match import root_mean_square_range
 from scanchain.matching import VoxelMap
 from scanchain.matching.matcher import terms_of
 
@@ -48,7 +49,7 @@ def test_a_singular_matrix_has_an_eigensystem_too(A):
 @pytest.mark.parametrize("k", [3, 6])
 def test_the_spectrum_counts_turns_as_lengths(k):
     H = definite(k)
-    found = evidence.spectrum_of(H, 7.0, 12.0)
+    found = observability.spectrum_of(H, 7.0, 12.0)
     scale, values, vectors = spectrum(H, 7.0, 12.0)
     np.testing.assert_allclose(found.scale, scale)
     np.testing.assert_allclose(found.values, values, atol=1e-15)
@@ -63,9 +64,9 @@ def test_weak_directions_are_held_and_no_others(k, min_information, signal):
     terms = terms_of(
         MatchingConfig(min_information=min_information, min_signal=3.0), VoxelMap(3, LocalMapConfig()), wide=False
     )
-    found = evidence.spectrum_of(H, 2.0, 5.0)
+    found = observability.spectrum_of(H, 2.0, 5.0)
     found.signals[1] = signal
-    held = evidence.hold(found, 2.0, expected, terms)
+    held = observability.hold(found, 2.0, expected, terms)
     wanted = hold(H, 2.0, 5.0, expected, found.signals, (min_information, 3.0))
     np.testing.assert_allclose(held, wanted, rtol=1e-9, atol=1e-9)
 
@@ -73,15 +74,15 @@ def test_weak_directions_are_held_and_no_others(k, min_information, signal):
 @pytest.mark.parametrize("k", [3, 6])
 def test_information_turns_into_the_frame_of_the_source(k):
     T, T_first, H = some_pose(k), some_pose(k, seed=1), definite(k)
-    found = evidence.spectrum_of(H, 1.0, 3.0)
-    information, direction = evidence.seen_from_source(T, T_first, H, found.vectors[:, 0], 0.04)
+    found = observability.spectrum_of(H, 1.0, 3.0)
+    information, direction = observability.seen_from_source(T, T_first, H, found.vectors[:, 0], 0.04)
     wanted, worst = seen_from_source(T, T_first, H, found.vectors[:, 0], 0.04)
     np.testing.assert_allclose(information, wanted, atol=1e-12)
     np.testing.assert_allclose(direction, worst, atol=1e-12)
 
 
 def test_what_is_not_definite_has_no_inverse():
-    np.testing.assert_array_equal(evidence.definite_inverse(np.diag([1.0, 0.0, 1.0])), np.zeros((3, 3)))
+    np.testing.assert_array_equal(observability.definite_inverse(np.diag([1.0, 0.0, 1.0])), np.zeros((3, 3)))
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -7,7 +7,7 @@ from naive_evidence import signal_along
 from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
-from scanchain.kernels import registration, signal
+from scanchain.kernels.registration import icp, signal_to_noise
 from scanchain.matching import VoxelMap, create_matcher
 from scanchain.matching.matcher import terms_of
 
@@ -52,10 +52,10 @@ def test_the_signal_is_that_of_its_slow_twin(twist, scans):
     voxel_map.insert(points + np.array([0.0, 0.0, 0.4]), lie.identity(3))  # voxels that are young
     T = lie.exp(np.array([0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
     terms = terms_of(LIMITS, voxel_map, wide=False)
-    outcome = registration.align(
+    outcome = icp.align(
         voxel_map.voxels, points, T, np.zeros(6), np.zeros((6, 6)), 5.0, terms.first_scale_m, terms
     )
-    found = signal.signal_along(voxel_map.voxels, points, T, outcome, twist, voxel_map.insertions)
+    found = signal_to_noise.signal_along(voxel_map.voxels, points, T, outcome, twist, voxel_map.insertions)
     assert found == pytest.approx(signal_along(voxel_map, points, T, outcome, twist), rel=1e-9)
 
 

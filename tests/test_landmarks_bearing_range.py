@@ -6,12 +6,12 @@ import pytest
 from naive_landmarks import numeric_jacobian
 from scenes import shared_data
 
-from scanchain.graph.robust import RobustLoss
-from scanchain.kernels import dead_reckoning, landmark_factors
+from scanchain.graph.robust.losses import RobustLoss
+from scanchain.kernels.landmarks import dead_reckoning, factors
 from scanchain.landmarks import guess as guesses
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
+from scanchain.landmarks.files.npz import read_landmark_data
 from scanchain.landmarks.minimize import QUADRATIC, minimize
-from scanchain.landmarks.npz import read_landmark_data
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
 
@@ -22,7 +22,7 @@ def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bea
     rng = np.random.default_rng(1)
     pose, landmark = np.array([1.0, -2.0, 2.8])[:size], rng.normal(size=2) * 3.0
     r, J = np.empty(2), np.empty((2, size + 2))
-    landmark_factors.bearing_range_block(pose, landmark, bearing, 2.0, r, J)
+    factors.bearing_range_block(pose, landmark, bearing, 2.0, r, J)
     assert np.allclose(r, naive_landmarks.bearing_range(pose, landmark, bearing, 2.0), atol=1e-12)
 
     def residual(x):
@@ -34,13 +34,13 @@ def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bea
 def test_a_bearing_that_crosses_pi_is_off_by_little_not_by_a_turn():
     r, J = np.empty(2), np.empty((2, 4))
     for y in (0.01, -0.01):
-        landmark_factors.bearing_range_block(np.zeros(2), np.array([-2.0, y]), np.sign(y) * -3.13, 2.0, r, J)
+        factors.bearing_range_block(np.zeros(2), np.array([-2.0, y]), np.sign(y) * -3.13, 2.0, r, J)
         assert abs(r[0]) < 0.02
 
 
 def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
     r, J = np.empty(2), np.empty((2, 5))
-    landmark_factors.bearing_range_block(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0, r, J)
+    factors.bearing_range_block(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0, r, J)
     assert np.array_equal(r, [0.0, -3.0]) and not J[0].any()
     assert np.allclose(J[1], [-np.cos(0.7), -np.sin(0.7), 0.0, np.cos(0.7), np.sin(0.7)])
 
@@ -49,7 +49,7 @@ def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
 def test_odometry_equals_the_naive_one_and_finite_differences(turn):
     first, second, moved = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.0, 3.0 + turn]), np.array([0.4, 0.1, turn])
     r, J = np.empty(3), np.empty((3, 6))
-    landmark_factors.odometry_block(first, second, moved, r, J)
+    factors.odometry_block(first, second, moved, r, J)
     assert np.allclose(r, naive_landmarks.odometry(first, second, moved), atol=1e-12)
     numeric = numeric_jacobian(
         lambda x: naive_landmarks.odometry(x[:3], x[3:], moved), np.concatenate([first, second])

@@ -3,10 +3,10 @@ import pytest
 from scenes import shared_data
 
 from scanchain.errors import InputError
-from scanchain.landmarks.dead_reckoning import OdometryNoise
-from scanchain.landmarks.mrclam import read_mrclam
-from scanchain.landmarks.npz import read_landmark_data
-from scanchain.landmarks.range_slam import solve_range_log
+from scanchain.landmarks.files.mrclam import read_mrclam
+from scanchain.landmarks.files.npz import read_landmark_data
+from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
+from scanchain.landmarks.ranges.slam import solve_range_log
 from scanchain.landmarks.study import Options
 from scanchain.landmarks.study_log import study_log
 
@@ -186,7 +186,7 @@ def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
 def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):
     log = read_mrclam(shared_data("landmarks/utias_mrclam6"), 1)
     first = solve_range_log(log, None)
-    monkeypatch.setattr("scanchain.landmarks.range_fit._SENSOR", np.square([0.02, 0.2]))
+    monkeypatch.setattr("scanchain.landmarks.ranges.fit._SENSOR", np.square([0.02, 0.2]))
     second = solve_range_log(log, None)
     assert second.bearing_sigma_rad == pytest.approx(first.bearing_sigma_rad, rel=0.1)
     assert second.range_sigma_m == pytest.approx(first.range_sigma_m, rel=0.1)

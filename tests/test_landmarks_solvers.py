@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanchain.errors import InputError
-from scanchain.kernels import column_order
+from scanchain.kernels.landmarks import column_order
 from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
 from scanchain.landmarks.solvers.eliminate_landmarks import LandmarkElimination

@@ -16,9 +16,12 @@ from web_server import serving
 from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
-from scanchain.logs import open_log, read_ahead, remote, write
+from scanchain.logs import open_log
+from scanchain.logs.mcap import read_ahead
+from scanchain.logs.mcap.read_ahead import ReadAhead, merged
 from scanchain.logs.opening import index_files
-from scanchain.logs.read_ahead import ReadAhead, merged
+from scanchain.logs.remote import files
+from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
 from scanchain.source import Address, source_of
@@ -31,7 +34,7 @@ def log_file(tmp_path_factory):
     """A simulated office in many chunks: laser scans, wheels, a mounting, ground truth."""
     path = tmp_path_factory.mktemp("remote") / "office.mcap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(write, "CHUNK_BYTES", 100_000)
+        patch.setattr(writer, "CHUNK_BYTES", 100_000)
         simulate("office", path, duration_s=80.0, seed=3)
     return path
 
@@ -45,7 +48,7 @@ def site(log_file):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(remote, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(files, "_PAUSE_S", 0.01)
 
 
 def same_scans(first, second):

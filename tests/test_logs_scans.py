@@ -176,7 +176,7 @@ def test_the_log_can_be_read_again_and_closed_early(tmp_path):
 
 
 def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
-    from scanchain.logs import stream
+    from scanchain.logs.mcap import stream
 
     path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
     opened = []

@@ -9,8 +9,8 @@ from scenes import configured, stored
 
 from scanchain import lie
 from scanchain.data import Keyframe, Proposal, Verdict
-from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
-from scanchain.kernels.place import count_heights, mark_heights
+from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
+from scanchain.kernels.search.descriptor import count_heights, mark_heights
 from scanchain.loops.agreement import free_space_agreement
 from scanchain.loops.gallery import Gallery
 from scanchain.loops.local_map import local_map

@@ -7,7 +7,7 @@ from scenes import configured
 
 from scanchain import lie
 from scanchain.data import Keyframe
-from scanchain.kernels.refinement import refine
+from scanchain.kernels.registration.refinement import refine
 from scanchain.loops import refined
 from scanchain.matching import VoxelMap
 from scanchain.matching.matcher import terms_of

@@ -24,11 +24,11 @@ from scanchain.data import Closure, GraphState, Match, Scan, State, Step, Timing
 from scanchain.errors import InputError
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.verdicts import final_verdicts
-from scanchain.viz import entities, shapes, viewer
-from scanchain.viz.blueprint import blueprint
-from scanchain.viz.messages import Message
-from scanchain.viz.recording import Recording
-from scanchain.viz.sinks import file_sink, open_stream, write_recording
+from scanchain.viz.recording import entities, shapes, viewer
+from scanchain.viz.recording.blueprint import blueprint
+from scanchain.viz.recording.messages import Message
+from scanchain.viz.recording.recording import Recording
+from scanchain.viz.recording.sinks import file_sink, open_stream, write_recording
 
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
@@ -363,10 +363,10 @@ from uuid import uuid4
 from test_recording import drive, free_port
 from scanchain.config import RecordingConfig
 from scanchain.viz import sinks, viewer
-from scanchain.viz.blueprint import blueprint
-from scanchain.viz.messages import Message
-from scanchain.viz.recording import Recording
-from scanchain.viz.sinks import open_stream, write_recording
+from scanchain.viz.recording.blueprint import blueprint
+from scanchain.viz.recording.messages import Message
+from scanchain.viz.recording.recording import Recording
+from scanchain.viz.recording.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
 server = viewer.start_web(port, free_port())
@@ -450,10 +450,10 @@ from pathlib import Path
 from uuid import uuid4
 from test_recording import drive
 from scanchain.config import RecordingConfig
-from scanchain.viz.blueprint import blueprint
-from scanchain.viz.messages import Message
-from scanchain.viz.recording import Recording
-from scanchain.viz.sinks import open_stream, write_recording
+from scanchain.viz.recording.blueprint import blueprint
+from scanchain.viz.recording.messages import Message
+from scanchain.viz.recording.recording import Recording
+from scanchain.viz.recording.sinks import open_stream, write_recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
 recording.__enter__()

@@ -19,15 +19,15 @@ from rerun.chunk import RrdReader
 from scanchain.__main__ import main
 from scanchain.comparison.columns import COLUMNS
 from scanchain.comparison.table import read_table
-from scanchain.logs.write import LogWriter
+from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.simulation import simulate
-from scanchain.viz.course_figures import plan
-from scanchain.viz.courses import Course, PathLine
-from scanchain.viz.map_figures import surroundings
-from scanchain.viz.map_viewer import SCRIPT, map_scene
-from scanchain.viz.report import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
-from scanchain.viz.trajectory_section import Told, trajectory_section
+from scanchain.viz.pictures.map_figures import surroundings
+from scanchain.viz.pictures.trajectories import Course, PathLine
+from scanchain.viz.pictures.trajectory_figures import plan
+from scanchain.viz.report.map_viewer import SCRIPT, map_scene
+from scanchain.viz.report.page import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.trajectory_section import Told, trajectory_section
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent
@@ -325,7 +325,7 @@ def test_a_page_needs_nothing_but_itself(which, request):
 
 
 def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
-    from scanchain.viz.compare_report import write_compare_report
+    from scanchain.viz.report.comparison import write_compare_report
 
     before = (comparison / "report.html").read_bytes()
     write_compare_report(comparison)

@@ -22,7 +22,7 @@ from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Job
 from scanchain.runs.progress import Unwatched
-from scanchain.runs.rescue import PartialRunError
+from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
 from scanchain.simulation import simulate

@@ -106,7 +106,7 @@ def batch(
         memory_mib=memory_mib,
         retries=retries,
     )
-    from scanchain.viz.batch_report import write_batch_report
+    from scanchain.viz.report.batch import write_batch_report
 
     with Terminal("logs") as terminal:
         batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))

@@ -14,7 +14,7 @@ from scanchain.settings import load_settings
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.logs.doctor import Diagnosis
+    from scanchain.logs.doctor.doctor import Diagnosis
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
@@ -34,7 +34,7 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_j
       scanchain doctor log.mcap --log.point_times ms
     """
     from scanchain.commands.terminal import Terminal
-    from scanchain.logs.doctor import examine
+    from scanchain.logs.doctor.doctor import examine
 
     chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
     early = load_settings(overrides=chosen).config

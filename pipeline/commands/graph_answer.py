@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from scanchain.graph.certificate import Certificate
-    from scanchain.graph.g2o import G2oFile
+    from scanchain.graph.files.g2o import G2oFile
     from scanchain.graph.observability import FreePose
     from scanchain.graph.optimization import GraphChange, Optimization
 

@@ -15,8 +15,8 @@ from scanchain.commands.override_command import OnceCommand
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.landmarks.dead_reckoning import OdometryNoise
     from scanchain.landmarks.minimize import Optimizer
+    from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
     from scanchain.landmarks.study import Guess, Study
 
 
@@ -103,15 +103,15 @@ def landmarks(
     """
     from scanchain.commands.outputs import check_output
     from scanchain.commands.terminal import Terminal
-    from scanchain.landmarks.npz import read_landmark_data
+    from scanchain.landmarks.files.npz import read_landmark_data
+    from scanchain.landmarks.files.write import text_of, tree_of
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options
     from scanchain.landmarks.study_file import study_file
     from scanchain.landmarks.study_log import study_log
-    from scanchain.landmarks.write import text_of, tree_of
     from scanchain.runs.compiling import telling_of_compilation
     from scanchain.runs.directory import RunDirectory
-    from scanchain.viz.landmark_report import write_report
+    from scanchain.viz.report.landmarks import write_report
 
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimizer)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
@@ -129,7 +129,7 @@ def landmarks(
         _write(directory.path, data, studies, tree)
         write_report(directory.path, studies)
         if recording is not None:
-            from scanchain.viz.landmark_recording import record_landmarks
+            from scanchain.viz.recording.landmarks import record_landmarks
 
             record_landmarks(studies, recording)
         directory.complete()
@@ -156,7 +156,7 @@ def _check_options(ctx: click.Context, kinds: Collection[str]) -> None:
 
 def _noise(text: str | None) -> OdometryNoise | None:
     """Four positive numbers with commas; None is to be estimated."""
-    from scanchain.landmarks.dead_reckoning import OdometryNoise
+    from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
 
     if text is None:
         return None
@@ -171,7 +171,7 @@ def _noise(text: str | None) -> OdometryNoise | None:
 
 def _check_names(studies: Sequence[Study]) -> None:
     """Refuse problems whose files would overwrite each other."""
-    from scanchain.landmarks.write import file_stem
+    from scanchain.landmarks.files.write import file_stem
 
     stems = [file_stem(study.name) for study in studies]
     for study, stem in zip(studies, stems, strict=True):
@@ -183,7 +183,7 @@ def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree
     """The estimates, the figures, and how they came about."""
     from msgspec.structs import replace
 
-    from scanchain.landmarks.write import write_estimate
+    from scanchain.landmarks.files.write import write_estimate
     from scanchain.runs.provenance import describe_start
 
     for study in studies:

@@ -19,7 +19,7 @@ from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from scanchain.config import GraphConfig
-    from scanchain.graph.g2o import G2oFile, Indefinite
+    from scanchain.graph.files.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
 
 _PATH = click.Path(path_type=Path)
@@ -123,7 +123,7 @@ class Outputs:
     @property
     def rejected(self) -> Path | None:
         """Where the edges go that are not in force, if there are any."""
-        from scanchain.graph.g2o_write import rejected_path
+        from scanchain.graph.files.g2o_write import rejected_path
 
         return rejected_path(self.graph) if self.graph else None
 
@@ -131,7 +131,7 @@ class Outputs:
         """Refuse before the work what could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        from scanchain.graph.g2o_write import GRAPH_SUFFIXES
+        from scanchain.graph.files.g2o_write import GRAPH_SUFFIXES
 
         endings = {self.graph: GRAPH_SUFFIXES, self.picture: (".png",), self.recording: (".rrd",)}
         for path in (*self.paths, *filter(None, [self.rejected])):
@@ -139,8 +139,8 @@ class Outputs:
 
     def write(self, answer: Answer) -> list[Path]:
         """Write them all; which those are."""
-        from scanchain.graph.covariance_table import chosen_poses, write_covariances
-        from scanchain.graph.g2o_write import write_graph
+        from scanchain.graph.files.covariance_table import chosen_poses, write_covariances
+        from scanchain.graph.files.g2o_write import write_graph
 
         file = answer.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
@@ -158,12 +158,12 @@ class Outputs:
             with _written(self.table):
                 write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
-            from scanchain.viz.graph_picture import draw_graph
+            from scanchain.viz.pictures.graph import draw_graph
 
             with _written(self.picture):
                 draw_graph(answer.change, self.picture)
         if self.recording is not None:
-            from scanchain.viz.graph_recording import record_graph
+            from scanchain.viz.recording.graph import record_graph
 
             with _written(self.recording):
                 record_graph(answer.change, self.recording)
@@ -196,7 +196,7 @@ def _config(settings: Sequence[Override]) -> GraphConfig:
 
 def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
     """The graph, with a warning where it is not taken as it stands."""
-    from scanchain.graph.g2o import read_g2o
+    from scanchain.graph.files.g2o import read_g2o
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -94,7 +94,7 @@ def run(
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
-    from scanchain.runs.rescue import how_to_resume
+    from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
 
     truth_file, truth_topic = ground_truth(gt)

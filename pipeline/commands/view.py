@@ -39,7 +39,7 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
             f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
         )
     if png is not None:
-        from scanchain.viz.run_picture import draw_run
+        from scanchain.viz.pictures.run import draw_run
 
         check_output(png, force=force, endings=(".png",))
         draw_run(directory, png)
@@ -52,7 +52,7 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         )
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
-    from scanchain.viz.show import show
+    from scanchain.viz.recording.show import show
 
     with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
         show(path, click.echo, in_browser=web)

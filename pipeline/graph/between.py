@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
-from scanchain.kernels import graph_between_se2, graph_between_se3, graph_scatter
+from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholesky, analyze
+from scanchain.kernels.graph import between_se2, between_se3, scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class BetweenProblem:
     def chi2(self, errors: Matrix) -> NDArray[np.float64]:
         """Return eᵀΩe of every edge, (E,)."""
         result = np.empty(len(errors))
-        graph_scatter.squared_norms(errors, self.information, result)
+        scatter.squared_norms(errors, self.information, result)
         return result
 
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
@@ -101,7 +101,7 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        graph_scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
+        scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
 
     def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:
@@ -112,7 +112,7 @@ class BetweenProblem:
 
     def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
         errors = np.empty((len(edges), self.freedom))
-        kernel = graph_between_se2 if self.freedom == 3 else graph_between_se3
+        kernel = between_se2 if self.freedom == 3 else between_se3
         kernel.residuals(_kept(poses), _kept(edges), self.measurements, errors)
         if len(self.sightings):
             d, Z = poses.shape[-1] - 1, self.measurements[self.sightings]
@@ -125,9 +125,9 @@ class BetweenProblem:
     def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
         jacobian = np.empty((len(edges), self.freedom, self.freedom))
         if self.freedom == 3:
-            graph_between_se2.jacobians(_kept(poses), _kept(edges), self.measurements, jacobian)
+            between_se2.jacobians(_kept(poses), _kept(edges), self.measurements, jacobian)
         else:
-            graph_between_se3.jacobians(_kept(poses), _kept(edges), errors, jacobian)
+            between_se3.jacobians(_kept(poses), _kept(edges), errors, jacobian)
         if len(self.sightings):
             d = poses.shape[-1] - 1
             T_i, T_j = poses[edges[self.sightings].T]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.minorant import Minorants, minorize
+from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.soundness import is_connected
-from scanchain.kernels.graph_dual import scatter_dual
+from scanchain.kernels.graph.dual import scatter_dual
 from scanchain.words import counted
 
 _NOTHING = 1e-9  # χ² that is zero but for rounding; this share of the largest information where that is below 1

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.cholesky import BlockPattern, SparseCholesky
+from scanchain.graph.solvers.cholesky import BlockPattern, SparseCholesky
 
 
 def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:

@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.chordal import relax_chordally
-from scanchain.kernels.graph_tree import follow_tree
+from scanchain.graph.solvers.cholesky import SingularMatrixError
+from scanchain.kernels.graph.tree import follow_tree
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.graph.soundness import is_connected, listed, loose
 from scanchain.words import counted
 

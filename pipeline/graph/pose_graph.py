@@ -14,9 +14,7 @@ from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
-from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import own_covariances, relative_covariance
-from scanchain.graph.graduation import Judgment
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -29,7 +27,9 @@ from scanchain.graph.observability import (
     weakly_joined,
 )
 from scanchain.graph.optimization import Optimization
-from scanchain.graph.solve import solve
+from scanchain.graph.robust.graduation import Judgment
+from scanchain.graph.solvers.cholesky import SingularMatrixError
+from scanchain.graph.solvers.solve import solve
 from scanchain.graph.soundness import check_connected, check_edges, ranks
 from scanchain.words import counted
 

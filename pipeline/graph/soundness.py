@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.kernels.graph_soundness import judge_matrices
+from scanchain.kernels.graph.semidefinite import judge_matrices
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.landmarks.mrclam import RangeLog
+from scanchain.landmarks.files.mrclam import RangeLog
 from scanchain.landmarks.problem import LandmarkData, State
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated

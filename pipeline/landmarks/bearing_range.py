@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels import landmark_factors
+from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.assembly import landmark_columns, pattern_of, pose_columns, whitening
 from scanchain.landmarks.problem import LandmarkData, State
 from scanchain.landmarks.system import Layout, LinearSystem
@@ -140,7 +140,7 @@ class BearingRangeProblem:
         calibration = given.calibration
         motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
         if p == 3:
-            landmark_factors.odometry(state.poses, given.motion, self.motion_whitening, motion, J_motion)
+            factors.odometry(state.poses, given.motion, self.motion_whitening, motion, J_motion)
         else:
             W = self.motion_whitening
             motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
@@ -149,7 +149,7 @@ class BearingRangeProblem:
         J_motion = np.concatenate([J_motion, self._slope], axis=-1)
         seen = np.empty(given.measured.shape)
         J_seen = np.empty((len(seen), 2, p + 2))
-        landmark_factors.bearing_range(
+        factors.bearing_range(
             state.poses, state.landmarks, given.observed, given.measured, self._observation, seen, J_seen
         )
         off = state.poses[0] - given.first_pose

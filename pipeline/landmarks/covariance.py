@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels import arrow
+from scanchain.kernels.landmarks import arrow
 from scanchain.landmarks.solvers.schur import factor_arrow
 from scanchain.landmarks.system import LinearSystem
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.graph.robust import RobustLoss
+from scanchain.graph.robust.losses import RobustLoss
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
-from scanchain.landmarks.dead_reckoning import chain
 from scanchain.landmarks.minimize import minimize
 from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.ranges.dead_reckoning import chain
 from scanchain.landmarks.solvers import LinearSolver
 
 _FIRST, _GROWTH = 16, 2  # poses to begin with, and how much further each part reaches

@@ -8,11 +8,11 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.graph.descent import descend
-from scanchain.graph.robust import RobustLoss
-from scanchain.graph.steps import step_rule
-from scanchain.kernels import normal_equations
+from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.solvers.cholesky import SingularMatrixError
+from scanchain.graph.solvers.descent import descend
+from scanchain.graph.solvers.steps import step_rule
+from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearization
 from scanchain.landmarks.problem import State
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError

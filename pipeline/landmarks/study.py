@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.landmarks.accuracy import Accuracy
 from scanchain.landmarks.compare import MethodResult
-from scanchain.landmarks.dead_reckoning import OdometryNoise
 from scanchain.landmarks.minimize import Optimizer
 from scanchain.landmarks.problem import State
+from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
 
 Guess = Literal["odometry", "disturbed", "origin"]
 

@@ -12,10 +12,10 @@ from scanchain.clock import working_s
 from scanchain.data import Trajectory
 from scanchain.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
 from scanchain.landmarks.compare import compare_linear
-from scanchain.landmarks.dead_reckoning import OWN, OWN_UNITS
-from scanchain.landmarks.mrclam import RangeLog, read_mrclam
+from scanchain.landmarks.files.mrclam import RangeLog, read_mrclam
 from scanchain.landmarks.problem import State
-from scanchain.landmarks.range_slam import RangeSolution, solve_range_log
+from scanchain.landmarks.ranges.dead_reckoning import OWN, OWN_UNITS
+from scanchain.landmarks.ranges.slam import RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import methods_for
 from scanchain.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
 from scanchain.words import counted

@@ -8,10 +8,10 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Pose
-from scanchain.logs.first_messages import first_messages
+from scanchain.logs.mcap.first_messages import first_messages
+from scanchain.logs.messages.poses import StampedPose, chain
+from scanchain.logs.messages.readers import cloud_reader, is_scan, scan_reader
 from scanchain.logs.mounting import in_plane, root_frame, static_transforms
-from scanchain.logs.poses import StampedPose, chain
-from scanchain.logs.readers import cloud_reader, is_scan, scan_reader
 
 if TYPE_CHECKING:
     from scanchain.logs.log import Log

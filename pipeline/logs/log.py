@@ -16,9 +16,16 @@ from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
-from scanchain.logs.first_messages import first_messages
-from scanchain.logs.laser_scan import LaserScanDecoder
-from scanchain.logs.limits import RangeLimits, Returns, none_retained
+from scanchain.logs.mcap.first_messages import first_messages
+from scanchain.logs.mcap.records import FileIndex, name_of
+from scanchain.logs.mcap.selection import chosen_span, count_scans, whole_span
+from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages
+from scanchain.logs.messages.laser_scan import LaserScanDecoder
+from scanchain.logs.messages.limits import RangeLimits, Returns, none_retained
+from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
+from scanchain.logs.messages.point_times import PointTimes
+from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.messages.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
 from scanchain.logs.mounting import (
     find_mounting,
     in_plane,
@@ -28,13 +35,6 @@ from scanchain.logs.mounting import (
     leaves_plane,
 )
 from scanchain.logs.opening import HAS_STAMPS, index_files
-from scanchain.logs.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
-from scanchain.logs.point_times import PointTimes
-from scanchain.logs.poses import StampedPose
-from scanchain.logs.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
-from scanchain.logs.records import FileIndex, name_of
-from scanchain.logs.selection import chosen_span, count_scans, whole_span
-from scanchain.logs.stream import Decoded, Decoders, decoded_messages
 from scanchain.logs.tally import Tally, most_bad_scans
 from scanchain.logs.told_poses import Beside, ToldPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry

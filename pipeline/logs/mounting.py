@@ -11,9 +11,11 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
-from scanchain.logs.first_messages import first_messages, spread_messages
-from scanchain.logs.poses import StampedPose, chain, frames_between
-from scanchain.logs.readers import (
+from scanchain.logs.mcap.first_messages import first_messages, spread_messages
+from scanchain.logs.mcap.records import Channel, FileIndex
+from scanchain.logs.mcap.selection import Span
+from scanchain.logs.messages.poses import StampedPose, chain, frames_between
+from scanchain.logs.messages.readers import (
     cloud_reader,
     has_transforms,
     is_odometry,
@@ -22,8 +24,6 @@ from scanchain.logs.readers import (
     scan_reader,
     transforms_reader,
 )
-from scanchain.logs.records import Channel, FileIndex
-from scanchain.logs.selection import Span
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain.data import Pose, Trajectory
-from scanchain.logs.limits import Returns
+from scanchain.logs.mcap.stream import Decoded
+from scanchain.logs.messages.limits import Returns
+from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.mounting import Mounting, edge
-from scanchain.logs.poses import StampedPose
-from scanchain.logs.stream import Decoded
 from scanchain.logs.wheels import WheelTrack
 from scanchain.words import counted
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from scanchain.errors import InputError
-from scanchain.logs.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
-from scanchain.logs.records import Channel, FileIndex, name_of
+from scanchain.logs.mcap.records import Channel, FileIndex, name_of
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
 from scanchain.words import counted
 
 _MOST_LISTED = 8

@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.free_space import compare_ranges, nearest_ranges
+from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.local_map import LocalMap
 
 _VIEWS = 8  # of each map that are held against the other

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.shortest_ways import shortest_ways
+from scanchain.kernels.graph.shortest_paths import shortest_ways
 
 _CLOSED = 0.5  # weight that the robust loss leaves to a loop edge, from which on it joins two places
 _LOOP_M = 1e-3  # length of such an edge

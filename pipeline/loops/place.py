@@ -11,7 +11,7 @@ from scipy.ndimage import affine_transform, gaussian_filter, map_coordinates
 
 from scanchain import lie
 from scanchain.data import Pose
-from scanchain.kernels.place import count_heights, mark_heights
+from scanchain.kernels.search.descriptor import count_heights, mark_heights
 from scanchain.loops.local_map import LocalMap
 
 SIZE = 128  # cells along each side of a view

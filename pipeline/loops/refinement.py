@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config, MatchingConfig
 from scanchain.data import Keyframe, Matrix, Points
-from scanchain.kernels.refinement import refine
+from scanchain.kernels.registration.refinement import refine
 from scanchain.matching import VoxelMap
 from scanchain.matching.matcher import terms_of
 from scanchain.point_store import PointStore

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Pose
-from scanchain.kernels.voxels import DIRECTION, PLANE, SHAPE
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, PLANE, SHAPE
 from scanchain.matching import VoxelMap
 
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally

@@ -9,7 +9,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Match, Points, Pose
-from scanchain.kernels.association import associate
+from scanchain.kernels.registration.association import associate
 from scanchain.loops.agreement import free_space_agreement
 from scanchain.loops.local_map import LocalMap
 from scanchain.matching import PointToShapeMatcher, VoxelMap

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scanchain.config import MapsConfig
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.kernels import ray_grid
+from scanchain.kernels.raycast import grid
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
 MAX_CELLS = 64_000_000  # half a gigabyte
 
-_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, § 5.1
+_HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, . 5.1
 _LOW, _HIGH = -2.0, 3.5
 _MARGIN = 2  # cells around everything that is drawn; rounding may put a beam one cell aside
 _GROWTH = 0.25  # of the extent, added where the grid has to grow
@@ -59,7 +59,7 @@ class OccupancyGrid:
         config = self.config
         for k, T in enumerate(poses):
             part = slice(int(kept[k]), int(kept[k]) + int(offsets[k + 1] - offsets[k]))
-            count = ray_grid.beams_in_slice(
+            count = grid.beams_in_slice(
                 T, points[offsets[k] : offsets[k + 1]], self.max_range_m,
                 config.slice_min_z_m, config.slice_max_z_m, starts[part], ends[part],
             )  # fmt: skip
@@ -90,10 +90,10 @@ class OccupancyGrid:
 
     def _draw(self, starts: Matrix, ends: Matrix, offsets: NDArray[np.int64]) -> None:
         extent = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        ray_grid.bounds(starts, extent)
-        ray_grid.bounds(ends, extent)
+        grid.bounds(starts, extent)
+        grid.bounds(ends, extent)
         self._cover(extent)
-        ray_grid.draw_beams(
+        grid.draw_beams(
             starts, ends, offsets, self.origin_m, self.resolution_m, self.scans + 1,
             np.float32(_HIT), np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
         )  # fmt: skip

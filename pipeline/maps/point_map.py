@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from scanchain.data import Points, Pose
 from scanchain.errors import InputError
-from scanchain.kernels import point_map as kernels
-from scanchain.kernels.hashing import EMPTY
+from scanchain.kernels.voxels import point_map as kernels
+from scanchain.kernels.voxels.hashing import EMPTY
 
 MAX_VOXELS = 16_000_000  # a gigabyte
 _FIRST_VOXELS = 1 << 14

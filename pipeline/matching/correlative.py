@@ -9,7 +9,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.branch_and_bound import draw_hits, fill_pyramid, search
+from scanchain.kernels.search.branch_and_bound import draw_hits, fill_pyramid, search
 from scanchain.matching.voxel_map import VoxelMap
 from scanchain.preprocess.sweep import downsample
 

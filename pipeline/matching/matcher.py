@@ -9,11 +9,11 @@ import numpy as np
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior
-from scanchain.kernels import registration
-from scanchain.kernels.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
-from scanchain.kernels.estimate import Terms
-from scanchain.kernels.matching import Answer, Expectation, match
-from scanchain.kernels.validity import largest_magnitude
+from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.registration import icp
+from scanchain.kernels.registration.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
+from scanchain.kernels.registration.linearization import Terms
+from scanchain.kernels.registration.match import Answer, Expectation, match
 from scanchain.matching.voxel_map import VoxelMap
 from scanchain.words import counted
 
@@ -28,9 +28,9 @@ _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up plac
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _ENDINGS = {
-    registration.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
-    registration.NO_PARTNERS: "no point has a correspondence in the map",
-    registration.SINGULAR: "the correspondences do not determine the pose",
+    icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
+    icp.NO_PARTNERS: "no point has a correspondence in the map",
+    icp.SINGULAR: "the correspondences do not determine the pose",
 }
 
 
@@ -108,7 +108,7 @@ def match_of(answer: Answer, points: int, target: VoxelMap, config: MatchingConf
         iterations=answer.iterations,
         residual_m=answer.residual_m,
         fit=answer.fit,
-        at_minimum=answer.ending == registration.CONVERGED,
+        at_minimum=answer.ending == icp.CONVERGED,
         converged=not problem,
         reason=problem or "converged",
         degeneracy_eigenvalue=answer.eigenvalue,
@@ -121,7 +121,7 @@ def _problem(answer: Answer, points: int, target: VoxelMap, observability: float
     """Why an answer is no pose to rely on, empty if it is one."""
     if not math.isfinite(largest_magnitude(answer.T)):
         return "the pose is not finite"
-    if answer.ending == registration.NO_PARTNERS:
+    if answer.ending == icp.NO_PARTNERS:
         return _ENDINGS[answer.ending]
     if answer.pairs < config.min_inlier_share * points:
         return (
@@ -139,7 +139,7 @@ def _problem(answer: Answer, points: int, target: VoxelMap, observability: float
             f"motion along the weakest direction is undetermined: the points show {answer.surface_signal:.1g} "
             f"times what errors of the normals alone would, below matching.min_signal ({config.min_signal:g})"
         )
-    if answer.ending != registration.CONVERGED:
+    if answer.ending != icp.CONVERGED:
         return _ENDINGS[answer.ending]
     return _contradiction(answer, config) or _chance(answer, points, target)
 

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
-from scanchain.kernels import registration
-from scanchain.kernels.association import associate
-from scanchain.kernels.cross_covariance import weighted_pairs
-from scanchain.kernels.matching import judge
-from scanchain.kernels.registration import SHRINK, Outcome
+from scanchain.kernels.registration import icp
+from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration.cross_covariance import weighted_pairs
+from scanchain.kernels.registration.icp import SHRINK, Outcome
+from scanchain.kernels.registration.match import judge
 from scanchain.matching.matcher import aligned, match_of, terms_of
 from scanchain.matching.svd import DegeneratePairsError, rigid_transform
 from scanchain.matching.voxel_map import VoxelMap
@@ -37,7 +37,7 @@ class SvdMatcher:
         T, scale_m = T_first.copy(), terms.first_scale_m
         partner = np.empty(len(points), np.int32)
         source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
-        ending, iterations, pairs = registration.OUT_OF_ITERATIONS, 0, 0
+        ending, iterations, pairs = icp.OUT_OF_ITERATIONS, 0, 0
         for _ in range(terms.max_iterations):
             iterations += 1
             associate(target.voxels, points, T, terms.reach, terms.max_distance_m, partner)
@@ -45,11 +45,11 @@ class SvdMatcher:
             try:
                 correction = rigid_transform(source[:pairs], nearest[:pairs], weight[:pairs])
             except DegeneratePairsError:
-                ending = registration.SINGULAR if pairs else registration.NO_PARTNERS
+                ending = icp.SINGULAR if pairs else icp.NO_PARTNERS
                 break
             T = lie.normalize(correction @ T)
             if scale_m <= terms.scale_m and self._stands_still(correction, T):
-                ending = registration.CONVERGED
+                ending = icp.CONVERGED
                 break
             scale_m = max(terms.scale_m, SHRINK * scale_m)
         outcome = self._outcome(

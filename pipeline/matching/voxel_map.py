@@ -7,7 +7,7 @@ import numpy as np
 from scanchain import checks, lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Points, Pose
-from scanchain.kernels.voxels import CELL, Voxels, insert, keep
+from scanchain.kernels.voxels.voxel_shapes import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting

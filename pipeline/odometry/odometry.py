@@ -13,7 +13,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
-from scanchain.kernels.validity import largest_magnitude
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.matching import CorrelativeMap, VoxelMap, create_matcher
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from

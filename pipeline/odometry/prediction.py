@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError
-from scanchain.kernels.evidence import definite_inverse
+from scanchain.kernels.registration.observability import definite_inverse
 from scanchain.odometry.experience import Experience
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import MotionFilter

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
-from scanchain.kernels import downsample as kernels
+from scanchain.kernels.voxels import downsample as kernels
 
 
 @dataclass(frozen=True, slots=True)

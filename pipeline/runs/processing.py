@@ -16,16 +16,16 @@ from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.logs import Log
-from scanchain.runs.checkpoint import Checkpoints
 from scanchain.runs.closure_table import write_closures
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job
-from scanchain.runs.journal import JOURNAL_FILE, Journal
 from scanchain.runs.progress import Progress
 from scanchain.runs.recorder import OpenRecorder, Recorder
 from scanchain.runs.results import Cloud, write_results
 from scanchain.runs.results_mcap import write_results_mcap
-from scanchain.runs.resuming import Left, after, go_on_recording, set_aside
+from scanchain.runs.resume.checkpoint import Checkpoints
+from scanchain.runs.resume.journal import JOURNAL_FILE, Journal
+from scanchain.runs.resume.resuming import Left, after, go_on_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.verdicts import JudgedClosure, final_verdicts
 from scanchain.slam import Slam, SlamResult

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Points, Pose
-from scanchain.graph.g2o_write import rejected_path, write_g2o
+from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.maps import (
     OccupancyGrid,
     View,

@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
 from scanchain.logs import Log
 from scanchain.logs.frames import MovingFrame, moving_frame
-from scanchain.logs.pack import (
+from scanchain.logs.writing.pack import (
     ORIGIN,
     Link,
     pack_cloud,
@@ -21,7 +21,7 @@ from scanchain.logs.pack import (
     pack_transforms,
     place,
 )
-from scanchain.logs.write import LogWriter
+from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult

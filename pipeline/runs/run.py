@@ -21,14 +21,14 @@ from scanchain.logs import Log, open_log
 from scanchain.runs.compiling import telling_of_compilation
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
 from scanchain.runs.job import Job
-from scanchain.runs.journal import JOURNAL_FILE
 from scanchain.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.progress import Progress
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
 from scanchain.runs.recorder import OpenRecorder
-from scanchain.runs.rescue import rescued
-from scanchain.runs.resuming import Left, find_left
+from scanchain.runs.resume.journal import JOURNAL_FILE
+from scanchain.runs.resume.rescue import rescued
+from scanchain.runs.resume.resuming import Left, find_left
 from scanchain.runs.step_table import StepTable
 from scanchain.settings import dump, load_settings, named
 from scanchain.slam import SlamResult

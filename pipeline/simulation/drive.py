@@ -14,7 +14,7 @@ from scanchain.errors import InputError
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import SENSORS, Sensor
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds import World, find_world
+from scanchain.simulation.worlds.registry import World, find_world
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 PLACE, WANDER, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers

@@ -11,7 +11,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.logs.write import LogWriter
+from scanchain.logs.writing.writer import LogWriter
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Sensor

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels.raycast import cast_rays
+from scanchain.kernels.raycast.cast import cast_rays
 
 FLAT = np.zeros(7)
 

@@ -14,16 +14,16 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from scanchain.graph.robust import RobustLoss
+from scanchain.graph.robust.losses import RobustLoss
 from scanchain.landmarks.accuracy import against_truth, truth_at
 from scanchain.landmarks.bearing_range import BearingRangeProblem, no_calibration
-from scanchain.landmarks.dead_reckoning import OWN, OdometryNoise
+from scanchain.landmarks.files.mrclam import read_mrclam
 from scanchain.landmarks.guess import from_odometry
 from scanchain.landmarks.minimize import minimize
-from scanchain.landmarks.mrclam import read_mrclam
 from scanchain.landmarks.problem import State
-from scanchain.landmarks.range_fit import LogModel
-from scanchain.landmarks.range_slam import solve_range_log
+from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise
+from scanchain.landmarks.ranges.fit import LogModel
+from scanchain.landmarks.ranges.slam import solve_range_log
 from scanchain.landmarks.solvers import create_solver
 
 ROOT = Path(__file__).resolve().parents[2]

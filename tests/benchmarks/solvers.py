@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.landmarks.compare import compare_linear
-from scanchain.landmarks.npz import read_landmark_data
+from scanchain.landmarks.files.npz import read_landmark_data
 from scanchain.landmarks.relative_position import linear_system
 from scanchain.landmarks.solvers import METHODS
 

@@ -112,7 +112,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     from scanchain.loops import LoopCloser
     from scanchain.point_store import PointStore
     from scanchain.runs import processing, results, run
-    from scanchain.runs.journal import Journal
+    from scanchain.runs.resume.journal import Journal
     from scanchain.runs.step_table import StepTable
 
     watch = Stopwatch()
@@ -134,7 +134,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     def record(*arguments: Any, **options: Any) -> Any:
         recording = open_recording(*arguments, **options)
         watch.over("recording", type(recording), "__enter__", "close", "log", "log_trajectory", "log_map")
-        watch.over("recording", sys.modules["scanchain.viz.messages"].Message, "send")
+        watch.over("recording", sys.modules["scanchain.viz.recording.messages"].Message, "send")
         return recording
 
     command._record = watch.timed("recording", record)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bmat, bsr_matrix, coo_matrix, csc_matrix
 
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
-from scanchain.graph.factor_matrix import upper_factor
+from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
+from scanchain.graph.solvers.factor_matrix import upper_factor
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem
 

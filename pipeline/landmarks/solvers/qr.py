@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from scanchain.graph.factor_matrix import front_rows
-from scanchain.kernels import column_order, graph_fronts, graph_symbolic, normal_equations, sparse_qr
-from scanchain.kernels.graph_fronts import Fronts
+from scanchain.graph.solvers.factor_matrix import front_rows
+from scanchain.kernels.graph import symbolic
+from scanchain.kernels.graph.fronts import Fronts, lay_out_fronts
+from scanchain.kernels.landmarks import column_order, normal_equations, sparse_qr
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern
 
@@ -85,14 +86,12 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
         order = column_order.column_minimum_degree(pattern.row_start, pattern.columns, column_start, rows)
     start, partners, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
     start, neighbors = _neighbor_lists(start, partners)
-    after = graph_symbolic.postorder(graph_symbolic.elimination_tree(start, neighbors, order))
+    after = symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))
     eliminated = order[after]
-    parent = graph_symbolic.elimination_tree(start, neighbors, eliminated)
-    begin, below = graph_symbolic.column_structures(start, neighbors, eliminated, parent)
+    parent = symbolic.elimination_tree(start, neighbors, eliminated)
+    begin, below = symbolic.column_structures(start, neighbors, eliminated, parent)
     sizes = np.ones(n, np.int64)
-    fronts = graph_fronts.lay_out_fronts(
-        graph_symbolic.group_columns(parent, begin, below, sizes), begin, below, sizes
-    )
+    fronts = lay_out_fronts(symbolic.group_columns(parent, begin, below, sizes), begin, below, sizes)
     place = np.empty(n, np.int64)
     place[eliminated] = np.arange(n)
     found = sparse_qr.assign_rows(fronts, pattern.row_start, pattern.columns, place)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from scanchain.kernels import arrow
+from scanchain.kernels.landmarks import arrow
 from scanchain.landmarks.solvers.eliminate_landmarks import LandmarkElimination
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern

@@ -14,8 +14,8 @@ from pathlib import Path
 from scanchain.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
 from scanchain.logs.formats.made import made_block, made_channel, made_index, unknown
 from scanchain.logs.formats.packed_text import read_text
-from scanchain.logs.pack import Link, pack_transforms
-from scanchain.logs.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.writing.pack import Link, pack_transforms
 from scanchain.source import Source
 from scanchain.words import counted
 

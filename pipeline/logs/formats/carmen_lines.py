@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scanchain.logs.pack import LATEST_NS, Place, pack_laser_scan, pack_odometry
+from scanchain.logs.writing.pack import LATEST_NS, Place, pack_laser_scan, pack_odometry
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
 SCANS = (b"FLASER", b"ROBOTLASER1")

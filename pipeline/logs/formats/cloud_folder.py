@@ -13,8 +13,8 @@ from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import SUFFIXES, raw_point, read_cloud_file
 from scanchain.logs.formats.made import left_out, made_block, made_channel, made_index, natural_order
 from scanchain.logs.formats.point_rows import CloudFileError
-from scanchain.logs.pack import LATEST_NS, pack_cloud
-from scanchain.logs.records import Block, Contents, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
+from scanchain.logs.writing.pack import LATEST_NS, pack_cloud
 from scanchain.words import counted
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001

@@ -23,8 +23,8 @@ from scanchain.logs.formats.kitti_truth import (
 )
 from scanchain.logs.formats.made import made_block, made_channel, made_index, natural_order
 from scanchain.logs.formats.point_rows import CloudFileError
-from scanchain.logs.pack import pack_cloud, pack_odometry, place
-from scanchain.logs.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.writing.pack import pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
 _TRUTH = -1  # the block of the ground truth

@@ -10,7 +10,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.logs.pack import LATEST_NS
+from scanchain.logs.writing.pack import LATEST_NS
 from scanchain.words import counted
 
 _EARTH_M = 6378137.0

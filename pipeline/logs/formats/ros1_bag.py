@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.errors import InputError
-from scanchain.logs.blocks import unpack
-from scanchain.logs.counting import messages_of
 from scanchain.logs.formats.ros1_bag_records import (
     CHUNK,
     CHUNK_INFO,
@@ -32,8 +30,10 @@ from scanchain.logs.formats.ros1_bag_records import (
     read_record,
     whole_records,
 )
-from scanchain.logs.records import Block, Channel, Contents, Entry, FileIndex, Message
-from scanchain.logs.walk import is_believable
+from scanchain.logs.mcap.blocks import unpack
+from scanchain.logs.mcap.counting import messages_of
+from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message
+from scanchain.logs.mcap.walk import is_believable
 from scanchain.words import counted
 
 _INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])

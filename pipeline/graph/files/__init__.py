@@ -1,0 +1,1 @@
+"""Pose graphs as text: g2o and TORO."""

@@ -1,0 +1,132 @@
+"""Pose graphs written as g2o or TORO text, every number to its last digit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.graph.files.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
+from scanchain.graph.files.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.whole_file import write_whole
+
+TORO_SUFFIXES = (".graph", ".toro")
+GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)
+
+
+Chosen = Literal["in force", "rejected"]
+
+
+def write_graph(
+    path: Path,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
+) -> None:
+    """Write a g2o file, or a TORO one where the name ends in .graph or .toro. Raises OSError."""
+    write = write_toro if path.suffix in TORO_SUFFIXES else write_g2o
+    write(path, graph, ids=ids, other_lines=other_lines, edges=edges)
+
+
+def rejected_path(path: Path) -> Path:
+    """The file beside a graph that holds its rejected edges: graph_rejected.g2o beside graph.g2o."""
+    return path.with_name(f"{path.stem}_rejected{path.suffix}")
+
+
+def write_g2o(
+    path: Path | str,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
+) -> None:
+    """Write poses, points and edges with full information matrices.
+
+    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name. Edges "in
+    force" are written with their robust weight in Ω, so that the poses are the minimum of the file's own χ².
+    """
+    d = graph.dimension
+    names = (np.arange(len(graph)) if ids is None else ids).tolist()
+    lines = []
+    for name, pose, is_point in zip(names, _numbers(graph.poses).tolist(), graph.is_point.tolist(), strict=True):
+        lines.append(f"{POINT} {name} {_text(pose[:2])}" if is_point else f"{VERTICES[d]} {name} {_text(pose)}")
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    chosen, triangles = _triangles(graph, edges)
+    pairs, measured = graph.edges[chosen], _numbers(graph.measurements[chosen])
+    sees = graph.is_point[pairs[:, 1]].tolist()
+    rows = zip(pairs.tolist(), measured.tolist(), triangles, sees, strict=True)
+    for (i, j), measured, upper, is_sighting in rows:
+        if is_sighting:
+            lines.append(
+                f"{SIGHTING} {names[i]} {names[j]} {_text([*measured[:2], upper[0], upper[1], upper[3]])}"
+            )
+        else:
+            lines.append(f"{EDGES[d]} {names[i]} {names[j]} {_text([*measured, *upper])}")
+    _write(path, [*lines, *other_lines])
+
+
+def write_toro(
+    path: Path | str,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
+) -> None:
+    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO knows no points."""
+    if graph.is_point.any():
+        raise InputError(f"{path}: TORO knows no points, and the graph has {graph.is_point.sum()}; write .g2o")
+    d = graph.dimension
+    names = (np.arange(len(graph)) if ids is None else ids).tolist()
+    lines = [
+        f"{TORO_VERTICES[d]} {name} {_text(row)}" for name, row in zip(names, _toro(graph.poses), strict=True)
+    ]
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    chosen, triangles = _triangles(graph, edges)
+    pairs, measured = graph.edges[chosen], _toro(graph.measurements[chosen])
+    for (i, j), row, upper in zip(pairs.tolist(), measured, triangles, strict=True):
+        lines.append(f"{TORO_EDGES[d]} {names[i]} {names[j]} {_text([*row, *to_toro_triangle(upper)])}")
+    _write(path, [*lines, *other_lines])
+
+
+def _write(path: Path | str, lines: list[str]) -> None:
+    write_whole(Path(path), "\n".join([*lines, ""]).encode())
+
+
+def _numbers(poses: Matrix) -> Matrix:
+    """Poses as rows x y θ, or x y z qx qy qz qw."""
+    d = poses.shape[-1] - 1
+    if d == 2:
+        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)])
+    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
+
+
+def _toro(poses: Matrix) -> list[list[float]]:
+    """Poses as rows x y θ, or x y z roll pitch yaw."""
+    if poses.shape[-1] == 3:
+        return _numbers(poses).tolist()
+    return [[*T[:3, 3].tolist(), *to_toro_angles(T[:3, :3])] for T in poses]
+
+
+def _triangles(graph: PoseGraph, edges: Chosen) -> tuple[NDArray[np.bool_], list[list[float]]]:
+    """Which edges are chosen, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
+    upper = np.triu_indices(graph.freedom)
+    triangles = graph.information[:, upper[0], upper[1]]
+    if edges == "rejected":
+        return graph.is_rejected, triangles[graph.is_rejected].tolist()
+    return ~graph.is_rejected, (graph.weight[:, None] * triangles)[~graph.is_rejected].tolist()
+
+
+def _text(row: list[float]) -> str:
+    """Shortest decimals that read back as the same numbers."""
+    return " ".join(map(repr, row))

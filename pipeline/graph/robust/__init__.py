@@ -1,0 +1,1 @@
+"""Which loop edges are in force: robust losses, graduated non-convexity, verdicts."""

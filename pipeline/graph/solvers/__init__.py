@@ -1,0 +1,1 @@
+"""Steps to the minimum of chi-squared, and the sparse linear algebra beneath them."""

@@ -1,0 +1,194 @@
+"""Sparse Cholesky factorization of a symmetric matrix of blocks; ordering and structure are found once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spilu
+
+from scanchain.data import Matrix
+from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
+
+_LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
+
+
+class SingularMatrixError(ArithmeticError):
+    """A pivot vanished: the equations leave open the value of this block, ``variable``, and ``scalar`` of all."""
+
+    def __init__(self, variable: int, scalar: int) -> None:
+        super().__init__(f"variable {variable} is not determined by the equations")
+        self.variable, self.scalar = variable, scalar
+
+
+class BlockPattern:
+    """Which blocks of a symmetric matrix may be nonzero: every diagonal one and the given pairs.
+
+    The values of such a matrix are one flat array: the n diagonal blocks, then one block for each pair
+    (row, column), each row-major. Blocks may differ in size.
+    """
+
+    def __init__(self, sizes: NDArray[np.int64], pairs: NDArray[np.int64]) -> None:
+        """Sizes (n,) in scalars of the variables; pairs (P, 2) distinct variables, each pair once."""
+        variables = np.arange(len(sizes))
+        self.sizes = sizes
+        self.pairs = pairs
+        self.rows = np.concatenate([variables, pairs[:, 0]])
+        self.columns = np.concatenate([variables, pairs[:, 1]])
+        self.starts = np.cumsum(sizes) - sizes
+        self.scalars = int(sizes.sum())
+        self.value_count = int((sizes[self.rows] * sizes[self.columns]).sum())
+        self.diagonal = self._diagonal()
+
+    def _diagonal(self) -> NDArray[np.int64]:
+        """Place among the values of every scalar's diagonal entry, (scalars,)."""
+        squares = np.cumsum(self.sizes**2) - self.sizes**2
+        within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
+        return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
+
+    def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The product of the symmetric matrix of these values with a vector (scalars,)."""
+        result = np.zeros(self.scalars)
+        scatter.multiply(self.rows, self.columns, self.starts, self.sizes, values, x, result)
+        return result
+
+
+class Packing:
+    """Blocks of one size k, as kernels fill them, to and from the values of a pattern whose blocks may be smaller.
+
+    A variable of fewer scalars keeps the first of its k rows, or the last.
+    """
+
+    def __init__(self, pattern: BlockPattern, k: int, *, at_end: bool) -> None:
+        begin = k - pattern.sizes if at_end else np.zeros_like(pattern.sizes)
+        is_kept = (np.arange(k) >= begin[:, None]) & (np.arange(k) < (begin + pattern.sizes)[:, None])
+        self._k = k
+        self._kept_rows = is_kept
+        self._kept = is_kept[pattern.rows][:, :, None] & is_kept[pattern.columns][:, None, :]
+        self._is_whole = bool(is_kept.all())
+
+    def values(self, blocks: Matrix) -> NDArray[np.float64]:
+        """Block values of blocks (B, k, k)."""
+        return blocks.reshape(-1) if self._is_whole else blocks[self._kept]
+
+    def blocks(self, values: NDArray[np.float64]) -> Matrix:
+        """Blocks (B, k, k) of block values, zero where nothing is kept."""
+        if self._is_whole:
+            return values.reshape(-1, self._k, self._k)
+        result = np.zeros(self._kept.shape)
+        result[self._kept] = values
+        return result
+
+    def rows(self, vectors: Matrix) -> Matrix:
+        """(scalars, ...) of (n, k, ...)."""
+        return vectors[self._kept_rows]
+
+    def spread_rows(self, packed: Matrix) -> Matrix:
+        """(n, k, ...) of (scalars, ...), zero where nothing is kept."""
+        result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
+        result[self._kept_rows] = packed
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What follows from the pairs alone: elimination order (n,), tree (n,), rows of the factor by column."""
+
+    order: NDArray[np.int64]
+    parent: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+
+def analyze(pattern: BlockPattern) -> Analysis:
+    """Fill-reducing order of the variables, and where the factor fills in; the same for blocks of any size."""
+    start, neighbors = _adjacency(pattern)
+    order = _fill_reducing_order(start, neighbors)
+    order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
+    parent = symbolic.elimination_tree(start, neighbors, order)
+    return Analysis(order, parent, *symbolic.column_structures(start, neighbors, order, parent))
+
+
+class SparseCholesky:
+    """The factor A = Uᵀ U of a block-sparse matrix; the fill-reducing ordering and the symbolic analysis are kept.
+
+    ``factorize`` may be called any number of times with new values of the same pattern.
+    """
+
+    def __init__(self, pattern: BlockPattern, analysis: Analysis) -> None:
+        """Lay out the fronts; the analysis may come from a pattern of the same pairs and other sizes."""
+        self.pattern = pattern
+        self.analysis = analysis
+        order, parent, begin, rows = analysis.order, analysis.parent, analysis.begin, analysis.rows
+        sizes = pattern.sizes[order]
+        groups = symbolic.group_columns(parent, begin, rows, sizes)
+        self._fronts = fronts.lay_out_fronts(groups, begin, rows, sizes)
+        places = np.empty(len(order), np.int64)
+        places[order] = np.cumsum(sizes) - sizes
+        self._blocks = fronts.lay_out_blocks(self._fronts, places, pattern.sizes, pattern.rows, pattern.columns)
+        self._places = np.repeat(places - pattern.starts, pattern.sizes) + np.arange(pattern.scalars)
+        self._factor = np.zeros(int(self._fronts.factor_start[-1]))
+        self._stack = np.empty(self._fronts.stack_size)
+        self._work = np.empty(self._fronts.widest**2)
+        self._floor = np.empty(pattern.scalars)
+
+    @property
+    def entries(self) -> int:
+        """Stored entries of the factor, explicit zeros included."""
+        pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
+        return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
+
+    def factorize(self, values: NDArray[np.float64]) -> None:
+        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
+        self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
+        failed = cholesky.factorize(
+            self._fronts, self._blocks, values, self._floor, self._factor, self._stack, self._work
+        )
+        if failed >= 0:
+            scalar = int(np.flatnonzero(self._places == failed)[0])
+            raise SingularMatrixError(int(np.searchsorted(self.pattern.starts, scalar, side="right") - 1), scalar)
+
+    def solve(self, right_side: Matrix) -> Matrix:
+        """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
+        columns = right_side[:, None] if right_side.ndim == 1 else right_side
+        result, local = np.empty_like(columns), np.empty(self._fronts.widest)
+        x = np.empty(self.pattern.scalars)
+        for column in range(columns.shape[1]):
+            x[self._places] = columns[:, column]
+            cholesky.solve(self._fronts, self._factor, x, local)
+            result[:, column] = x[self._places]
+        return result.reshape(right_side.shape)
+
+    def inverse_blocks(self) -> NDArray[np.float64]:
+        """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
+        result = np.empty(self.pattern.value_count)
+        inverse.selected_inverse(self._fronts, self._blocks, self._factor, result, self._stack, self._work)
+        return result
+
+
+def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Neighbor lists of the variables, without themselves: (start (n + 1,), neighbors)."""
+    both = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    start = np.searchsorted(both[:, 0], np.arange(len(pattern.sizes) + 1))
+    return start.astype(np.int64), np.ascontiguousarray(both[:, 1])
+
+
+def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as SuperLU has it.
+
+    An incomplete factorization that drops every entry hands the ordering out without the work of a full one.
+    """
+    n = len(start) - 1
+    if n < 2:
+        return np.arange(n)
+    rows = np.concatenate([np.repeat(np.arange(n), np.diff(start)), np.arange(n)])
+    columns = np.concatenate([neighbors, np.arange(n)])
+    weights = np.concatenate([np.full(len(neighbors), -1.0), np.diff(start) + 1.0])
+    matrix = coo_matrix((weights, (rows, columns)), shape=(n, n)).tocsc()
+    factor = spilu(
+        matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
+    return np.argsort(factor.perm_c).astype(np.int64)

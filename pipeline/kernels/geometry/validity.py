@@ -1,0 +1,62 @@
+"""Whether arrays hold finite numbers and rigid transformations, without temporaries."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from scanchain.kernels.voxels.voxel_shapes import move
+
+
+@njit(cache=True, nogil=True)
+def largest_magnitude(points) -> float:
+    """Largest |coordinate| of points (N, d); infinite where one is NaN or infinite, 0 without points."""
+    largest = 0.0
+    for i in range(points.shape[0]):
+        for axis in range(points.shape[1]):
+            value = abs(points[i, axis])
+            if not value <= largest:
+                if not math.isfinite(value):
+                    return np.inf
+                largest = float(value)
+    return largest
+
+
+@njit(cache=True, nogil=True)
+def largest_moved(points, T) -> float:
+    """Largest |coordinate| of finite points (N, d) moved by the pose T (d+1, d+1); 0 without points."""
+    largest = 0.0
+    for i in range(points.shape[0]):
+        x, y, z = move(T, points, i)
+        largest = max(largest, abs(x), abs(y), abs(z))
+    return largest
+
+
+@njit(cache=True)
+def rigidity_error(T) -> float:
+    """Largest |entry| of RᵀR − I and of the last row less (0, …, 0, 1) of T (d+1, d+1).
+
+    At least 2 where det R < 0, as a reflection has it; infinite where an entry is not finite.
+    """
+    d = T.shape[0] - 1
+    error = 0.0
+    for i in range(d + 1):
+        for j in range(d + 1):
+            if not math.isfinite(T[i, j]):
+                return np.inf
+    for i in range(d):
+        error = max(error, abs(T[d, i]))
+        for j in range(d):
+            product = -1.0 if i == j else 0.0
+            for m in range(d):
+                product += T[m, i] * T[m, j]
+            error = max(error, abs(product))
+    if d == 2:
+        determinant = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
+    else:
+        determinant = (
+            T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
+            - T[0, 1] * (T[1, 0] * T[2, 2] - T[1, 2] * T[2, 0])
+            + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
+        )
+    return max(error, abs(T[d, d] - 1.0), 2.0 if determinant < 0.0 else 0.0)

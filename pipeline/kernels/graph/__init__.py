@@ -1,0 +1,1 @@
+"""Factors of a pose graph and sparse factorization; compiled."""

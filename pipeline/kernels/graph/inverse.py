@@ -1,0 +1,94 @@
+"""The inverse of a sparse matrix where the matrix itself has entries, from its Cholesky factor; compiled."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scanchain.kernels.graph.fronts import Blocks, Fronts
+
+_Array = NDArray[np.float64]
+_Index = NDArray[np.int64]
+
+
+@njit(cache=True)
+def selected_inverse(
+    fronts: Fronts, blocks: Blocks, factor: _Array, inverse: _Array, stack: _Array, work: _Array
+) -> None:
+    """Fill the blocks of Z = A⁻¹ that A has, by fronts from the root down (Takahashi et al. 1973).
+
+    From A = Uᵀ U follows U Z = U⁻ᵀ, which is zero above the diagonal; row a of a front, Z being known below it:
+        Z_ac = −Σ_{m>a} U_am Z_mc / U_aa for c > a,      Z_aa = (1 / U_aa − Σ_{m>a} U_am Z_ma) / U_aa
+    What a front needs of Z beyond its pivots its parent has; it waits on the stack, as the update matrices did.
+
+    factor : as ``graph_cholesky.factorize`` left it; inverse : block values, laid out as those of A, filled
+    stack : fronts.stack_size scalars of room, work : fronts.widest² scalars of room
+    """
+    first_child, sibling = _families(fronts)
+    depth = 0
+    for f in range(fronts.pivots.size - 1, -1, -1):
+        height, pivots = fronts.row_start[f + 1] - fronts.row_start[f], fronts.pivots[f]
+        rest = height - pivots
+        Z = work[: height * height].reshape(height, height)
+        depth -= rest * rest
+        for a in range(rest):
+            for c in range(rest):
+                Z[pivots + a, pivots + c] = stack[depth + a * rest + c]
+        start = fronts.factor_start[f]
+        for a in range(pivots - 1, -1, -1):
+            _fill_row(Z, a, factor[start + a * height : start + (a + 1) * height])
+        for b in range(blocks.start[f], blocks.start[f + 1]):
+            _take_block(Z, blocks, b, inverse)
+        child = first_child[f]
+        while child != -1:
+            place = fronts.place[fronts.row_start[child] + fronts.pivots[child] : fronts.row_start[child + 1]]
+            for a in range(place.size):
+                for b in range(place.size):
+                    stack[depth + a * place.size + b] = Z[place[a], place[b]]
+            depth += place.size**2
+            child = sibling[child]
+
+
+@njit(cache=True)
+def _families(fronts: Fronts) -> tuple[_Index, _Index]:
+    """First child of every front, and the next child of its parent, ascending; -1 where there is none."""
+    count = fronts.pivots.size
+    parent, waiting, top = np.full(count, -1, np.int64), np.empty(count, np.int64), 0
+    for f in range(count):
+        for _ in range(fronts.children[f]):
+            top -= 1
+            parent[waiting[top]] = f
+        waiting[top] = f
+        top += 1
+    first_child, sibling = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
+    for f in range(count - 1, -1, -1):
+        if parent[f] != -1:
+            sibling[f] = first_child[parent[f]]
+            first_child[parent[f]] = f
+    return first_child, sibling
+
+
+@njit(cache=True)
+def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
+    """Fill row and column a of Z from those beyond it; upper is row a of U in the columns of the front."""
+    height = upper.size
+    row = Z[a]
+    row[a + 1 :].fill(0.0)
+    for m in range(a + 1, height):
+        weight, below = upper[m] / upper[a], Z[m]
+        for c in range(a + 1, height):
+            row[c] -= weight * below[c]
+    total = 1.0 / upper[a]
+    for m in range(a + 1, height):
+        Z[m, a] = row[m]
+        total -= upper[m] * row[m]
+    row[a] = total / upper[a]
+
+
+@njit(cache=True)
+def _take_block(Z: _Array, blocks: Blocks, b: int, inverse: _Array) -> None:
+    """Copy one block out of its front."""
+    top, left, at = blocks.top[b], blocks.left[b], blocks.offset[b]
+    for r in range(blocks.height[b]):
+        for c in range(blocks.width[b]):
+            inverse[at] = Z[top + c, left + r] if blocks.turned[b] == 1 else Z[top + r, left + c]
+            at += 1

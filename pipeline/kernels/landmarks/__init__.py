@@ -1,0 +1,1 @@
+"""Factors and linear algebra of landmark problems; compiled."""

@@ -1,0 +1,1 @@
+"""Rays through grids and simulated solids; compiled."""

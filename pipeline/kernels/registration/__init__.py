@@ -1,0 +1,1 @@
+"""Correspondences, residuals, the descent, and how well a pose is determined; compiled."""

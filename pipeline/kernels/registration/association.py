@@ -1,0 +1,50 @@
+"""The nearest voxel mean of every point, among the voxels around it."""
+
+import numpy as np
+from numba import njit
+
+from scanchain.kernels.voxels.hashing import find_row, pack
+from scanchain.kernels.voxels.voxel_shapes import move
+
+
+@njit(cache=True, nogil=True)
+def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
+    """Fill ``partner`` (N,) with the row of the nearest voxel mean, −1 where none is near enough.
+
+    points : (N, d) meters; T moves them into the map's frame
+    reach : voxels searched to each side: the 2ʳᵉᵃᶜʰ-fold of each axis around the point, (2·reach)ᵈ voxels
+    A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all
+    that lies nearer than r − ½ voxels. Returns the number of points with a partner.
+    """
+    scale = 1.0 / voxels.size_m
+    flat = points.shape[1] == 2
+    found = 0
+    for i in range(points.shape[0]):
+        x, y, z = move(T, points, i)
+        ix, iy = int(np.floor(x * scale - 0.5)), int(np.floor(y * scale - 0.5))
+        iz = 0 if flat else int(np.floor(z * scale - 0.5))
+        nearest = max_distance_m * max_distance_m
+        chosen = -1
+        for ring in range(1, reach + 1):
+            for dx in range(1 - ring, ring + 1):
+                for dy in range(1 - ring, ring + 1):
+                    on_side = dx == 1 - ring or dx == ring or dy == 1 - ring or dy == ring
+                    for dz in range(0 if flat else 1 - ring, 1 if flat else ring + 1):
+                        if ring > 1 and not on_side and (flat or (dz > 1 - ring and dz < ring)):
+                            continue
+                        voxel = find_row(voxels.rows, voxels.keys, pack(ix + dx, iy + dy, iz + dz))
+                        if voxel < 0:
+                            continue
+                        ex = voxels.cells[voxel, 0] - x
+                        ey = voxels.cells[voxel, 1] - y
+                        ez = voxels.cells[voxel, 2] - z
+                        distance = ex * ex + ey * ey + ez * ez
+                        if distance < nearest:
+                            nearest = distance
+                            chosen = voxel
+            covered = (ring - 0.5) * voxels.size_m
+            if nearest <= covered * covered:
+                break
+        partner[i] = chosen
+        found += chosen >= 0
+    return found

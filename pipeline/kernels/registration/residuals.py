@@ -1,0 +1,242 @@
+"""Normal equations of the distances between points and the local shapes they are paired with."""
+
+import numpy as np
+from numba import njit
+
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, SHAPE, move
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, curvature: float, H, b):
+    """Linearize every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
+
+    With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
+    ``origin`` (all lengths counted from there, so that rotation and translation stay apart), T ← exp(ξ) T,
+    changes the residual by
+        r = nᵀ(p − q)        ∂r/∂ξ = [nᵀ, (p × n)ᵀ]     (Chen & Medioni 1992; in 2D Censi 2008)
+    On a line the residuals are the two across it, on a point shape all components of p − q. Geman–McClure
+    weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985)
+    times the trust in the pair.
+
+    points : (N, d) meters, source frame; origin : (3,), map frame
+    partner : (N,) rows of the map's voxels, −1 for none; trust : (N,) in [0, 1], what each pair counts
+    scale_m : s; residuals far above it are all but ignored
+    curvature : 1 adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
+        held fixed); 0 leaves it out
+    H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
+    """
+    H.fill(0.0)
+    b.fill(0.0)
+    cost = weights = squares = 0.0
+    s2 = scale_m * scale_m
+    planar = points.shape[1] == 2
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+        shape = cell[SHAPE]
+        r2 *= trust[i]
+        ratio = s2 / (s2 + r2)
+        w = trust[i] * ratio * ratio
+        cost += 0.5 * r2 * ratio
+        weights += w
+        squares += ratio * ratio * r2
+        if planar:
+            _add_2d(H, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
+        elif shape == PLANE:
+            _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
+        else:
+            _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+        if curvature > 0.0:
+            _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
+    _mirror(H)
+    return cost, weights, squares
+
+
+@njit(cache=True, nogil=True)
+def information(voxels, points, T, origin, partner, trust, scale_m: float, H, unweighted):
+    """Fill H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
+    H.fill(0.0)
+    unweighted.fill(0.0)
+    s2, b = scale_m * scale_m, np.zeros(H.shape[0])
+    planar = points.shape[1] == 2
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+        shape = cell[SHAPE]
+        ratio = s2 / (s2 + r2 * trust[i])
+        for A, w in ((H, trust[i] * ratio * ratio), (unweighted, trust[i])):
+            if planar:
+                _add_2d(A, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
+            elif shape == PLANE:
+                _add_plane(A, b, w, px, py, pz, nx, ny, nz, along)
+            else:
+                _add_point(A, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+    _mirror(H)
+    _mirror(unweighted)
+
+
+@njit(cache=True, nogil=True)
+def robust_sums(voxels, points, T, partner, trust, scale_m: float):
+    """What ``normal_equations`` returns: the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m²."""
+    cost = weights = squares = 0.0
+    s2 = scale_m * scale_m
+    for i in range(points.shape[0]):
+        voxel = partner[i]
+        if voxel < 0:
+            continue
+        x, y, z = move(T, points, i)
+        r2 = trust[i] * _residual(voxels.cells[voxel], x, y, z)[4]
+        ratio = s2 / (s2 + r2)
+        cost += 0.5 * r2 * ratio
+        weights += trust[i] * ratio * ratio
+        squares += ratio * ratio * r2
+    return cost, weights, squares
+
+
+@njit(cache=True, inline="always")
+def _residual(cell, x, y, z):
+    """What of (x, y, z) − mean counts (3), its component along the voxel's direction, and its squared length."""
+    ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
+    nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+    along = nx * ex + ny * ey + nz * ez
+    if cell[SHAPE] == PLANE:
+        return along * nx, along * ny, along * nz, along, along * along
+    if cell[SHAPE] == LINE:
+        ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
+    return ex, ey, ez, along, ex * ex + ey * ey + ez * ez
+
+
+@njit(cache=True, inline="always")
+def _add_2d(H, b, w, px, py, ex, ey, nx, ny, plane: bool):
+    """Point-to-line: J = [n, p × n]; point-to-point: J = [I, (−p_y, p_x)ᵀ]."""
+    if plane:
+        turn = px * ny - py * nx
+        r = nx * ex + ny * ey
+        H[0, 0] += w * nx * nx
+        H[0, 1] += w * nx * ny
+        H[0, 2] += w * nx * turn
+        H[1, 1] += w * ny * ny
+        H[1, 2] += w * ny * turn
+        H[2, 2] += w * turn * turn
+        b[0] += w * nx * r
+        b[1] += w * ny * r
+        b[2] += w * turn * r
+    else:
+        H[0, 0] += w
+        H[1, 1] += w
+        H[0, 2] -= w * py
+        H[1, 2] += w * px
+        H[2, 2] += w * (px * px + py * py)
+        b[0] += w * ex
+        b[1] += w * ey
+        b[2] += w * (px * ey - py * ex)
+
+
+@njit(cache=True, inline="always")
+def _add_plane(H, b, w, px, py, pz, nx, ny, nz, r):
+    """One residual: J = [n, p × n], upper triangle."""
+    cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+    wx, wy, wz = w * nx, w * ny, w * nz
+    H[0, 0] += wx * nx
+    H[0, 1] += wx * ny
+    H[0, 2] += wx * nz
+    H[0, 3] += wx * cx
+    H[0, 4] += wx * cy
+    H[0, 5] += wx * cz
+    H[1, 1] += wy * ny
+    H[1, 2] += wy * nz
+    H[1, 3] += wy * cx
+    H[1, 4] += wy * cy
+    H[1, 5] += wy * cz
+    H[2, 2] += wz * nz
+    H[2, 3] += wz * cx
+    H[2, 4] += wz * cy
+    H[2, 5] += wz * cz
+    H[3, 3] += w * cx * cx
+    H[3, 4] += w * cx * cy
+    H[3, 5] += w * cx * cz
+    H[4, 4] += w * cy * cy
+    H[4, 5] += w * cy * cz
+    H[5, 5] += w * cz * cz
+    r *= w
+    b[0] += r * nx
+    b[1] += r * ny
+    b[2] += r * nz
+    b[3] += r * cx
+    b[4] += r * cy
+    b[5] += r * cz
+
+
+@njit(cache=True, nogil=True)
+def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
+    """Three residuals, J = P [I, −p×], with P = I on a point shape and P = I − vvᵀ across a line."""
+    H[0, 0] += w
+    H[1, 1] += w
+    H[2, 2] += w
+    H[0, 4] += w * pz
+    H[0, 5] -= w * py
+    H[1, 3] -= w * pz
+    H[1, 5] += w * px
+    H[2, 3] += w * py
+    H[2, 4] -= w * px
+    H[3, 3] += w * (py * py + pz * pz)
+    H[4, 4] += w * (px * px + pz * pz)
+    H[5, 5] += w * (px * px + py * py)
+    H[3, 4] -= w * px * py
+    H[3, 5] -= w * px * pz
+    H[4, 5] -= w * py * pz
+    b[0] += w * ex
+    b[1] += w * ey
+    b[2] += w * ez
+    b[3] += w * (py * ez - pz * ey)
+    b[4] += w * (pz * ex - px * ez)
+    b[5] += w * (px * ey - py * ex)
+    if line:
+        _add_plane(H, b, -w, px, py, pz, vx, vy, vz, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
+    """Second derivative of eᵀ exp(ξ) p at ξ = 0, of which the first-order rows know nothing.
+
+    exp(ξ) p = p + φ × p + ρ + ½ φ × (φ × p) + ½ φ × ρ + …, so that the blocks are
+        ½(e pᵀ + p eᵀ) − (eᵀp) I for (φ, φ), in 2D −eᵀp, and ½ φᵀ(ρ × e) for (ρ, φ).
+    """
+    dot = ex * px + ey * py + ez * pz
+    half = 0.5 * w
+    if planar:
+        H[2, 2] -= w * dot
+        H[0, 2] += half * ey
+        H[1, 2] -= half * ex
+        return
+    H[0, 4] -= half * ez
+    H[0, 5] += half * ey
+    H[1, 3] += half * ez
+    H[1, 5] -= half * ex
+    H[2, 3] -= half * ey
+    H[2, 4] += half * ex
+    H[3, 3] += w * (ex * px - dot)
+    H[4, 4] += w * (ey * py - dot)
+    H[5, 5] += w * (ez * pz - dot)
+    H[3, 4] += half * (ex * py + ey * px)
+    H[3, 5] += half * (ex * pz + ez * px)
+    H[4, 5] += half * (ey * pz + ez * py)
+
+
+@njit(cache=True, inline="always")
+def _mirror(H):
+    for row in range(1, H.shape[0]):
+        for column in range(row):
+            H[row, column] = H[column, row]

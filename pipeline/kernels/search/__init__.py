@@ -1,0 +1,1 @@
+"""Branch and bound over poses, and place descriptors; compiled."""

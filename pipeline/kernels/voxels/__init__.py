@@ -1,0 +1,1 @@
+"""Hash tables of voxels, and what they hold; compiled."""

@@ -1,0 +1,239 @@
+"""A hash map of voxels that keep running moments of their points and the local shape fitted to them.
+
+A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's center, so
+that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
+(3), direction (3), shape; of a line or plane the variance across it; and of a plane in space its second
+direction (3), and how that variance carries over to the fit: at the mean, and by squared distance along both
+directions. Its row of ``history`` holds the ticks of the first and of the last insertion, and the number of points
+when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
+from scanchain.kernels.voxels.hashing import find_row, key_of, pack, unpack
+
+POINT, LINE, PLANE = 0.0, 1.0, 2.0
+MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
+MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
+CELL = 16  # two more than are used, to fill the second cache line
+BORN, SEEN, FITTED = 0, 1, 2
+_GROWN = 1.3  # times the points of its last fit, from which on a voxel is fitted anew
+_BROAD = 0.125  # voxels, the least width of a plane that is fitted to a voxel's own points
+MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
+
+
+class Voxels(NamedTuple):
+    """The arrays of a voxel map.
+
+    ``rows`` (S,) is the hash table; it holds rows of ``keys`` (V,), ``moments`` (V, 10), ``cells`` (V, 16) and
+    ``history`` (V, 3).
+    """
+
+    rows: NDArray[np.int32]
+    keys: NDArray[np.int64]
+    moments: NDArray[np.float64]
+    cells: NDArray[np.float64]
+    history: NDArray[np.int32]
+    used: NDArray[np.int64]
+    size_m: float
+
+
+@njit(cache=True, nogil=True)
+def insert(voxels, points, T, tick: int, alone: float):
+    """Add points (N, d), moved by T into the map's frame, and fit the voxels anew that have grown by enough.
+
+    alone : points from which on a voxel is fitted without its neighbors
+    Room for N more voxels must be there.
+    """
+    touched = np.empty(points.shape[0], np.int32)
+    sums = np.empty(10)
+    touches = 0
+    scale = 1.0 / voxels.size_m
+    for i in range(points.shape[0]):
+        x, y, z = move(T, points, i)
+        voxel = _voxel_at(voxels, key_of(x, y, z, scale), tick)
+        if voxels.history[voxel, SEEN] != tick:
+            voxels.history[voxel, SEEN] = tick
+            touched[touches] = voxel
+            touches += 1
+        _accumulate(voxels, voxel, x, y, z)
+    for k in range(touches):
+        voxel = touched[k]
+        if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
+            _fit(voxels, voxel, points.shape[1], alone, sums)
+            voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
+
+
+@njit(cache=True, inline="always")
+def move(T, points, i: int):
+    """Point i moved by the pose T; z is 0 in 2D."""
+    x, y = points[i, 0], points[i, 1]
+    if points.shape[1] == 2:
+        return T[0, 0] * x + T[0, 1] * y + T[0, 2], T[1, 0] * x + T[1, 1] * y + T[1, 2], 0.0
+    z = points[i, 2]
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@njit(cache=True, nogil=True)
+def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: int):
+    """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
+    for voxel in range(voxels.used[0]):
+        cell = voxels.cells[voxel]
+        dx, dy, dz = cell[0] - x, cell[1] - y, cell[2] - z
+        is_old = voxels.history[voxel, SEEN] < oldest_tick
+        if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
+            continue
+        new = _voxel_at(kept, voxels.keys[voxel], 0)
+        for k in range(voxels.moments.shape[1]):
+            kept.moments[new, k] = voxels.moments[voxel, k]
+        for k in range(CELL):
+            kept.cells[new, k] = cell[k]
+        for k in range(voxels.history.shape[1]):
+            kept.history[new, k] = voxels.history[voxel, k]
+
+
+@njit(cache=True, inline="always")
+def _voxel_at(voxels, key: int, tick: int) -> int:
+    """Row of the voxel with that key; a new one is empty."""
+    row = find_row(voxels.rows, voxels.keys, key)
+    if row >= 0:
+        return row
+    voxel = voxels.used[0]
+    voxels.used[0] = voxel + 1
+    voxels.rows[~row] = np.int32(voxel)
+    voxels.keys[voxel] = key
+    voxels.moments[voxel].fill(0.0)
+    voxels.cells[voxel].fill(0.0)
+    voxels.history[voxel, BORN], voxels.history[voxel, SEEN], voxels.history[voxel, FITTED] = tick, -1, 0
+    return voxel
+
+
+@njit(cache=True, inline="always")
+def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
+    ix, iy, iz = unpack(voxels.keys[voxel])
+    x -= (ix + 0.5) * voxels.size_m
+    y -= (iy + 0.5) * voxels.size_m
+    z -= (iz + 0.5) * voxels.size_m
+    m = voxels.moments[voxel]
+    m[0] += 1.0
+    m[1] += x
+    m[2] += y
+    m[3] += z
+    m[4] += x * x
+    m[5] += x * y
+    m[6] += x * z
+    m[7] += y * y
+    m[8] += y * z
+    m[9] += z * z
+
+
+@njit(cache=True, nogil=True)
+def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
+    """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
+
+    The neighbors help where the points are few or show no width: a ring that passes again and again while the
+    lidar stands still leaves many points and no surface.
+    """
+    ix, iy, iz = unpack(voxels.keys[voxel])
+    m = voxels.moments[voxel]
+    size = voxels.size_m
+    cell = voxels.cells[voxel]
+    cell[0] = (ix + 0.5) * size + m[1] / m[0]
+    cell[1] = (iy + 0.5) * size + m[2] / m[0]
+    cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
+    if m[0] >= alone and _fit_shape(m, dimension, cell) >= (_BROAD * size) ** 2:
+        return
+    _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+    _fit_shape(sums, dimension, cell)
+
+
+@njit(cache=True, inline="always")
+def _fit_shape(m, dimension: int, cell) -> float:
+    """Shape and direction of the points with the moments m (10,); returns the least variance within that, m²."""
+    return _fit_2d(m, cell) if dimension == 2 else _fit_3d(m, cell)
+
+
+@njit(cache=True, nogil=True)
+def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
+    """Moments of the 3ᵈ voxels around one, relative to its center, written to ``sums`` (10,)."""
+    sums.fill(0.0)
+    size = voxels.size_m
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-height, height + 1):
+                row = find_row(voxels.rows, voxels.keys, pack(ix + dx, iy + dy, iz + dz))
+                if row < 0:
+                    continue
+                m = voxels.moments[row]
+                n, x, y, z = m[0], dx * size, dy * size, dz * size
+                sums[0] += n
+                sums[1] += m[1] + n * x
+                sums[2] += m[2] + n * y
+                sums[3] += m[3] + n * z
+                sums[4] += m[4] + 2.0 * x * m[1] + n * x * x
+                sums[5] += m[5] + x * m[2] + y * m[1] + n * x * y
+                sums[6] += m[6] + x * m[3] + z * m[1] + n * x * z
+                sums[7] += m[7] + 2.0 * y * m[2] + n * y * y
+                sums[8] += m[8] + y * m[3] + z * m[2] + n * y * z
+                sums[9] += m[9] + 2.0 * z * m[3] + n * z * z
+
+
+@njit(cache=True, nogil=True)
+def _fit_2d(m, cell):
+    """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
+    cell[SHAPE] = POINT
+    n = m[0]
+    if n < 3.0:
+        return 0.0
+    mx, my = m[1] / n, m[2] / n
+    small, large, nx, ny = normal_2d(m[4] / n - mx * mx, m[5] / n - mx * my, m[7] / n - my * my)
+    if large > 1e-12 and small < 0.1 * large:
+        cell[SHAPE] = PLANE
+        cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
+        cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / min(n, MANY)
+        cell[SLOPE_ALONG] = cell[MEAN_TERM] / large
+    return large
+
+
+@njit(cache=True, nogil=True)
+def _fit_3d(m, cell):
+    """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
+
+    A plane is thin against its second extent, a line is thin against its length in both others.
+    """
+    cell[SHAPE] = POINT
+    n = m[0]
+    if n < 5.0:
+        return 0.0
+    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
+    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
+    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
+    small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
+    if small < 0.1 * middle:
+        cell[SHAPE] = PLANE
+        chosen = small
+        wx, wy, wz = eigenvector_3d(xx, xy, xz, yy, yz, zz, middle)
+        cell[ACROSS], cell[ACROSS + 1], cell[ACROSS + 2] = wx, wy, wz
+        n = min(n, MANY)
+        cell[THICKNESS], cell[MEAN_TERM] = small, 1.0 / n
+        cell[SLOPE_ACROSS], cell[SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
+    elif middle < 0.1 * large:
+        cell[SHAPE] = LINE
+        chosen = large
+        cell[THICKNESS] = middle
+    else:
+        return middle
+    vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
+    cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2] = vx, vy, vz
+    if vx == 0.0 and vy == 0.0 and vz == 0.0:
+        cell[SHAPE] = POINT
+    return middle

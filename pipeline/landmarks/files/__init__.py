@@ -1,0 +1,1 @@
+"""Landmark problems read from files, results written."""

@@ -1,0 +1,1 @@
+"""Range and bearing logs (MRCLAM): noise and state estimated together."""

@@ -1,0 +1,146 @@
+"""State and noise of a range log estimated in turn, until neither changes any more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.errors import InputError
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
+from scanchain.landmarks.covariance import Covariance
+from scanchain.landmarks.files.mrclam import RangeLog
+from scanchain.landmarks.guess import from_odometry, growing
+from scanchain.landmarks.minimize import Minimum, minimize
+from scanchain.landmarks.problem import State
+from scanchain.landmarks.ranges.correlation import Likeness
+from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise, Reckoning, reckon
+from scanchain.landmarks.ranges.student import StudentLoss
+from scanchain.landmarks.ranges.variances import Consistency, consistency
+from scanchain.landmarks.solvers import LinearSolver
+
+_ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
+_SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
+_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
+_LEAST_FREEDOM = 1e-3  # observations beyond what the state takes up
+_TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
+_RECKONED = 2  # of them begin with dead reckoning anew, by the robot as it is known then
+_MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
+
+
+class LogModel:
+    """What of a log's problem does not depend on its noise: nodes, landmarks, who saw what."""
+
+    def __init__(self, log: RangeLog) -> None:
+        self._log = log
+        self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
+        self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
+        self.observed = np.stack([node, landmark], axis=1)
+        self.likeness = Likeness(log.seen_s, landmark)
+
+    def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
+        """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
+        return reckon(self._log, self.nodes_s, own)
+
+    def measurements(self, reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
+        """The problem with these variances (6,), the odometry's first."""
+        return Measurements(
+            first_pose=np.zeros(3),
+            first_covariance=_ANCHOR * np.eye(3),
+            motion=reckoning.motion,
+            motion_covariance=reckoning.covariance(variances[:4]),
+            calibration=reckoning.calibration,
+            observed=self.observed,
+            measured=self._log.measured,
+            measured_covariance=np.diag(variances[4:]),
+            landmarks=self.landmarks,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LogFit:
+    """A minimum, the noise it was found for, and what follows from both.
+
+    Attributes
+    ----------
+    reckoned : by the velocities as they were logged, every landmark where it was first seen
+    problem, guess, minimum : with the noise as estimated; where the first minimization began; where the last ended
+    variances : (6,) of the odometry's sources as ``OdometryNoise`` has them, of bearing and range
+    loss : of the observations
+    covariance, consistency : at the minimum
+    iterations : steps after the guess
+    """
+
+    reckoned: State
+    problem: BearingRangeProblem
+    guess: State
+    minimum: Minimum
+    variances: NDArray[np.float64]
+    loss: StudentLoss
+    covariance: Covariance
+    consistency: Consistency
+    iterations: int
+
+
+def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) -> LogFit:
+    """Estimate state and noise; that of the odometry stays what it is unless it is None.
+
+    Raises InputError where the observations tell nothing of the sensor's.
+    """
+    stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
+    reckoning = model.reckoned(np.zeros(len(OWN)))
+    problem = BearingRangeProblem(model.measurements(reckoning, stated))
+    reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
+    variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
+    now = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
+    if not np.all(now.consistency.redundancy > _LEAST_FREEDOM):
+        raise InputError("the landmarks were seen too seldom to tell the sensor's noise; give a longer log")
+    iterations = now.minimum.iterations
+    for turn in range(_TURNS):
+        growth = now.consistency.growth(stated / variances)
+        if noise is not None:
+            growth[:4] = 1.0
+        is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
+        variances = np.maximum(variances * growth, _LEAST)
+        residuals = np.sqrt(now.minimum.weights / loss.share)[:, None] * now.minimum.at.observations
+        loss = StudentLoss(model.likeness.share(model.likeness.correlation(residuals)))
+        state = now.minimum.state
+        if turn < _RECKONED:
+            reckoning = model.reckoned(state.calibration)
+        problem = problem.of(model.measurements(reckoning, variances))
+        now = _settled(problem, state, loss, variances, reckoning, solver, _FINE if is_last else _ROUGH)
+        iterations += now.minimum.iterations
+        if is_last:
+            break
+    return LogFit(
+        reckoned, problem, guess, now.minimum, variances, loss, now.covariance, now.consistency, iterations
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """A minimum, the covariance there, and what its residuals say."""
+
+    minimum: Minimum
+    covariance: Covariance
+    consistency: Consistency
+
+
+def _settled(
+    problem: BearingRangeProblem,
+    state: State,
+    loss: StudentLoss,
+    variances: NDArray[np.float64],
+    reckoning: Reckoning,
+    solver: LinearSolver,
+    tolerance: float,
+) -> _Settled:
+    """The minimum with noise as it is."""
+    minimum = minimize(
+        problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
+    )
+    covariance = Covariance(problem.system(minimum.at, minimum.weights))
+    sources = variances[:4, None, None] * reckoning.sources
+    found = consistency(problem, minimum, covariance, sources, loss.share)
+    return _Settled(minimum, covariance, found)

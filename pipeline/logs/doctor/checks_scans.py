@@ -1,0 +1,237 @@
+"""The doctor's checks of the scans: damage, returns, ranges, surfaces, rings, copies, rest, mounting."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.config import PreprocessConfig
+from scanchain.logs.doctor.finding import Finding, Severity
+from scanchain.logs.doctor.standing_still import LEAST_S, Rest
+from scanchain.logs.doctor.surfaces import weakest_motion
+from scanchain.logs.doctor.survey import Survey
+from scanchain.logs.tally import most_bad_scans
+from scanchain.words import counted
+
+_MANY_LOST = 0.5
+_MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use
+_SOME_BELOW = 0.05  # of beams, below range_min
+_STUCK_SHARE = 0.01  # of beams, all at the farthest range
+_LONG_REST_S = 5.0
+_WHEELS_MOVE = 0.02  # meters, or the sine of a turn
+_FEW_POINTS = 50
+_OPEN = 0.003  # information about the weakest motion, below which matches are degenerate as a rule
+
+
+def check_scans(seen: Survey, preprocess: PreprocessConfig) -> Iterator[Finding]:
+    """Every finding about the scans. ``preprocess`` is what a run of this log would use."""
+    yield _damage(seen, preprocess)
+    yield _returns(seen)
+    yield _no_return(seen)
+    yield _ranges(seen, preprocess)
+    if seen.log.dimension == 3:
+        yield _rings(seen)
+    yield _surfaces(seen, preprocess)
+    yield _duplicates(seen)
+    yield _rest(seen)
+    yield _mounting(seen)
+
+
+def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    empty = sum(scan.kept == 0 for scan in seen.scans)
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
+    bad = len(seen.malformed) + empty + outside
+    lines = list(seen.damage)
+    if seen.malformed:
+        lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
+    if empty:
+        lines.append(f"{counted(empty, 'scan')} without a valid point")
+    if outside:
+        limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
+        lines.append(f"{counted(outside, 'scan')} without a point between {limits}")
+    if not lines:
+        return Finding("damage", Severity.OK, "every scan is readable and has points")
+    messages = len(seen.scans) + len(seen.malformed)
+    if bad > most_bad_scans(messages, seen.log.config):
+        effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}" if bad < messages else ""
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
+    effect = "what was damaged is left out, the rest is used"
+    return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
+
+
+def _returns(seen: Survey) -> Finding:
+    undefined, zero = seen.share(lambda scan: scan.undefined), seen.share(lambda scan: scan.zero)
+    below = seen.share(lambda scan: scan.below)
+    kept = np.array([scan.kept for scan in seen.scans])
+    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, "
+    if below:
+        found += (
+            f"{100 * below:.2g} % below range_min ({np.median([scan.limits_m[0] for scan in seen.scans]):.3g} m), "
+        )
+    found += f"{int(np.median(kept)):,} valid a scan (median)"
+    poor = kept < _FEW_POINTS
+    few = int(np.count_nonzero(poor))
+    if few:
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
+        return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
+    if undefined + zero + below > _MANY_LOST:
+        return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
+    if below > _SOME_BELOW:
+        return Finding(
+            "returns", Severity.NOTE, found, "what lies below range_min is not used: the sensor's own limit"
+        )
+    return Finding("returns", Severity.OK, found)
+
+
+def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
+    """The flags that leave out scans at the start and at the end, where these are the poor ones and no others."""
+    good = np.flatnonzero(~poor)
+    if not len(good) or poor[good[0] : good[-1] + 1].any():
+        return ""
+    start_s, end_s = (seen.into_log_s(int(seen.log_ns[place])) for place in (good[0], good[-1]))
+    flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
+    return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
+
+
+def _no_return(seen: Survey) -> Finding:
+    """Whether many beams tell one farthest range, as scanners do that write a number for no return."""
+    values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
+    farthest_m = max(values, default=0.0)
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
+    stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
+    share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
+    told_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
+    limit_m = min(told_m, seen.log.config.max_range_m)
+    if share < _STUCK_SHARE:
+        return Finding("no return", Severity.OK, "no range is told so often that it must stand for no return")
+    found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"
+    if farthest_m >= limit_m:
+        return Finding("no return", Severity.OK, f"{found}; range limits take it out")
+    effect = "if it stands for no return, it is taken for a wall that moves along"
+    return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
+
+
+def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    ranges_m = np.array([scan.ranges_m for scan in seen.scans if scan.kept], np.float64)
+    near_m, far_m = np.median(ranges_m[:, [1, 99]], axis=0).tolist() if len(ranges_m) else (np.nan, np.nan)
+    found = f"98 % of the returns lie between {near_m:.3g} and {far_m:.4g} m (medians)"
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    if far_m > high_m:
+        unused = float(np.mean(ranges_m > high_m))
+        effect = f"{100 * unused:.2g} % lie beyond {high_m:g} m and are not used"
+        remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+    if near_m < low_m:
+        unused = float(np.mean(ranges_m < low_m))
+        effect = f"{100 * unused:.2g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
+        remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+    return Finding("ranges", Severity.OK, found)
+
+
+def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    """Whether the surfaces in sight determine every motion; a run judges this by matching, scan by scan."""
+    found = [weakest_motion(sample, preprocess) for sample in seen.samples]
+    open_motions = Counter(each.direction for each in found if each.information < _OPEN)
+    bad = open_motions.total()
+    if not bad:
+        return Finding(
+            "surfaces", Severity.OK, f"they determine every motion in {counted(len(found), 'scan')} looked at"
+        )
+    motions = " and ".join(motion for motion, _ in open_motions.most_common(2))
+    told = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
+    effect = "scans are degenerate there, that motion is predicted; a run most of whose scans are so is unreliable"
+    if not seen.wheels:
+        effect += "; wheel odometry, or a lidar with a wider view or a longer range, helps"
+    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, told, effect)
+
+
+def _rings(seen: Survey) -> Finding:
+    rings = [scan.rings for scan in seen.scans]
+    if not any(rings):
+        return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
+    most, least = max(rings), min(rings)
+    found = counted(most, "ring") if most == least else f"{least} to {most} rings"
+    if least < most:
+        return Finding("rings", Severity.NOTE, found, "scans without some of their rings are sparser, no more")
+    return Finding("rings", Severity.OK, found)
+
+
+def _duplicates(seen: Survey) -> Finding:
+    digests = [scan.digest for scan in seen.scans]
+    same = sum(before == after for before, after in pairwise(digests))
+    if not same:
+        return Finding("duplicates", Severity.OK, "no scan is the one before once more")
+    found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
+    effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
+    every = round(len(digests) / (len(digests) - same))
+    remedy = f"--every {every}" if every > 1 else ""
+    return Finding("duplicates", Severity.WARNING, found, effect, remedy)
+
+
+def _rest(seen: Survey) -> Finding:
+    """How long the surroundings do not change and the wheels, where there are any, do not move."""
+    rests = [_until_wheels_move(seen, rest) for rest in seen.rests]
+    rests = [rest for rest in rests if rest.duration_s >= LEAST_S]
+    still_s = sum(rest.duration_s for rest in rests)
+    first_s = rests[0].duration_s if rests and rests[0].first == 0 else 0.0
+    total_s = float(seen.log_ns[-1] - seen.log_ns[0]) * 1e-9
+    found = (
+        f"{still_s:.1f} of {total_s:.1f} s nothing changes from scan to scan, {first_s:.1f} s of it at the start"
+    )
+    if rests and rests[0].last - rests[0].first == len(seen.scans) - 1:
+        effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
+        return Finding("rest", Severity.WARNING, found, effect)
+    if first_s > _LONG_REST_S:
+        effect = "the trajectory drifts by millimeters meanwhile, and it takes time"
+        return Finding(
+            "rest", Severity.NOTE, found, effect, f"--start {np.floor(seen.into_log_s(rests[0].end_ns)):g}"
+        )
+    return Finding("rest", Severity.OK, found)
+
+
+def _until_wheels_move(seen: Survey, rest: Rest) -> Rest:
+    """The rest up to where the wheels tell a motion."""
+    begin_ns, end_ns = seen.stamps_ns[rest.first], seen.stamps_ns[rest.last]
+    poses = [pose for pose in seen.wheels if begin_ns <= pose.stamp_ns <= end_ns]
+    for pose in poses:
+        if np.abs(pose.T_parent_child - poses[0].T_parent_child).max() > _WHEELS_MOVE:
+            stamps_ns = seen.stamps_ns[rest.first : rest.last + 1]
+            last = rest.first + max(int(np.count_nonzero(stamps_ns <= pose.stamp_ns)) - 1, 0)
+            return rest._replace(last=last, end_ns=int(seen.log_ns[last]))
+    return rest
+
+
+def _mounting(seen: Survey) -> Finding:
+    frame = seen.scans[0].frame or "without a name"
+    frames = {scan.frame for scan in seen.scans}
+    if len(frames) > 1:
+        effect = "only the first frame's mounting is used; scans of the others are taken to sit there, too"
+        return Finding(
+            "mounting", Severity.PROBLEM, f"scans in several frames: {', '.join(sorted(frames))}", effect
+        )
+    told = next((note for note in seen.log.notes if note.startswith("no static transform")), "")
+    if told:
+        effect = "trajectories are the lidar's; record /tf_static"
+        if not seen.wheels:
+            return Finding("mounting", Severity.WARNING, told, effect)
+        effect += ", as the wheels' turns are taken about the lidar instead of the robot"
+        return Finding("mounting", Severity.WARNING, told, effect, "--odometry.prior constant-velocity")
+    place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
+    mounting = seen.log.mounting
+    if mounting.motion is not None:
+        effect = "trajectories are the lidar's, its motion on the robot included"
+        effect += "; wheels are carried over to it by /tf" if seen.log.has_odometry else ""
+        return Finding("mounting", Severity.NOTE, f"the lidar moves: {mounting.motion}", effect)
+    if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
+        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not told")
+    return Finding(
+        "mounting", Severity.OK, f"lidar frame {frame}: at {place} m of {mounting.base_name}, {mounting.source}"
+    )

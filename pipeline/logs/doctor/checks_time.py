@@ -1,0 +1,200 @@
+"""The doctor's checks of time: rate, gaps, jitter, stamps, clocks, wheels, per-point times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.config import MatchingConfig
+from scanchain.logs.doctor.finding import Finding, Severity
+from scanchain.logs.doctor.survey import Survey
+from scanchain.logs.messages.point_times import UNITS_S
+from scanchain.logs.messages.readers import is_scan
+from scanchain.words import counted
+
+_GAP_PERIODS = 2.5
+_MOST_MISSING = 10  # scans in a row, beyond which a step of the stamps tells nothing of their jitter
+_JITTER = 0.1  # of the period
+_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
+_SLOW_HZ = 4.0
+_OTHER_CLOCK_S = 1.0
+_LATE_S = 0.2
+_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # of the period, where a unit of time is hard to believe
+_SPINS_AT_S = (0.04, 0.25)
+_WIDE_VOXELS, _WIDE_M = 4, 6  # of a search for motions of meters between scans; either alone does not help
+_SURE = 0.9  # share of the scans that turn alike, and how alike they begin
+_NEAR_NS = 500_000_000  # as far as a run looks for the wheels' reading
+
+
+def check_time(seen: Survey, matching: MatchingConfig) -> Iterator[Finding]:
+    """Every finding about time. ``matching`` is what a run of this log would use."""
+    yield _rate(seen, matching)
+    yield _gaps(seen)
+    yield _jitter(seen)
+    yield _order(seen)
+    yield _clock(seen)
+    yield _wheels(seen)
+    if not is_scan(seen.log.lidar):
+        yield _point_times(seen)
+
+
+def _rate(seen: Survey, matching: MatchingConfig) -> Finding:
+    rate_hz = 1.0 / seen.period_s if seen.period_s else 0.0
+    found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
+    if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not seen.wheels:
+        effect = "the motion between two scans is long and predicted without wheels; the first ones may be missed"
+        remedy = f"--matching.wide_reach_voxels {_WIDE_VOXELS} --matching.wide_max_distance_m {_WIDE_M}"
+        is_wide = matching.wide_reach_voxels >= _WIDE_VOXELS and matching.wide_max_distance_m >= _WIDE_M
+        is_of_use = seen.log.dimension == 3 and not is_wide  # the plane is searched by correlation instead
+        return Finding("rate", Severity.NOTE, found, effect, remedy if is_of_use else "")
+    return Finding("rate", Severity.OK, found)
+
+
+def _gaps(seen: Survey) -> Finding:
+    steps_s = np.diff(seen.log_ns) * 1e-9
+    gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
+    periods, off_s = _periods(seen)
+    is_even = len(off_s) > 0 and float(np.std(off_s)) < _JITTER * seen.period_s
+    missing = int((periods - 1).sum()) if is_even else 0  # of scans that come as they please none is missing
+    absent = f"; {counted(missing, 'scan')} missing in all" if missing else ""
+    if not len(gaps):
+        found = f"none longer than {_GAP_PERIODS:g} periods{absent}"
+        if not missing:
+            return Finding("gaps", Severity.OK, found)
+        return Finding("gaps", Severity.NOTE, found, "after a missing scan the prediction is off by one motion")
+    longest = gaps[np.argmax(steps_s[gaps])]
+    at_s = seen.into_log_s(int(seen.log_ns[longest]))
+    found = (
+        f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
+        f"{at_s:.1f} s into the log{absent}"
+    )
+    predicted = f"the motion over a gap is predicted {'by the wheels' if seen.wheels else 'at constant velocity'}"
+    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if seen.wheels else _LONG_GAP_S):
+        return Finding("gaps", Severity.NOTE, found, predicted)
+    until_s, again_s = math.ceil(10.0 * at_s) / 10.0, math.floor(10.0 * (at_s + steps_s[longest])) / 10.0
+    effect = (
+        f"{predicted}; after a long one the match may settle elsewhere: run the rest, --start {again_s:g}, apart"
+    )
+    return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
+
+
+def _periods(seen: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How many periods lie between scans and the scan before, by the stamps, and the seconds that are left over.
+
+    Missing scans make two periods or more of one; stamps that step back, repeat or jump are left out.
+    """
+    steps_s = np.diff(seen.stamps_ns) * 1e-9
+    steps_s = steps_s[(steps_s > 0.0) & (steps_s < (_MOST_MISSING + 1.5) * seen.period_s)]
+    periods = np.maximum(np.rint(steps_s / seen.period_s), 1.0) if len(steps_s) else steps_s
+    return periods, steps_s - periods * seen.period_s
+
+
+def _jitter(seen: Survey) -> Finding:
+    _, off_s = _periods(seen)
+    if not len(off_s):
+        return Finding("jitter", Severity.OK, "too few scans to tell")
+    jitter_s = float(np.std(off_s))
+    share = jitter_s / seen.period_s
+    found = (
+        f"intervals of stamps are {1e3 * jitter_s:.3g} ms ({100.0 * share:.2g} % of the period) off whole periods"
+    )
+    if share < _JITTER:
+        return Finding("jitter", Severity.OK, found)
+    return Finding("jitter", Severity.NOTE, found, "velocities, and with them deskewing, are off by that share")
+
+
+def _order(seen: Survey) -> Finding:
+    steps_ns = np.diff(seen.stamps_ns)
+    backwards, repeated = int(np.count_nonzero(steps_ns < 0)), int(np.count_nonzero(steps_ns == 0))
+    if not backwards and not repeated:
+        return Finding("stamp order", Severity.OK, "header stamps rise from scan to scan")
+    found = f"{counted(backwards, 'step')} back in the header stamps, {repeated:,} repeated"
+    effect = "scans are taken in the order of log time; poses in the results hold at stamps that are not in order"
+    if repeated < len(steps_ns):
+        return Finding("stamp order", Severity.WARNING, found, effect)
+    return Finding(
+        "stamp order", Severity.PROBLEM, found, f"{effect}; record with stamps: the driver left them out"
+    )
+
+
+def _clock(seen: Survey) -> Finding:
+    """Header stamp against log time."""
+    late_s = (seen.log_ns - seen.stamps_ns) * 1e-9
+    least, median, most = (float(value) for value in np.percentile(late_s, [0.0, 50.0, 100.0]))
+    found = f"logged {median:.4g} s after the header stamp (from {least:.4g} to {most:.4g} s)"
+    if abs(median) > _OTHER_CLOCK_S:
+        effect = (
+            "header stamps are of another clock than log times: --start and --end count by log time, results by "
+        )
+        effect += "header stamps, and wheels or ground truth of the recorder's clock do not meet the scans"
+        return Finding("clock", Severity.WARNING, found, effect)
+    if most - least > _LATE_S:
+        effect = "some scans were recorded late; results hold at header stamps and do not suffer"
+        return Finding("clock", Severity.NOTE, found, effect)
+    return Finding("clock", Severity.OK, found)
+
+
+def _wheels(seen: Survey) -> Finding:
+    if not seen.log.odometry_topic:
+        effect = "the motion is predicted from the scans alone"
+        return Finding("wheels", Severity.OK, "no wheel odometry", effect)
+    stamps_ns = np.sort(np.array([pose.stamp_ns for pose in seen.wheels], np.int64))
+    topic = seen.log.odometry_topic
+    if not len(stamps_ns):
+        return Finding("wheels", Severity.WARNING, f"{topic} has no readable pose", "it is as if there were none")
+    after = np.searchsorted(stamps_ns, seen.stamps_ns)
+    before_ns = np.abs(seen.stamps_ns - stamps_ns[np.maximum(after - 1, 0)])
+    after_ns = np.abs(stamps_ns[np.minimum(after, len(stamps_ns) - 1)] - seen.stamps_ns)
+    scans = counted(len(seen.scans), "scan")
+    missed = int(np.count_nonzero(np.minimum(before_ns, after_ns) > _NEAR_NS))
+    found = f"{topic}: {counted(len(stamps_ns), 'reading')}, {missed} of {scans} without one within 0.5 s"
+    if not missed:
+        return Finding("wheels", Severity.OK, found)
+    return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
+
+
+def _point_times(seen: Survey) -> Finding:
+    spans_s = np.array([scan.time_span_s for scan in seen.scans])
+    spans_s = spans_s[np.isfinite(spans_s)]
+    if not len(spans_s):
+        effect = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
+        return Finding("point times", Severity.NOTE, "none", effect, _by_azimuth(seen))
+    span_s = float(np.median(spans_s))
+    found = f"{seen.point_times.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
+    part = span_s / seen.period_s if seen.period_s else 1.0
+    if _PART_OF_SCAN < part < _MORE_THAN_SCAN:
+        return Finding("point times", Severity.OK, found)
+    found += f", {part:.2g} of the period"
+    effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
+    return Finding("point times", Severity.WARNING, found, effect, _other_unit(seen, part))
+
+
+def _by_azimuth(seen: Survey) -> str:
+    """Flags that tell the times of a lidar that spins by its azimuth, where the order of its points shows how."""
+    turns = np.array([scan.turn for scan in seen.scans])
+    sense = int(np.sign(turns.sum()))
+    start = complex(np.mean(np.exp(1j * np.array([scan.start_rad for scan in seen.scans])[turns == sense])))
+    if not sense or np.mean(turns == sense) < _SURE or abs(start) < _SURE:
+        return ""
+    low_s, high_s = _SPINS_AT_S
+    revolution_s = f"{seen.period_s:.3g}" if low_s < seen.period_s < high_s else "0.1"
+    way = "counterclockwise" if sense > 0 else "clockwise"
+    start_rad = f"{np.angle(start) % (2.0 * np.pi):.3g}"
+    return f"--log.point_times {way} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+
+
+def _other_unit(seen: Survey, part: float) -> str:
+    """The flag for the unit in which scans last about a period; where none fits times too long, that for none.
+
+    part : of the period that scans last in the unit that was taken
+    """
+    taken = next((unit for unit in UNITS_S if f"taken as {unit} " in seen.point_times), "")
+    if not taken:
+        return ""
+    for unit, unit_s in UNITS_S.items():
+        if unit != taken and _PART_OF_SCAN < part * unit_s / UNITS_S[taken] < _MORE_THAN_SCAN:
+            return f"--log.point_times {unit}"
+    return "--log.point_times none" if part > _MORE_THAN_SCAN else ""

@@ -1,0 +1,58 @@
+"""What is wrong with a log, what that does to the result, and the flags that help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from scanchain.config import Config, LogConfig
+from scanchain.logs.doctor.checks_scans import check_scans
+from scanchain.logs.doctor.checks_time import check_time
+from scanchain.logs.doctor.finding import Finding, Severity
+from scanchain.logs.doctor.survey import survey
+from scanchain.logs.log import Log, open_log
+from scanchain.logs.topics import other_sensors
+from scanchain.source import Source
+
+_ORDER = tuple(reversed(Severity))
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The findings about a log, the gravest first.
+
+    ``notes`` are what opening it assumed, ``idle_keys`` the settings that have no effect on it, and why.
+    """
+
+    files: tuple[str, ...]
+    topic: str
+    dimension: int
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    idle_keys: dict[str, str]
+
+
+def examine(
+    sources: Sequence[Source],
+    config_of: Callable[[int], Config],
+    log_config: LogConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Diagnosis:
+    """Look at every scan of a log. Raises InputError where a run could not open it either.
+
+    config_of : what a run would use for a log of this dimension
+    """
+    log = open_log(sources, log_config)
+    notes = tuple(log.notes)
+    seen = survey(log, progress)
+    config = config_of(log.dimension)
+    findings = [*check_time(seen, config.matching), *check_scans(seen, config.preprocess), _sensors(log)]
+    ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
+    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())
+
+
+def _sensors(log: Log) -> Finding:
+    """What else there is, and whether a run uses it."""
+    seen = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
+    found = "; ".join(f"{each.sensor} {each.topic}: {each.use}" for each in seen)
+    return Finding("sensors", Severity.OK, found or "no IMU, GNSS or ground truth")

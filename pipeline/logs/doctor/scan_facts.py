@@ -1,0 +1,153 @@
+"""What a scan message shows of its sensor, for the doctor: invalid beams, limits, rings, times, an outline."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import RawPoints
+from scanchain.logs.messages.laser_scan import LaserScanDecoder, LaserScanMessage
+from scanchain.logs.messages.limits import Returns
+from scanchain.logs.messages.point_cloud import PointCloudDecoder, PointCloudMessage, column
+
+RING_FIELDS = ("ring", "line", "channel")
+_AZIMUTHS, _ELEVATIONS = 72, 64  # cells of an outline
+_STEEPEST = 0.7  # sine of the elevation of the uppermost cells
+_OUTLINE_POINTS = 8192
+_PERCENT = np.arange(101)
+_NEXT_RAD = 0.2  # from one point to the next, as a rule, where their order is that of firing
+_ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # stored ring by ring they make many, and none tells the start
+
+
+class ScanFacts(NamedTuple):
+    """One scan.
+
+    Attributes
+    ----------
+    beams : measurements in the message; ``undefined`` are NaN or infinite, ``zero`` are at no distance at all
+    below : closer than ``limits_m``, though not at no distance
+    kept : what a run would use
+    limits_m : the least and the largest range that the message believes in, 0 and inf where it tells none
+    farthest_m, at_farthest : the largest finite range and how many beams tell just that one
+    ranges_m : (101,) percentiles of the ranges that are kept, NaN where none is
+    time_span_s : of the per-point times, NaN where there are none
+    turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
+    start_rad : azimuth of the first point
+    rings : rings with returns, 0 where points do not tell
+    digest : of the measurements, equal for equal ones
+    points : (N, d) meters, those that are kept
+    outline : (C,) meters, mean distance in each cell of direction, NaN where nothing was seen
+    """
+
+    stamp_ns: int
+    frame: str
+    beams: int
+    undefined: int
+    zero: int
+    below: int
+    kept: int
+    limits_m: tuple[float, float]
+    farthest_m: float
+    at_farthest: int
+    ranges_m: NDArray[np.float32]
+    time_span_s: float
+    turn: int
+    start_rad: float
+    rings: int
+    digest: int
+    points: RawPoints
+    outline: NDArray[np.float64]
+
+
+def facts_of(decoder: LaserScanDecoder | PointCloudDecoder) -> Callable[[memoryview], ScanFacts]:
+    """What looks at a message with the eyes of a run's decoder."""
+    if isinstance(decoder, LaserScanDecoder):
+        return lambda data: _of_scan(decoder, decoder.read(data))
+    return lambda data: _of_cloud(decoder, decoder.read(data))
+
+
+def _of_scan(decoder: LaserScanDecoder, message: LaserScanMessage) -> ScanFacts:
+    limits_m = message.range_min_m, message.range_max_m if message.range_max_m > 0.0 else float("inf")
+    digest = zlib.crc32(message.ranges_m.tobytes())
+    return _facts(decoder.returns(message), message.frame, message.ranges_m, limits_m, 0, digest)
+
+
+def _of_cloud(decoder: PointCloudDecoder, message: PointCloudMessage) -> ScanFacts:
+    returns = decoder.returns(message)
+    x, y, z = (np.asarray(column(message, name), np.float32) for name in "xyz")
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges_m = np.sqrt(x * x + y * y + z * z)
+    rings = next((values for name in RING_FIELDS if (values := column(message, name)) is not None), None)
+    seen = 0 if rings is None else len(np.unique(rings[np.isfinite(ranges_m) & (ranges_m > 0.0)]))
+    limits_m = (decoder.limits.min_m, float("inf"))
+    return _facts(returns, message.frame, ranges_m, limits_m, seen, zlib.crc32(message.data))
+
+
+def _facts(
+    returns: Returns,
+    frame: str,
+    ranges_m: NDArray[np.float32],
+    limits_m: tuple[float, float],
+    rings: int,
+    digest: int,
+) -> ScanFacts:
+    finite = ranges_m[np.isfinite(ranges_m)]
+    farthest_m = float(finite.max()) if len(finite) else float("nan")
+    kept_m = np.sqrt(np.sum(np.square(returns.points), axis=1))
+    kept_m = np.percentile(kept_m, _PERCENT) if len(kept_m) else np.full(len(_PERCENT), np.nan)
+    times_s = returns.times_s
+    turn, start_rad = _turning(returns.points)
+    return ScanFacts(
+        stamp_ns=returns.stamp_ns,
+        frame=frame,
+        beams=len(ranges_m),
+        undefined=len(ranges_m) - len(finite),
+        zero=int(np.count_nonzero(finite == 0.0)),
+        below=int(np.count_nonzero((finite > 0.0) & (finite < limits_m[0]))),
+        kept=len(returns.points),
+        limits_m=limits_m,
+        farthest_m=farthest_m,
+        at_farthest=int(np.count_nonzero(finite == np.float32(farthest_m))),
+        ranges_m=kept_m.astype(np.float32),
+        time_span_s=float(times_s.max() - times_s.min()) if len(times_s) else float("nan"),
+        turn=turn,
+        start_rad=start_rad,
+        rings=rings,
+        digest=digest,
+        points=returns.points,
+        outline=_outline(returns.points),
+    )
+
+
+def _turning(points: RawPoints) -> tuple[int, float]:
+    """Which way round the points follow each other, 0 where they make no single turn, and where they begin."""
+    if len(points) < 2:
+        return 0, float("nan")
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
+    turned = float(steps.sum())
+    is_turn = _ONE_TURN_RAD[0] < abs(turned) < _ONE_TURN_RAD[1] and float(np.median(np.abs(steps))) < _NEXT_RAD
+    return int(np.sign(turned)) * is_turn, float(azimuth[0])
+
+
+def _outline(points: RawPoints) -> NDArray[np.float64]:
+    """Mean distance by direction, of every so-many-th point."""
+    some = points[:: max(1, len(points) // _OUTLINE_POINTS)].astype(np.float64)
+    ranges_m = np.sqrt(np.sum(np.square(some), axis=1))
+    cell = _cell(np.arctan2(some[:, 1], some[:, 0]) / np.pi, _AZIMUTHS)
+    count = _AZIMUTHS
+    if points.shape[1] == 3:
+        cell = cell * _ELEVATIONS + _cell(some[:, 2] / np.maximum(ranges_m, 1e-9) / _STEEPEST, _ELEVATIONS)
+        count *= _ELEVATIONS
+    seen = np.bincount(cell, minlength=count)
+    total_m = np.bincount(cell, ranges_m, minlength=count)
+    return np.where(seen > 0, total_m / np.maximum(seen, 1), np.nan)
+
+
+def _cell(place: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Which of ``count`` equal parts of [-1, 1] a number lies in."""
+    return np.clip((0.5 * (place + 1.0) * count).astype(np.int64), 0, count - 1)

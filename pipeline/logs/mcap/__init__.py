@@ -1,0 +1,1 @@
+"""MCAP files: where their messages lie, damage included, and their messages in order."""

@@ -1,0 +1,141 @@
+"""The messages of a block: decompressed, checked and cut apart."""
+
+from __future__ import annotations
+
+import bz2
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from collections.abc import Set as AbstractSet
+from io import BytesIO
+
+import lz4.frame
+import zstandard
+
+from scanchain.logs.mcap.records import (
+    CHANNEL,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD,
+    SCHEMA,
+    Block,
+    Contents,
+    FileIndex,
+    Message,
+)
+from scanchain.words import counted
+
+
+class DamagedBlockError(Exception):
+    """A block whose contents cannot be trusted; the message says which and why."""
+
+
+def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
+    """The messages of a block, of all channels or of those wanted; channels met on the way join the index.
+
+    Raises DamagedBlockError where a whole block does not unpack to what its header says.
+    """
+    if index.make is not None:
+        return index.make(block, wanted)
+    payload = unpack(index, block)
+    messages: list[Message] = []
+    met = strangers = 0
+    try:
+        for opcode, begin, end in _records(payload):
+            if opcode == SCHEMA:
+                index.add_schema(payload, begin)
+            elif opcode == CHANNEL:
+                index.add_channel(payload, begin)
+            elif opcode == MESSAGE:
+                number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
+                met += 1
+                channel = index.channels.get(number)
+                strangers += channel is None
+                if channel is not None and (wanted is None or number in wanted):
+                    messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
+    except (struct.error, UnicodeDecodeError):
+        damage = "a record in it is malformed; what follows was left out"
+        return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
+    told = sum(entry.messages for entry in block.entries)
+    if strangers:
+        return Contents(
+            messages, f"{_name(index, block)}: {counted(strangers, 'message')} of a channel that nothing defines"
+        )
+    return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
+
+
+def unpack(index: FileIndex, block: Block) -> memoryview:
+    """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
+    return memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
+
+
+def release(index: FileIndex, block: Block) -> None:
+    """Let go of a block's bytes of the file, so that memory does not grow with what has been read."""
+    if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
+        begin = block.offset - block.offset % mmap.PAGESIZE
+        index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
+
+
+def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of each record. Raises struct.error for one that does not belong there."""
+    offset = 0
+    while offset < len(payload):
+        opcode, length = RECORD.unpack_from(payload, offset)
+        begin, offset = offset + RECORD.size, offset + RECORD.size + length
+        if offset > len(payload) or opcode not in (SCHEMA, CHANNEL, MESSAGE):
+            raise struct.error("record beyond the end, or of no kind that a chunk may hold")
+        yield opcode, begin, offset
+
+
+def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
+    stored, crc = index.stored(block)
+    size = block.uncompressed_size
+    try:
+        if not size:
+            payload = b""
+        elif block.compression == "zstd":
+            if zstandard.frame_content_size(stored) not in (-1, size):
+                raise DamagedBlockError(f"{_name(index, block)}: lies about the size it unpacks to")
+            payload = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+        elif block.compression == "lz4":
+            payload = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+        elif block.compression == "bz2":
+            payload = bz2.BZ2Decompressor().decompress(stored, max_length=size)
+        elif block.compression == "":
+            payload = stored
+        else:
+            raise DamagedBlockError(
+                f"{_name(index, block)}: compression {block.compression!r} is not known (none, lz4 and zstd are)"
+            )
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError) as error:
+        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({_one_line(error)})") from error
+    if len(payload) != size:
+        raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
+    if crc and zlib.crc32(payload) != crc:
+        raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
+    return payload
+
+
+def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
+    """As much as the beginning of a chunk unpacks to; nothing of it has been checked."""
+    stored, _ = index.stored(block)
+    try:
+        if block.compression == "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:
+                return reader.read(block.uncompressed_size)
+        if block.compression == "lz4":
+            return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=block.uncompressed_size)
+        if block.compression == "bz2":
+            return bz2.BZ2Decompressor().decompress(stored, max_length=block.uncompressed_size)
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
+        return b""
+    return stored if block.compression == "" else b""
+
+
+def _name(index: FileIndex, block: Block) -> str:
+    return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,218 @@
+"""What is known about an MCAP file before any message is read: channels, blocks of messages, damage."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from scanchain.logs.mcap.read_ahead import ReadAhead
+from scanchain.source import Source
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
+STATISTICS, DATA_END = 0x0B, 0x0F
+RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+
+_CRC = struct.Struct("<I")
+_CRC_AT = RECORD.size + 24  # of a chunk record
+_LONGEST_STRING = 1 << 16  # bytes; a longer name is damage
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
+
+    ``definition`` says what the type looks like, in the language ``schema_encoding``.
+    """
+
+    key: tuple[int, int]
+    topic: str
+    encoding: str
+    schema: int
+    type_name: str
+    schema_encoding: str
+    definition: bytes = b""
+
+
+class Message(NamedTuple):
+    """One message: its channel, when it was logged, and its bytes."""
+
+    channel: Channel
+    log_time_ns: int
+    data: memoryview
+
+
+class Contents(NamedTuple):
+    """The messages of a block in the order of the file; ``damage`` says what is missing behind them."""
+
+    messages: list[Message]
+    damage: str
+
+
+class Entry(NamedTuple):
+    """How many messages of a channel a chunk holds; their (log time, offset) pairs lie at byte ``offset``."""
+
+    channel: int
+    offset: int
+    messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A run of records: a chunk, or messages outside of any chunk.
+
+    Attributes
+    ----------
+    file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
+    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked, None that the chunk's head
+        has to be read for it
+    start_ns, end_ns : log time of the first and last message
+    entries : the channels in it; empty where the file does not say
+    """
+
+    file: int
+    offset: int
+    size: int
+    compression: str
+    uncompressed_size: int
+    crc: int | None
+    start_ns: int
+    end_ns: int
+    entries: tuple[Entry, ...] = ()
+    is_chunk: bool = True
+    is_cut: bool = False
+
+    @property
+    def chunk_offset(self) -> int:
+        """Where the record of a chunk begins, its head included."""
+        return self.offset - (_CRC_AT + 16 + len(self.compression) if self.is_chunk else 0)
+
+    @property
+    def may_be_empty(self) -> bool:
+        """Whether its times are those that writers give a chunk without any message."""
+        return (self.start_ns == self.end_ns == 0 and not self.entries) or self.start_ns > self.end_ns
+
+
+@dataclass(slots=True)
+class FileIndex:
+    """Everything that is known of one file before its messages are read.
+
+    Attributes
+    ----------
+    number : its place among the files of the log
+    data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
+        makes the contents of a block, of all channels or of those wanted
+    counts : messages by channel id; ``is_counted`` once they are complete
+    doubted : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
+    is_trusted : whether what blocks say about their channels agrees with what the file says about itself
+    """
+
+    path: Source
+    number: int
+    data: mmap.mmap | bytes
+    remote: ReadAhead | None = None
+    make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
+    profile: str = ""
+    library: str = ""
+    blocks: list[Block] = field(default_factory=list)
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    is_counted: bool = False
+    takes_rate: bool = False
+    is_trusted: bool = True
+    doubted: list[tuple[int, int]] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def stored(self, block: Block) -> tuple[memoryview, int]:
+        """A block's bytes as the file holds them, and the CRC-32 of what they unpack to, 0 for unchecked."""
+        if block.crc is not None:
+            return self.bytes_at(block.offset, block.size), block.crc
+        head = block.offset - block.chunk_offset
+        record = self.bytes_at(block.chunk_offset, head + block.size)
+        return record[head:], _CRC.unpack_from(record, _CRC_AT)[0]
+
+    def bytes_at(self, offset: int, size: int) -> memoryview:
+        """A part of an MCAP file, wherever it lies."""
+        if self.remote is None:
+            return memoryview(self.data)[offset : offset + size]
+        return self.remote.read(offset, size)
+
+    def expect(self, blocks: Iterable[Block]) -> None:
+        """Take note of which blocks will be read next, in this order."""
+        if self.remote is not None:
+            self.remote.expect([(block.chunk_offset, block.offset + block.size) for block in blocks])
+
+    def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+        """Take in the schema record whose body starts at the offset."""
+        (number,) = struct.unpack_from("<H", body, offset)
+        name, offset = read_string(body, offset + 2)
+        encoding, offset = read_string(body, offset)
+        self.schemas[number] = (name, encoding, _read_octets(body, offset))
+
+    def add_channel(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+        """Take in the channel record whose body starts at the offset; one that is fully known stays."""
+        number, schema = struct.unpack_from("<HH", body, offset)
+        if self.knows(number):
+            return
+        topic, offset = read_string(body, offset + 4)
+        encoding, _ = read_string(body, offset)
+        known = self.schemas.get(schema, ("", "", b""))
+        self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
+
+    def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
+        """Whether a block can have messages of the channels."""
+        if not self.is_trusted or not block.entries:
+            return True
+        return any(entry.channel in channels for entry in block.entries)
+
+    def believe(self, wanted: AbstractSet[int]) -> None:
+        """Take channels in from a damaged summary, as nothing else tells of them."""
+        for opcode, body in self.doubted:
+            try:
+                if opcode == SCHEMA:
+                    self.add_schema(self.data, body)
+                elif opcode == CHANNEL and struct.unpack_from("<H", self.data, body)[0] in wanted:
+                    self.add_channel(self.data, body)
+            except (struct.error, UnicodeDecodeError):
+                continue
+
+    def note_damage(self, line: str) -> None:
+        """Note a line once, however often the damage is met."""
+        if line not in self.damage:
+            self.damage.append(line)
+
+    def knows(self, number: int) -> bool:
+        """Whether the channel and its schema have been met."""
+        channel = self.channels.get(number)
+        return channel is not None and (channel.schema == 0 or channel.type_name != "")
+
+
+def read_string(data: memoryview | mmap.mmap | bytes, offset: int) -> tuple[str, int]:
+    """A string with its length before it, and the byte behind it."""
+    (length,) = struct.unpack_from("<I", data, offset)
+    end = offset + 4 + length
+    if end > len(data) or length > _LONGEST_STRING:
+        raise struct.error("string beyond the end")
+    return bytes(data[offset + 4 : end]).decode(), end
+
+
+def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
+    (length,) = struct.unpack_from("<I", data, offset)
+    end = offset + 4 + length
+    if end > len(data):
+        raise struct.error("bytes beyond the end")
+    return bytes(data[offset + 4 : end])
+
+
+def name_of(indexes: Sequence[FileIndex]) -> str:
+    """The files of a log as errors name them: all of two, of more the first and how many there are beside."""
+    paths = [str(index.path) for index in indexes]
+    shown = f"{paths[0]} and {len(paths) - 1} more files" if len(paths) > 2 else " and ".join(paths)
+    return f"{shown}, read as one log" if len(paths) > 1 else shown

@@ -1,0 +1,128 @@
+"""Whether a record begins at some byte of an MCAP file, and where the next one does behind damage."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Set as AbstractSet
+
+import numpy as np
+
+from scanchain.logs.mcap.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, SCHEMA
+
+PRIVATE = 0x80  # opcodes from here on are those of applications
+CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC-32
+
+_LEAST_BYTES = {
+    1: 8,
+    2: 20,
+    3: 14,
+    4: 16,
+    5: 22,
+    6: 40,
+    7: 6,
+    8: 64,
+    9: 36,
+    10: 48,
+    11: 46,
+    12: 8,
+    13: 20,
+    14: 17,
+    15: 4,
+}
+_EXACT_BYTES = {2: 20, 14: 17, 15: 4}  # footer, summary offset, end of data
+_PARTS = {1: (0, 2), 3: (2, 3), 4: (4, 3), 9: (16, 2), 12: (0, 2)}  # fixed bytes, then parts behind their length
+_COMPRESSIONS = 64  # bytes; no name of a compression is longer
+_COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
+_ANY = frozenset(_LEAST_BYTES)
+_OUTSIDE_CHUNKS = _ANY - {SCHEMA, CHANNEL, MESSAGE}  # of a file that keeps its messages in chunks
+_WINDOW = 1 << 20  # bytes searched at once
+
+
+def record_end(data: mmap.mmap | bytes, offset: int) -> int:
+    """The byte behind the record at ``offset``; 0 where what lies there is none, or not all of one."""
+    if offset + RECORD.size > len(data):
+        return 0
+    opcode, length = RECORD.unpack_from(data, offset)
+    end = offset + RECORD.size + length
+    if end > len(data) or _EXACT_BYTES.get(opcode, length) != length:
+        return 0
+    if opcode >= PRIVATE:
+        return end
+    if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
+        return 0
+    return end if vouches_for_itself(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
+
+
+def vouches_for_itself(data: mmap.mmap | bytes, offset: int) -> bool:
+    """Whether the record at ``offset`` tells its length twice, and both agree."""
+    opcode, length = RECORD.unpack_from(data, offset)
+    body = offset + RECORD.size
+    if opcode == MESSAGE_INDEX:
+        return length >= 6 and struct.unpack_from("<I", data, body + 2)[0] == length - 6
+    if opcode != CHUNK or length < CHUNK_HEAD.size + 12:
+        return opcode == FOOTER
+    (name,) = struct.unpack_from("<I", data, body + CHUNK_HEAD.size)
+    size_at = CHUNK_HEAD.size + 4 + name
+    if name > _COMPRESSIONS or size_at + 8 > length:
+        return False
+    return struct.unpack_from("<Q", data, body + size_at)[0] == length - size_at - 8
+
+
+class Resync:
+    """Finds where reading can go on in a file.
+
+    In one with chunks no message is looked for outside of them: what is left of a damaged chunk, unchecked, is not
+    taken for messages.
+    """
+
+    def __init__(self, data: mmap.mmap | bytes) -> None:
+        self.data = data
+        self._sought: AbstractSet[int] = frozenset()
+
+    def behind(self, offset: int) -> int:
+        """The first byte behind ``offset`` at which a record begins that others follow; 0 where there is none."""
+        if not self._sought:
+            places = (offset, record_end(self.data, offset))
+            begun = any(_begins_chunk(self.data, at) for at in places)
+            has_chunks = begun or _next(self.data, len(MAGIC), {CHUNK, MESSAGE_INDEX}) > 0
+            self._sought = _OUTSIDE_CHUNKS if has_chunks else _ANY
+        return _next(self.data, offset + 1, self._sought)
+
+
+def _next(data: mmap.mmap | bytes, offset: int, sought: AbstractSet[int]) -> int:
+    for begin in range(offset, len(data) - RECORD.size, _WINDOW):
+        window = np.frombuffer(data, np.uint8, min(_WINDOW + 8, len(data) - begin), begin)
+        opcodes, high = window[:-8], (window[6:-2] | window[7:-1] | window[8:])
+        likely = np.flatnonzero((opcodes > 0) & (opcodes <= max(_LEAST_BYTES)) & (high == 0))
+        for candidate in (begin + likely).tolist():
+            if data[candidate] in sought and _is_start(data, candidate):
+                return candidate
+    return 0
+
+
+def is_end(data: mmap.mmap | bytes, offset: int) -> bool:
+    """Whether nothing but the closing magic is left."""
+    return offset == len(data) - len(MAGIC) and data[offset:] == MAGIC
+
+
+def _has_parts(data: mmap.mmap | bytes, offset: int, end: int) -> bool:
+    """Whether the strings and other parts that a record begins with end inside it."""
+    fixed, count = _PARTS.get(data[offset], (0, 0))
+    at = offset + RECORD.size + fixed
+    for _ in range(count):
+        if at + 4 > end:
+            return False
+        at += 4 + struct.unpack_from("<I", data, at)[0]
+    return at <= end
+
+
+def _begins_chunk(data: mmap.mmap | bytes, offset: int) -> bool:
+    """Whether a compressed chunk begins here, which may be cut off."""
+    name = offset + RECORD.size + CHUNK_HEAD.size
+    return data[offset : offset + 1] == bytes([CHUNK]) and data[name : name + 8].startswith(_COMPRESSED)
+
+
+def _is_start(data: mmap.mmap | bytes, offset: int) -> bool:
+    end = record_end(data, offset)
+    return end > 0 and (vouches_for_itself(data, offset) or is_end(data, end) or record_end(data, end) > 0)

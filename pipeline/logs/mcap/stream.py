@@ -1,0 +1,108 @@
+"""Messages in the order of log time, over chunks and files that overlap; unpacked and decoded ahead in threads."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from heapq import heappop, heappush
+from itertools import pairwise
+from typing import NamedTuple
+
+from scanchain.logs.mcap.blocks import DamagedBlockError, read_block, release
+from scanchain.logs.mcap.records import Block, Channel, FileIndex
+from scanchain.logs.mcap.selection import Span
+from scanchain.logs.messages.cdr import MalformedMessageError
+
+Decoders = Mapping[str, Callable[[memoryview], object]]
+
+_THREADS = 2
+_MOST_BYTES_AHEAD = 256_000_000
+
+
+class Decoded(NamedTuple):
+    """A message as its decoder understood it, or the decoder's complaint, a MalformedMessageError."""
+
+    channel: Channel
+    log_time_ns: int
+    value: object
+
+
+def decoded_messages(
+    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, ahead: int, damage: list[str]
+) -> Iterator[Decoded]:
+    """Every message of a topic that has a decoder, by log time; ties in the order of the files.
+
+    At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
+    """
+    wanted = [
+        {number for number, channel in index.channels.items() if channel.topic in decoders} for index in indexes
+    ]
+
+    def decode(block: Block) -> tuple[list[Decoded], str]:
+        contents = read_block(indexes[block.file], block, wanted[block.file])
+        decoded = [
+            Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message.data))
+            for message in contents.messages
+            if span.begin_ns <= message.log_time_ns <= span.end_ns
+        ]
+        release(indexes[block.file], block)
+        return decoded, contents.damage
+
+    blocks = [
+        block
+        for index in indexes
+        for block in index.blocks
+        if span.meets(block) and index.may_hold(block, wanted[block.file])
+    ]
+    blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
+    for index in indexes:
+        index.expect(block for block in blocks if block.file == index.number)
+    waiting: list[tuple[int, int, int, int, Decoded]] = []
+    results = _ahead(blocks, decode, ahead, damage)
+    for (block, following), messages in zip(pairwise([*blocks, None]), results, strict=True):
+        assert block is not None
+        for place, message in enumerate(messages):
+            heappush(waiting, (message.log_time_ns, block.file, block.offset, place, message))
+        while waiting and (following is None or waiting[0][0] < following.start_ns):
+            yield heappop(waiting)[-1]
+
+
+def _decode(decoder: Callable[[memoryview], object], data: memoryview) -> object:
+    try:
+        return decoder(data)
+    except MalformedMessageError as error:
+        return error
+
+
+def _ahead(
+    blocks: Sequence[Block], decode: Callable[[Block], tuple[list[Decoded], str]], ahead: int, damage: list[str]
+) -> Iterator[list[Decoded]]:
+    """Contents in the order of the blocks, decoded by threads that end when the iterator is closed."""
+    running: deque[tuple[Block, Future[tuple[list[Decoded], str]]]] = deque()
+    size = 0
+    pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="scanchain-read")
+    try:
+        for block in blocks:
+            running.append((block, pool.submit(decode, block)))
+            size += block.uncompressed_size
+            while len(running) > ahead or (size > _MOST_BYTES_AHEAD and len(running) > 1):
+                done, future = running.popleft()
+                size -= done.uncompressed_size
+                yield _result(future, damage)
+        while running:
+            yield _result(running.popleft()[1], damage)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> list[Decoded]:
+    try:
+        messages, incomplete = future.result()
+    except DamagedBlockError as error:
+        line = f"{error}; it was left out"
+        damage += [] if line in damage else [line]
+        return []
+    if incomplete and incomplete not in damage:
+        damage.append(incomplete)
+    return messages

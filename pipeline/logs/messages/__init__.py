@@ -1,0 +1,1 @@
+"""Messages taken apart: scans, clouds, poses, in every encoding that is understood."""

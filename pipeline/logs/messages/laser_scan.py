@@ -1,0 +1,149 @@
+"""sensor_msgs/LaserScan to points in the plane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Pose
+from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
+from scanchain.logs.messages.limits import NO_TIMES, RangeLimits, Returns, moved
+
+_MOST_GEOMETRIES = 16
+_NEAREST_M = float(np.finfo(np.float32).tiny)
+_FARTHEST_M = float(np.finfo(np.float32).max)
+
+
+class LaserScanMessage(NamedTuple):
+    """A sensor_msgs/LaserScan as it is: radians, seconds, meters; intensities are passed over.
+
+    ``T_frame_scan`` (4, 4) is where the scan lies in its frame, None where that is its origin.
+    """
+
+    stamp_ns: int
+    frame: str
+    first_rad: float
+    last_rad: float
+    step_rad: float
+    beam_s: float
+    scan_s: float
+    range_min_m: float
+    range_max_m: float
+    ranges_m: NDArray[np.float32]
+    T_frame_scan: Pose | None = None
+
+
+def read_laser_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
+    """Take a message apart; the ranges are a view of it."""
+    reader = form(data)
+    stamp_ns, frame = reader.header()
+    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
+    ranges_m = reader.floats()
+    return LaserScanMessage(
+        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
+    )
+
+
+def read_multi_echo_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
+    """A sensor_msgs/MultiEchoLaserScan as the scan of each beam's first echo, inf where there is none."""
+    reader = form(data)
+    stamp_ns, frame = reader.header()
+    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
+    ranges_m = np.full(_believed(reader.integer(), len(data)), np.inf, np.float32)
+    for beam in range(len(ranges_m)):
+        echoes_m = reader.floats()
+        if len(echoes_m):
+            ranges_m[beam] = echoes_m[0]
+    return LaserScanMessage(
+        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
+    )
+
+
+ReadLaserScan = Callable[[memoryview], LaserScanMessage]
+
+
+class Geometry(NamedTuple):
+    """Directions (N, 2) of the beams and their times (N,) after the stamp, (0,) where they are simultaneous."""
+
+    directions: NDArray[np.float32]
+    times_s: NDArray[np.float32]
+
+
+class LaserScanDecoder:
+    """Decodes scans; directions are computed once for each geometry and shared, also between threads."""
+
+    def __init__(self, limits: RangeLimits, read: ReadLaserScan = read_laser_scan) -> None:
+        self.limits = limits
+        self.read = read
+        self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
+
+    def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's beams."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: LaserScanMessage) -> Returns:
+        """Points of the beams that came back: finite, at least range_min, below range_max.
+
+        Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
+        not positive are taken as unknown. Negative angle increments are as good as positive ones.
+        """
+        ranges_m = message.ranges_m
+        low_m, high_m = self.limits_of(message)
+        geometry = self._geometry(message)
+        valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
+        if len(valid) == len(ranges_m):
+            points = geometry.directions * ranges_m[:, None]
+            times_s = geometry.times_s
+        else:
+            points = geometry.directions[valid] * ranges_m[valid, None]
+            times_s = geometry.times_s[valid] if len(geometry.times_s) else NO_TIMES
+        points = moved(points, message.T_frame_scan).astype(np.float32, copy=False)
+        why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
+        return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
+
+    def limits_of(self, message: LaserScanMessage) -> tuple[float, float]:
+        """The least range that counts, and the one from which on none does."""
+        low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
+        high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
+        return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)
+
+    def _geometry(self, message: LaserScanMessage) -> Geometry:
+        key = (message.first_rad, message.step_rad, message.beam_s, len(message.ranges_m))
+        geometry = self.geometries.get(key)
+        if geometry is None:
+            if len(self.geometries) >= _MOST_GEOMETRIES:
+                self.geometries = {}
+            geometry = self.geometries[key] = _geometry(*key)
+        return geometry
+
+
+def _believed(beams: int, size: int) -> int:
+    if 4 * beams > size:
+        raise MalformedMessageError(f"it claims {beams} beams, more than its {size} bytes can hold")
+    return beams
+
+
+def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:
+    if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
+        raise MalformedMessageError(
+            f"its beams lie {step_rad:g} rad and {beam_s:g} s apart from {first_rad:g} rad on, which cannot be"
+        )
+    angles_rad = first_rad + step_rad * np.arange(count)
+    directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
+    times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES
+    times_s.flags.writeable = False
+    return Geometry(directions, times_s)
+
+
+def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
+    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
+    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
+    far = len(ranges_m) - undefined - near
+    return (
+        f"of {len(ranges_m)} beams {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
+        f"{far} are at {high_m:.3g} m or beyond"
+    )

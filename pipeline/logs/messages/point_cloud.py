@@ -1,0 +1,242 @@
+"""sensor_msgs/PointCloud2 to points in space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Pose
+from scanchain.kernels.cloud_fields import keep_valid
+from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
+from scanchain.logs.messages.limits import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.point_times import NAMES, PointTimes
+
+_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+_MOST_LAYOUTS = 64
+_MOST_FIELDS = 1024
+PLANAR_M = 5e-4  # off the plane, at the most, of a point of a planar cloud: rounding of float32
+_FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # of a cloud, and in all, that tell whether clouds are planar
+_SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
+
+
+class PointField(NamedTuple):
+    """A sensor_msgs/PointField: where in a point a number lies, and of which type it is."""
+
+    name: str
+    offset: int
+    datatype: int
+    repeats: int
+
+
+class PointCloudMessage(NamedTuple):
+    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes that say how a point is laid out.
+
+    ``T_frame_cloud`` (4, 4) is where the cloud lies in its frame, None where that is its origin.
+    """
+
+    stamp_ns: int
+    frame: str
+    height: int
+    width: int
+    fields: list[PointField]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: memoryview
+    described: bytes
+    T_frame_cloud: Pose | None = None
+
+
+def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
+    """Take a message apart; the points are a view of it."""
+    reader = form(data)
+    stamp_ns, frame = reader.header()
+    height, width = reader.integer(), reader.integer()
+    begin = reader.offset
+    count = reader.integer()
+    if count > _MOST_FIELDS:
+        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are believed")
+    fields = [
+        PointField(reader.string(), reader.integer(), reader.integer("B"), reader.integer()) for _ in range(count)
+    ]
+    is_bigendian = bool(reader.integer("B"))
+    point_step = reader.integer()
+    described = bytes(data[begin : reader.offset])
+    row_step = reader.integer()
+    return PointCloudMessage(
+        stamp_ns, frame, height, width, fields, is_bigendian, point_step, row_step, reader.octets(), described
+    )
+
+
+ReadPointCloud = Callable[[memoryview], PointCloudMessage]
+
+
+def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
+    """One field of all points (N,), None where the cloud does not have it."""
+    for field in message.fields:
+        if field.name == name and field.datatype in _FORMATS:
+            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+            if field.offset + number.itemsize > message.point_step:
+                return None
+            point = np.dtype({
+                "names": [name],
+                "formats": [number.str],
+                "offsets": [field.offset],
+                "itemsize": message.point_step,
+            })  # fmt: skip
+            return _rows(message, point)[name]
+    return None
+
+
+class Layout(NamedTuple):
+    """Where a channel keeps its fields: a structured type, and the name of the time field, if any."""
+
+    point: np.dtype[np.void]
+    time: str
+
+
+class PointCloudDecoder:
+    """Decodes clouds; the place of the fields is worked out once for each layout."""
+
+    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud = read_point_cloud) -> None:
+        self.read = read
+        self.limits = limits
+        self.times = times
+        self.layouts: dict[bytes, Layout] = {}
+
+    def decode(self, data: memoryview) -> Returns:
+        """What came back of a message's points."""
+        return self.returns(self.read(data))
+
+    def returns(self, message: PointCloudMessage) -> Returns:
+        """Points that came back: finite, not the origin, within the limits; their times with them.
+
+        Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
+        """
+        layout = self.layouts.get(message.described)
+        if layout is None:
+            if len(self.layouts) >= _MOST_LAYOUTS:
+                self.layouts = {}
+            layout = self.layouts[message.described] = _layout(message, self.times)
+        return self._filter(message, layout, _rows(message, layout.point))
+
+    def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
+        points = np.empty((len(cloud), 3), np.float32)
+        kept = np.empty(len(cloud), np.int32)
+        x, y, z = (_as_float32(cloud[name]) for name in "xyz")
+        high_square = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
+        count = keep_valid(x, y, z, self.limits.min_m**2, high_square, points, kept)
+        times_s = NO_TIMES
+        if layout.time:
+            times = cloud[layout.time]
+            times = times if count == len(cloud) else times[kept[:count]]
+            times_s = self.times.from_field(layout.time, message.stamp_ns, times)
+        elif self.times.by_azimuth:
+            times_s = self.times.from_azimuth(points[:count])
+        why = "" if count else _why_none(x, y, z)
+        kept_points = moved(points[:count], message.T_frame_cloud)
+        return Returns(message.stamp_ns, kept_points, times_s, len(cloud) - count, why)
+
+
+class PlanarCloudDecoder(PointCloudDecoder):
+    """Decodes clouds whose points all lie at one height, as of a planar scanner, to points in the plane."""
+
+    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud, height_m: float) -> None:
+        super().__init__(limits, times, read)
+        self.height_m = height_m
+
+    def returns(self, message: PointCloudMessage) -> Returns:
+        """Points (N, 2) that came back. Raises MalformedMessageError where one is not in the plane."""
+        returns = super().returns(message)
+        off_m = np.abs(returns.points[:, 2] - self.height_m).max(initial=0.0)
+        if off_m > PLANAR_M:
+            raise MalformedMessageError(
+                f"a point lies {off_m:.3g} m off the plane z = {self.height_m:.3g} m, in which all points of the "
+                "first clouds lie"
+            )
+        return returns._replace(points=np.ascontiguousarray(returns.points[:, :2]))
+
+
+def plane_height_m(clouds: Iterable[Returns]) -> float | None:
+    """The height of all points of the first clouds, None where it is not one or no cloud has enough to tell."""
+    heights_m = np.empty(0, np.float32)
+    most = 0
+    for cloud in clouds:
+        most = max(most, len(cloud.points))
+        heights_m = np.concatenate([heights_m, cloud.points[:, 2]])
+        if len(heights_m) and np.ptp(heights_m) > 2.0 * PLANAR_M:
+            return None
+        if len(heights_m) > _ENOUGH_POINTS:
+            break
+    return None if most < _FEWEST_POINTS else float(np.median(heights_m))
+
+
+def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """The field itself where it is native float32 already, else a copy; infinite where float32 ends."""
+    if values.dtype == np.float32 and values.dtype.isnative and values.flags.aligned:
+        return values.view(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
+
+
+def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
+    wanted: dict[str, tuple[str, int]] = {}
+    for field in message.fields:
+        if field.name not in ("x", "y", "z") and not times.wants(field.name):
+            continue
+        if field.datatype not in _FORMATS:
+            raise MalformedMessageError(
+                f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8"
+            )
+        number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+        if field.offset + number.itemsize > message.point_step:
+            raise MalformedMessageError(
+                f"field {field.name} reaches to byte {field.offset + number.itemsize} of a point, "
+                f"beyond point_step {message.point_step}"
+            )
+        wanted[field.name] = (number.str, field.offset)
+    missing = [name for name in "xyz" if name not in wanted]
+    if missing:
+        names = ", ".join(field.name for field in message.fields) or "none"
+        raise MalformedMessageError(f"the cloud has no field {' '.join(missing)} (it has: {names})")
+    time = next((name for name in NAMES if name in wanted), "")
+    chosen = ["x", "y", "z", time] if time else ["x", "y", "z"]
+    point = np.dtype({
+        "names": chosen,
+        "formats": [wanted[name][0] for name in chosen],
+        "offsets": [wanted[name][1] for name in chosen],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    return Layout(point, time)
+
+
+def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.void]:
+    """All points of all rows, the padding behind each row left out."""
+    height, width, body = message.height, message.width, message.data
+    row = width * point.itemsize
+    stride = message.row_step if height > 1 else row
+    if stride < row:
+        raise MalformedMessageError(f"row_step {stride} is less than the {row} bytes of {width} points")
+    needed = (height - 1) * stride + row if height and width else 0
+    if len(body) < needed:
+        raise MalformedMessageError(
+            f"data has {len(body)} bytes, fewer than the {needed} of {height} × {width} points "
+            f"of {point.itemsize} bytes"
+        )
+    if not needed or stride == row:
+        return np.frombuffer(body, point, height * width)
+    rows = np.ndarray((height, width), point, body, strides=(stride, point.itemsize))
+    return rows.reshape(-1)
+
+
+def _why_none(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> str:
+    count = len(x)
+    if not count:
+        return "the cloud is empty"
+    undefined = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
+    zero = int(np.count_nonzero((x == 0.0) & (y == 0.0) & (z == 0.0)))
+    outside = count - undefined - zero
+    return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"

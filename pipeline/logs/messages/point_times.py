@@ -1,0 +1,88 @@
+"""Per-point times, whatever a driver calls them and counts them in, or by the azimuth of a spinning lidar."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.config import LogConfig
+from scanchain.data import RawPoints
+from scanchain.logs.messages.limits import NO_TIMES
+
+NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
+
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_NONE = "no point times: every scan counts as measured at once"
+_SHORTEST_SCAN_NS = 500_000  # whole numbers that span less are microseconds
+_LONGEST_SCAN = 1e4  # in milliseconds; floats that span more are micro- or nanoseconds
+_NEAR_S = 1.0  # no scan begins further from its stamp than this
+_ABSOLUTE_S = 3600.0  # absolute times are beyond
+
+
+class PointTimes:
+    """Seconds after the stamp for the points of scans, in any order and from any thread.
+
+    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
+    ``assumed`` says in words what was done with one of the first scans that have times.
+    """
+
+    def __init__(self, config: LogConfig) -> None:
+        self.config = config
+        self.unit = config.point_times if config.point_times in UNITS_S else ""
+        self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
+        self.assumed = _NONE
+
+    def wants(self, field: str) -> bool:
+        """Whether times are taken from a field of this name."""
+        return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
+
+    def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
+        """Times (N,) of points (N, 3) by how far the lidar has turned since its start, which is at the stamp."""
+        config = self.config
+        sense = -1.0 if config.point_times == "clockwise" else 1.0
+        turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
+        way = f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+        self.assumed = f"point times by the azimuth: {way} (log.point_times)"
+        return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
+
+    def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:
+        """Times (N,) of raw values (N,); (0,) where not finite or all the same.
+
+        Whole numbers are nanoseconds, or microseconds where that would make the whole scan shorter than half a
+        millisecond. Floats are seconds where they span up to 10, else milli-, micro- or nanoseconds by their span.
+        Values within a second of the stamp are absolute, others count from it; those of another clock, the
+        sensor's own or one that is off by the leap seconds, count from the first point.
+        """
+        if not len(values):
+            return NO_TIMES
+        is_whole = values.dtype.kind in "iu"
+        raw = values.astype(np.int64) if is_whole else values.astype(np.float64)
+        if not np.isfinite(raw).all():
+            return NO_TIMES
+        first = raw.min()
+        span = float(raw.max() - first)
+        if span == 0.0:  # as where a float32 holds an absolute time
+            return NO_TIMES
+        unit = self.unit or _likely_unit(span, is_whole=is_whole)
+        unit_s = UNITS_S[unit]
+        per_second = round(1.0 / unit_s)
+        stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
+        origin = "after the stamp"
+        if abs(float(first) - float(stamp)) * unit_s < _NEAR_S and float(first) * unit_s > _ABSOLUTE_S:
+            raw, origin = raw - stamp, "since the epoch"
+        elif abs(float(first)) * unit_s > _NEAR_S:
+            raw, origin = raw - first, "of another clock, counted from the first point"
+        if self.assumed == _NONE:
+            taken = f"field {name} ({values.dtype.name}) taken as {unit} {origin}"
+            self.assumed = f"point times: {taken} (log.point_times)"
+        return (raw * unit_s).astype(np.float32)
+
+
+def _likely_unit(span: float, *, is_whole: bool) -> str:
+    if is_whole:
+        return "us" if span < _SHORTEST_SCAN_NS else "ns"
+    if span <= 10.0:
+        return "s"
+    if span <= _LONGEST_SCAN:
+        return "ms"
+    return "us" if span <= 1e3 * _LONGEST_SCAN else "ns"

@@ -1,0 +1,1 @@
+"""Messages packed and written as MCAP."""

@@ -1,0 +1,101 @@
+"""A log of any format that is known as one MCAP file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs.mcap.records import FileIndex, name_of
+from scanchain.logs.mcap.selection import EVERYTHING, chosen_span, whole_span
+from scanchain.logs.mcap.stream import Decoded, decoded_messages
+from scanchain.logs.opening import HAS_STAMPS, index_files
+from scanchain.logs.topics import find_lidar, is_lidar, topics_of
+from scanchain.logs.writing.writer import LogWriter
+from scanchain.source import Source
+
+_DEFAULTS = LogConfig()
+_WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """What came of a conversion: messages by topic, what was left out by choice, what could not be read."""
+
+    path: Path
+    messages: dict[str, int]
+    notes: tuple[str, ...]
+    damage: tuple[str, ...]
+
+
+def convert(
+    sources: Sequence[Source],
+    destination: Path,
+    *,
+    config: LogConfig = _DEFAULTS,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Converted:
+    """Write the messages of the sources, one log, by log time. ROS messages stay as they are, byte by byte.
+
+    config : what is left out: what lies before ``start_s`` and behind ``end_s``, the lidars beside ``topic``, all
+        but every ``every``-th scan; static transforms are kept, from the start on
+    Raises InputError for what cannot be read or written.
+    """
+    if destination.suffix != ".mcap":
+        raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
+    indexes = index_files(sources, config.rate_hz)
+    is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
+    is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
+    if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part:
+        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
+    total = sum(sum(index.counts.values()) for index in indexes)
+    counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
+    damage = [line for index in indexes for line in index.damage]
+    with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
+        for message in _messages(indexes, counts, config, damage):
+            assert isinstance(message.value, bytes)
+            log.copy(message.channel, message.log_time_ns, message.value)
+            counts[message.channel.topic] += 1
+            if progress is not None:
+                progress(sum(counts.values()), total)
+        if not sum(counts.values()):
+            raise InputError(
+                f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+            )
+    notes = tuple(line for index in indexes for line in index.notes)
+    if config.rate_hz and not any(index.takes_rate for index in indexes):
+        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
+    return Converted(destination, counts, notes, tuple(damage))
+
+
+def _messages(
+    indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
+) -> Iterator[Decoded]:
+    """The messages to write. Static transforms come first, and none before the chosen part begins."""
+    span, ahead = chosen_span(whole_span(indexes), config), config.prefetch_chunks
+    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith("tf_static")}
+    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, ahead=ahead, damage=[]):
+        yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
+    others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
+    scans = Counter[str]()
+    for message in decoded_messages(indexes, others, span, ahead=ahead, damage=damage):
+        scans[message.channel.topic] += is_lidar(message.channel)
+        if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
+            yield message
+
+
+def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
+    """The topics to write: all, but of several lidars only the one that is asked for."""
+    lidar = find_lidar(indexes, topic) if topic else None
+    channels = topics_of(indexes)
+    return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]
+
+
+def _profile(indexes: Sequence[FileIndex]) -> str:
+    """The convention that all channels keep, empty where they differ."""
+    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
+    return {frozenset({"cdr"}): "ros2", frozenset({"ros1"}): "ros1"}.get(frozenset(encodings), "")

@@ -1,0 +1,1 @@
+"""Checkpoints of a run, and how one goes on after it was stopped."""

@@ -1,0 +1,112 @@
+"""state.checkpoint: the whole chain as it was after some scan, to go on from."""
+
+from __future__ import annotations
+
+import zlib
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+from scanchain import config, data
+from scanchain.clock import working_s
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.voxels.voxel_shapes import Voxels
+from scanchain.loops.anywhere_closer import AnywhereCloser
+from scanchain.loops.closer import LoopCloser
+from scanchain.loops.doubt import Doubt
+from scanchain.loops.gallery import Gallery
+from scanchain.loops.near_closer import NearCloser
+from scanchain.loops.pieces import Pieces
+from scanchain.loops.place import Place
+from scanchain.loops.place_closer import PlaceCloser
+from scanchain.loops.planar_search import PlanarSearch
+from scanchain.loops.recognition import Recognition
+from scanchain.loops.submaps import Submaps
+from scanchain.loops.verification import Verifier
+from scanchain.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
+from scanchain.odometry import FrontEnd, Odometry
+from scanchain.odometry.experience import Experience
+from scanchain.odometry.intervals import Intervals
+from scanchain.odometry.motion_filter import MotionFilter
+from scanchain.odometry.prediction import Predictor
+from scanchain.point_store import PointStore, StoredPoints
+from scanchain.preprocess import Resolution, Sweep
+from scanchain.runs.directory import CHECKPOINT_FILE
+from scanchain.runs.provenance import package_version
+from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.slam import Slam
+
+_LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
+
+
+def _version() -> str:
+    """That of the package and a checksum of its code: other code would not go on to the same bits."""
+    package = Path(__file__).parents[2]
+    code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})"
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """The chain after ``scans`` scans, which took ``run_s`` seconds of work.
+
+    The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
+    numbers the processes that wrote to the run directory, from 0.
+    """
+
+    scans: int
+    run_s: float
+    process: int
+    recorded_bytes: int
+    slam: Slam
+
+
+_CLASSES = Classes(
+    [
+        Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep,
+        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch,
+        Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray, PointStore, StoredPoints,
+        Pieces, AnywhereCloser,
+        data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
+        config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
+    ],
+    {
+        (PoseGraph, "_problem"): None,
+        (PoseGraph, "_factor_is_now"): False,
+        (Submaps, "held"): OrderedDict(),
+        (PointStore, "file"): None,
+    },
+    _version(),
+)  # fmt: skip
+
+
+class Checkpoints:
+    """Writes the chain down every so often, and so rarely that it takes a twentieth of the time at the most."""
+
+    def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
+        """run_s : that the ``process`` earlier processes took up to the checkpoint gone on from."""
+        self.path = folder / CHECKPOINT_FILE
+        self.process = process
+        self.every_s = every_s
+        self.began_s = working_s() - run_s
+        self.next_s = perf_counter() + every_s
+
+    def are_due(self) -> bool:
+        """Whether it is time for the next."""
+        return perf_counter() >= self.next_s
+
+    def write(self, slam: Slam, recorded_bytes: int = 0) -> None:
+        """Write one. Raises OSError on a full disk; the last one stays."""
+        started = perf_counter()
+        run_s = working_s() - self.began_s
+        checkpoint = Checkpoint(len(slam.stamps_ns), run_s, self.process, recorded_bytes, slam)
+        write_snapshot(self.path, checkpoint, _CLASSES)
+        now = perf_counter()
+        self.next_s = now + max(self.every_s, _LEISURE * (now - started))
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made."""
+    return read_snapshot(folder / CHECKPOINT_FILE, _CLASSES)

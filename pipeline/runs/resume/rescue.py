@@ -1,0 +1,83 @@
+"""What is kept of a run that failed, and what is said of it."""
+
+from __future__ import annotations
+
+import shlex
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from scanchain.errors import InputError, ScanchainError, told
+from scanchain.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
+from scanchain.runs.provenance import Provenance
+from scanchain.runs.resume.journal import JOURNAL_FILE
+from scanchain.runs.step_table import StepTable
+from scanchain.source import without_keys
+from scanchain.trajectory import write_tum
+from scanchain.words import counted
+
+
+class PartialRunError(ScanchainError):
+    """A run that failed after some scans; what there is lies in a directory marked partial."""
+
+
+def how_to_resume(command: Sequence[str]) -> str:
+    """What goes on with a run that this command line began; one without was begun by a script."""
+    words = [*without_keys(command[1:]), *([] if "--resume" in command else ["--resume"])]
+    again = f"scanchain {shlex.join(words)}" if len(command) > 1 else "the same with --resume"
+    return f"to go on with it: {again}"
+
+
+def rescued(
+    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
+) -> BaseException:
+    """The error to raise; what there is of a run that got somewhere is written and said where it lies."""
+    is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+    if not len(steps) and not is_bug:
+        return error
+    directory.worth_keeping()
+    if isinstance(error, OSError) and error.filename is None:
+        error.filename = str(directory.destination)
+    reason = _reason(error)
+    what = "traceback.txt and the " if is_bug else ""
+    until = f"{counted(len(steps), 'scan')} until then {'is' if len(steps) == 1 else 'are'}"
+    where = f"{what}{until} in {directory.path}"
+    try:
+        _keep(
+            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
+        )
+    except OSError as failure:
+        why = "" if isinstance(error, OSError) else f" ({told(failure) or failure.strerror})"
+        where = f"{until} in {directory.path / JOURNAL_FILE} alone{why}"
+    if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
+        where += f"; {how_to_resume(provenance.command)}"
+    if isinstance(error, InputError):
+        return InputError(f"{error}; {where}")
+    kind = f"{type(error).__name__}: " if is_bug else ""
+    return PartialRunError(f"{kind}{reason}; {where}")
+
+
+def _reason(error: BaseException) -> str:
+    """What ended a run, in words."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    known = told(error) if isinstance(error, OSError) else ""
+    return known or str(error) or type(error).__name__
+
+
+def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
+    """Write what there is. Raises OSError where the disk is full, after which nothing half-written is left."""
+    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
+    try:
+        provenance.write(folder / RUN_FILE)
+        if bug is not None:
+            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
+        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
+            write_tum(written[0], steps.odometry)
+            steps.write(written[1], steps.best_known)
+    except OSError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,1 @@
+"""The worlds that can be simulated."""

@@ -1,0 +1,80 @@
+"""The worlds that can be driven through, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.simulation.motion import Motion, Vehicle
+from scanchain.simulation.solids import Solids
+from scanchain.simulation.worlds import (
+    corridor,
+    field,
+    forest,
+    hall,
+    highway,
+    identical,
+    office,
+    rounds,
+    staircase,
+    town,
+    yard,
+)
+from scanchain.simulation.worlds.laps import Laps
+from scanchain.simulation.worlds.pivots import Pivot, Pivots
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A place, the way through it, by whom, and with which lidar and for how long by default.
+
+    Attributes
+    ----------
+    build : draws the place
+    way : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
+    sight_m : how far any lidar sees there
+    holes : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
+    """
+
+    build: Callable[[np.random.Generator], Solids]
+    way: Matrix | tuple[Pivot, ...]
+    vehicle: Vehicle
+    sensor: str
+    duration_s: float
+    sight_m: float = np.inf
+    holes: tuple[tuple[float, float], ...] = ()
+
+    def motion(self, solids: Solids, *, duration_s: float, rng: np.random.Generator) -> Motion:
+        """The drive; ``rng`` draws how it strays and sways."""
+        if isinstance(self.way, tuple):
+            return Pivots(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        return Laps(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)
+
+
+_GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
+
+WORLDS: dict[str, World] = {
+    "office": World(office.office, office.ROUTE, office.ROBOT, "lms-270", 240.0),
+    "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0),
+    "rounds": World(rounds.rounds, rounds.ROUTE, rounds.CAR, "hdl-64", 160.0),
+    "identical": World(identical.identical, identical.ROUTE, office.ROBOT, "lms-270", 300.0),
+    "highway": World(highway.highway, highway.ROUTE, highway.CAR, "hdl-64", 30.0),
+    "corridor": World(corridor.corridor, corridor.ROUTE, corridor.ROBOT, "os1-32", 40.0, corridor.SIGHT_M),
+    "field": World(field.field, field.ROUTE, field.TRACTOR, "hdl-64", 40.0, field.SIGHT_M),
+    "forest": World(forest.forest, forest.ROUTE, forest.MULE, "os1-32", 30.0),
+    "staircase": World(staircase.staircase, staircase.ROUTE, staircase.WALKER, "os1-32", 40.0),
+    "hall": World(hall.hall, hall.ROUTE, hall.TRUCK, "vlp-16", 25.0),
+    "turns": World(yard.yard, yard.STEPS, yard.ROBOT, "os1-32", 40.0),
+    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, holes=_GAPS),
+}
+
+
+def find_world(name: str) -> World:
+    """The world of that name."""
+    if name not in WORLDS:
+        raise InputError(f"world {name!r} does not exist; choose one of {', '.join(WORLDS)}")
+    return WORLDS[name]

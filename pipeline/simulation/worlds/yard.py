@@ -1,0 +1,66 @@
+"""A walled yard with sheds, containers, cars and posts, in the middle of which a robot turns on the spot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanchain.simulation.motion import Vehicle, mount
+from scanchain.simulation.solids import Scenery, Solids
+from scanchain.simulation.worlds.outdoors import BELOW_M, parked_car, tree
+from scanchain.simulation.worlds.pivots import Pivot
+
+_HALF_X_M, _HALF_Y_M = 19.0, 15.0
+
+ROBOT = Vehicle(
+    speed_m_s=1.5,
+    acceleration_m_s2=1.5,
+    lateral_acceleration_m_s2=1.0,
+    corner_m=0.0,
+    wander_m=0.0,
+    sway_rad=0.006,
+    heave_m=0.004,
+    radius_m=0.4,
+    T_base_lidar=mount(0.15, 0.9),
+)
+
+# A triangle, a square the other way round, there and back, once round on the spot and once back; it closes.
+STEPS = (
+    *[Pivot(120.0, 3.0)] * 3,
+    *[Pivot(-90.0, 2.0)] * 4,
+    *[Pivot(180.0, 3.5)] * 2,
+    Pivot(360.0, 0.0), Pivot(-45.0, 0.0), Pivot(90.0, 0.0), Pivot(-405.0, 0.0),
+)  # fmt: skip
+
+
+def yard(rng: np.random.Generator) -> Solids:
+    """The yard; walls stand where they stand, everything along them is drawn from ``rng``."""
+    phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
+    scenery = Scenery(np.array([0.0, 0.1, 2.0 * np.pi / 30.0, phase_x, 0.1, 2.0 * np.pi / 24.0, phase_y]))
+    for side in (-1.0, 1.0):
+        scenery.box((0.0, side * _HALF_Y_M), (2.0 * _HALF_X_M, 0.3), (BELOW_M, rng.uniform(1.8, 3.0)))
+        scenery.box((side * _HALF_X_M, 0.0), (0.3, 2.0 * _HALF_Y_M), (BELOW_M, rng.uniform(1.8, 3.0)))
+        for x in np.arange(-15.0, 15.1, 6.0):
+            _lean_on(scenery, float(x) + rng.uniform(-1.0, 1.0), side * (_HALF_Y_M - 2.2), rng)
+        for y in (-7.0, 0.0, 7.0):
+            parked_car(scenery, side * (_HALF_X_M - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
+        tree(scenery, side * rng.uniform(10.5, 12.0), rng.uniform(-6.0, 6.0), rng)
+    for bearing in np.deg2rad(np.arange(0.0, 360.0, 60.0)) + rng.uniform(-0.4, 0.4, 6):
+        post = rng.uniform(7.0, 9.5) * np.array([np.cos(bearing), np.sin(bearing)])
+        scenery.cylinder(
+            (float(post[0]), float(post[1])), rng.uniform(0.05, 0.2), (BELOW_M, rng.uniform(0.8, 3.5))
+        )
+    return scenery.finish()
+
+
+def _lean_on(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None:
+    """Something along a wall: a shed, a container or a pile of crates."""
+    kind, yaw = rng.random(), rng.normal(0.0, 0.06)
+    if kind < 0.35:
+        scenery.box((x, y), (rng.uniform(2.5, 4.0), rng.uniform(2.0, 2.8)), (BELOW_M, rng.uniform(2.2, 3.2)), yaw)
+    elif kind < 0.6:
+        scenery.box((x, y), (5.0, 2.4), (BELOW_M, 2.6), yaw)
+    else:
+        for _ in range(4):
+            place = (x + rng.uniform(-1.5, 1.5), y + rng.uniform(-0.6, 0.6))
+            size = (rng.uniform(0.6, 1.3), rng.uniform(0.6, 1.2))
+            scenery.box(place, size, (BELOW_M, rng.uniform(0.4, 1.6)), yaw + rng.uniform(0.0, 1.5))

@@ -1,0 +1,1 @@
+"""Figures: trajectories, maps, graphs and landmarks, as PNG and SVG."""

@@ -1,0 +1,102 @@
+"""Maps as small pictures, and loop closures on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from scanchain.data import Points
+from scanchain.viz.pictures.svg import INK, Sheet
+from scanchain.viz.pictures.trajectories import CLOSURES, Course, Floats, PathLine
+
+_POINTS = "#808893"
+_MAX_POINTS = 120_000
+_PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
+_OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
+_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; how many times its size a point may lie outside of these
+
+
+def surroundings(low: Floats, high: Floats, clouds: Sequence[Points]) -> tuple[Floats, Floats]:
+    """Corners (3,) that hold a trajectory, from ``low`` to ``high``, and the extents of its maps."""
+    boxes = np.array([(low, high), *(extent(points) for points in clouds if len(points))])
+    return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+
+
+def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Corners (d,) of a map (M, d), but for outliers: points that lie far beyond 99 % of all, along any axis."""
+    low, high = np.percentile(points, _BULK, axis=0)
+    size = high - low
+    size[:2] = size[:2].max()
+    inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
+    return inside.min(axis=0).astype(np.float64), inside.max(axis=0).astype(np.float64)
+
+
+def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
+    """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
+    with Sheet.of_plan(name, low, high) as sheet:
+        _draw_points(sheet, points, low, high, by_height=True)
+        return sheet.svg()
+
+
+def path_over_map(
+    name: str, points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats
+) -> Markup:
+    """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
+    with Sheet.of_plan(name, low, high) as sheet:
+        _draw_points(sheet, points, low, high, by_height=False)
+        for line in lines:
+            style = (0, (3, 3)) if line.is_dashed else "-"
+            x, y = line.positions[:, :2].T
+            sheet.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
+        for place, marker in ((0, "o"), (-1, "s")):
+            sheet.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
+        return sheet.svg()
+
+
+def _draw_points(sheet: Sheet, points: Points, low: Floats, high: Floats, *, by_height: bool) -> None:
+    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
+    if inside.any():
+        image = _image(shown[inside], low, high, by_height=by_height)
+        corners = (low[0], high[0], low[1], high[1])
+        sheet.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
+
+
+def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
+    """(H, W, 4), clear where nothing is, the fuller the more points there are, colored as the highest of them."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgba
+
+    width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
+    edge_m = (high[0] - low[0]) / width
+    columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
+    points = points[np.argsort(points[:, 2])]
+    column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
+    colors = np.array([to_rgba(_POINTS)])
+    if by_height and np.ptp(points[:, 2]):
+        bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
+        colors = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
+    image = np.zeros((rows, columns, 4))
+    image[row, column] = colors
+    opacity = float(np.clip(_OPAQUE / len(points), *_OPACITIES))
+    counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    image[:, :, 3] = 1.0 - (1.0 - opacity) ** counts
+    return np.rint(255.0 * image).astype(np.uint8)
+
+
+def loops_picture(
+    name: str, course: Course, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
+) -> Markup:
+    """The way (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3) from place to place."""
+    with Sheet.of_plan(name, low, high) as sheet:
+        sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
+        for by, (_, color) in CLOSURES.items():
+            chosen = edges[rejected_by == by][:, :, :2]
+            gaps = np.full((len(chosen), 1, 2), np.nan)
+            lines = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2)
+            sheet.axes.plot(lines[:, 0], lines[:, 1], color=color, linewidth=0.9)
+        sheet.axes.plot(*course.positions[0, :2], marker="o", markersize=4, color=INK)
+        return sheet.svg()

@@ -1,0 +1,1 @@
+"""The rerun recording: entities, batches, sinks and the viewer."""

@@ -1,0 +1,251 @@
+"""The recording of a run: what every step says, to a file, to a viewer, or to both.
+
+Nothing that goes wrong here after the start ends a run; it is collected in ``Recording.warnings``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.error_utils import catch_and_log_exceptions
+
+from scanchain.config import RecordingConfig
+from scanchain.data import Closure, GraphState, Matrix, Step
+from scanchain.errors import InputError
+from scanchain.runs.recorder import SinkName
+from scanchain.runs.step_table import StepRow
+from scanchain.runs.verdicts import JudgedClosure
+from scanchain.viz.recording import entities, shapes, viewer
+from scanchain.viz.recording.batching import Batcher
+from scanchain.viz.recording.blueprint import blueprint
+from scanchain.viz.recording.keyframe_graph import KeyframeGraph
+from scanchain.viz.recording.messages import Message, Times
+from scanchain.viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
+
+
+class Recording:
+    """Takes in steps and results; a context that is entered before the first and left after the last.
+
+    path : the .rrd file; needed for the sink "save", ignored otherwise
+    name : what the viewer calls the recording
+    sinks : "save" to the file, "spawn" a viewer, "connect" to an open one, serve a "web" viewer on this machine;
+        none at all is a recording that goes nowhere
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        dimension: int,
+        name: str,
+        sinks: frozenset[SinkName],
+        config: RecordingConfig,
+        port: int = viewer.PORT,
+        web_port: int = viewer.WEB_PORT,
+    ) -> None:
+        if "save" in sinks and path is None:
+            raise InputError("no path for the recording: give --out, or leave save out of --rerun")
+        self.path = path
+        self.dimension = dimension
+        self.name = name
+        self.wanted = sinks
+        self.config = config
+        self.port = port
+        self.web_port = web_port
+        self.web_address = ""
+        self.sinks: list[Sink] = []
+        self.file: Sink | None = None
+        self.server: subprocess.Popen[bytes] | None = None
+        self.batcher = Batcher(dimension)
+        self.graph = KeyframeGraph()
+        self.now = Times.at(0, 0)
+        self.problems: list[str] = []
+
+    def __enter__(self) -> Recording:
+        recording_id = uuid4()
+        if "save" in self.wanted and self.path is not None:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.file = file_sink(self.path, stream, blueprint(self.dimension))
+            self.sinks.append(self.file)
+        address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
+        if address:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.sinks.append(viewer_sink(address, stream, blueprint(self.dimension)))
+        self._send(lambda: entities.constants(self.dimension))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What went wrong so far, a line each."""
+        return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
+
+    def go_on(
+        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+    ) -> None:
+        """Go on after the steps of ``rows``, with all closures tried by then and the graph as it was.
+
+        before : the recording up to there, which is copied; without one, the recording begins here
+        """
+        self.now = Times.at(rows[-1].index, rows[-1].stamp_ns)
+        self._guard(lambda: self.batcher.restore(rows, self.graph.restore(rows, closures, graph)))
+        if before is not None:
+            for sink in self.sinks:
+                sink.send(before)
+        for sink in self.sinks:
+            sink.settle()
+
+    def secure(self) -> int:
+        """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
+        self._send(self.batcher.messages)
+        if self.path is None or self.file is None or not self.file.settle():
+            return 0
+        return self.path.stat().st_size
+
+    def log(self, step: Step) -> None:
+        """Record one step; most of it is gathered and written in batches."""
+        if self.sinks:
+            self._send(lambda: self._step(step))
+
+    def log_trajectory(
+        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
+    ) -> None:
+        """Record the way after optimization: poses (N, d+1, d+1) of the scans ``indices``."""
+        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
+
+    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
+        """Record the final graph and the final verdict on every closure, at the last scan."""
+        self._send(lambda: self._settled(judged, graph))
+
+    def log_ground_truth(self, poses: Matrix) -> None:
+        """Record true poses (N, 4, 4), moved onto the optimized way."""
+        line = rr.LineStrips3D([shapes.positions(poses)], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
+        self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
+
+    def log_map(self, points: NDArray[np.floating]) -> None:
+        """Record the finished map (N, d); thinned to a third of the points that the scans took."""
+        self._send(lambda: self._map(points))
+
+    def log_grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
+    ) -> None:
+        """Record the finished occupancy grid of a 2D log.
+
+        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
+        origin_m : x, y of the outer corner of cells[0, 0]
+        """
+        self._send(lambda: self._grid(cells, resolution_m, origin_m))
+
+    def close(self) -> None:
+        """Write what is gathered, frame the view, and let go of file and viewer; once is enough."""
+        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(self.now)])
+        layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
+        for sink in self.sinks:
+            sink.send(layout)
+            sink.close()
+        self.problems, self.sinks = self.warnings, []
+        if self.server is not None:
+            viewer.stop(self.server)
+            self.server = None
+
+    def hold(self) -> None:
+        """Keep the web viewer served until it ends or the user interrupts."""
+        self._send(self.batcher.messages)
+        if self.server is not None:
+            try:
+                self.server.wait()
+            except KeyboardInterrupt:
+                return
+
+    def _viewer_address(self) -> str:
+        """Where a viewer takes data, or nothing and a warning."""
+        try:
+            if "web" in self.wanted:
+                self.server = viewer.start_web(self.port, self.web_port)
+                self.web_address = viewer.web_address(self.port, self.web_port)
+            elif "spawn" in self.wanted:
+                viewer.start_window(self.port)
+            elif not viewer.is_listening(self.port):
+                raise viewer.ViewerError(
+                    f"no viewer at {viewer.HOST}:{self.port}, the run goes on without it; open one with: rerun"
+                )
+        except (viewer.ViewerError, OSError) as error:
+            self.problems.append(str(error))
+            return ""
+        return viewer.grpc_address(self.port)
+
+    def _step(self, step: Step) -> list[Message]:
+        self.now = Times.at(step.scan.index, step.scan.stamp_ns)
+        self.batcher.add(step, self.graph.add(step))
+        messages = self.graph.draw(self.now) if self.graph.has_grown else []
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+            points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
+            columns = rr.Points3D.columns(positions=points).partition([len(points)])
+            messages.append(Message(entities.LOCAL_MAP, columns, self.now))
+        return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
+
+    def _settled(self, judged: Sequence[JudgedClosure], graph: GraphState) -> list[Message]:
+        verdicts = self.graph.settle(judged, graph)
+        messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
+        return [*messages, *self.graph.draw(self.now)]
+
+    def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
+        path = shapes.positions(poses)
+        line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(0.75)])
+        return [
+            Message(entities.OPTIMIZED, line),
+            Message(entities.OPTIMIZED_LIDAR, shapes.transforms(poses), times),
+        ]
+
+    def _map(self, points: NDArray[np.floating]) -> list[Message]:
+        limit = max(self.config.max_map_points, self.batcher.points // 3)
+        drawn = shapes.in_space(shapes.at_most(points, limit))
+        if not len(drawn):
+            return []
+        colors = entities.height_colors(drawn) if self.dimension == 3 else [entities.WHITE]
+        return [Message(entities.MAP, rr.Points3D(drawn, colors=colors, radii=[entities.pixels(1.0)]))]
+
+    def _grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
+    ) -> list[Message]:
+        """Rerun's first row is the top one, at the highest y."""
+        height, width = cells.shape
+        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)
+        grid = rr.GridMap(
+            data=pixels.tobytes(),
+            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+            cell_size=resolution_m,
+            translation=[*origin_m, -0.05],
+            colormap=rr.components.Colormap.RvizMap,
+        )
+        return [Message(entities.GRID, grid)]
+
+    def _send(self, say: Callable[[], list[Message]]) -> None:
+        """Send what ``say`` has to say to every sink."""
+        if not self.sinks:
+            return
+        messages: list[Message] = []
+        self._guard(lambda: messages.extend(say()))
+        for sink in self.sinks if messages else ():
+            sink.send(messages)
+
+    def _guard(self, act: Callable[[], object]) -> None:
+        """A recording that fails must not fail the run: say so, once for each kind of failure."""
+        try:
+            with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
+                act()
+        except Exception as error:
+            problem = f"the recording lacks something: {type(error).__name__}: {error}"
+            if problem not in self.problems:
+                self.problems.append(problem)

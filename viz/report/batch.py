@@ -1,0 +1,179 @@
+"""report.html of a batch: a row a log, the spread of the figures, every way in small."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from markupsafe import Markup
+
+from scanchain.batch.table import totals
+from scanchain.batch.task import Row, State, said_file
+from scanchain.runs.metrics import Metrics
+from scanchain.source import source_of, without_keys
+from scanchain.trajectory import read_tum
+from scanchain.viz.pictures.svg import Sheet
+from scanchain.viz.pictures.trajectories import color_of
+from scanchain.viz.report import page
+from scanchain.viz.report.page import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
+from scanchain.words import counted
+
+_MOST_WAYS = 60
+_MAX_POINTS = 1500  # of a line
+_BEYOND = 1.05  # of the greatest value, so that its mark is whole
+_MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
+_HEADS = (
+    Head("log"),
+    Head("scans"),
+    Head("degen.", "", "degenerate scans: a direction of motion that nothing determines"),
+    Head("lost", "", "scans that could not be matched"),
+    Head("warn.", "", "warnings of the run: what was lost, left out or is wrong"),
+    Head("way", "m"),
+    Head("loops", "", "loop closures accepted"),
+    Head("ATE", "m", "rmse against the ground truth in the log, after optimization"),
+    Head("KITTI", "%", "translational error of the KITTI metric"),
+    Head("inliers", "%", "median over the scans"),
+    Head("residual", "mm", "median over the scans"),
+    Head("speed", "× real time"),
+    Head("time", "s", "of the whole process"),
+    Head("memory", "MiB", "most that the process had"),
+)
+
+
+def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[str]) -> None:
+    """Draw and write the page; runs are looked up in the directory."""
+    done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
+    missing = len(rows) - len(done)
+    unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
+    page = Page(
+        title=f"Batch of {counted(len(rows), 'log')}",
+        subtitle="Each was run in a process of its own.",
+        facts=tuple(totals(rows)),
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
+        + tuple(unreliable),
+        notes=(),
+        sections=(_logs(directory, rows, names), *_spread(done), *_ways(directory, done, names)),
+        folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),
+    )
+    write_page(directory / REPORT_FILE, page)
+
+
+def names_of(logs: Sequence[str]) -> dict[str, str]:
+    """What each log is called: its file's name, with as many folders before it as tell it from the others."""
+    names = {log: source_of(log).name for log in logs}
+    for depth in range(2, max((len(Path(log).parts) for log in logs), default=0) + 1):
+        counts = Counter(names.values())
+        names = {
+            log: name if counts[name] == 1 else "/".join(Path(log).parts[-depth:]) for log, name in names.items()
+        }
+    return names
+
+
+def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Section:
+    legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
+    text = "A name leads to the report of its run, or to what was printed where there is none."
+    return Section(
+        "Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
+    )
+
+
+def _row(directory: Path, row: Row, name: str) -> page.Row:
+    """The figures of a log, or why it has none."""
+    m, link = row.metrics, _link(directory, row)
+    if m is None:
+        return page.Row(name, (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
+    truth = None if m.ground_truth is None else m.ground_truth.optimized
+    is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
+    cells = (
+        Cell(f"{m.scans:,}"),
+        Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
+        Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
+        Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
+        Cell(f"{m.traveled_m:,.1f}"),
+        Cell(f"{m.closures_accepted:,}"),
+        Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
+        Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
+        Cell(f"{100.0 * m.median_inlier_share:.0f}"),
+        Cell(_figure(m.median_residual_m, 1e3, 1)),
+        Cell(f"{m.times_real_time:.1f}"),
+        Cell(f"{row.duration_s:.1f}"),
+        Cell(f"{row.peak_mib:,.0f}"),
+    )
+    return page.Row(name, cells, link=link)
+
+
+def _link(directory: Path, row: Row) -> str:
+    """The run's report, else what the last try printed, from this page; empty where there is neither."""
+    for path in (Path(row.run) / REPORT_FILE if row.run else None, said_file(Path(), row.key)):
+        if path is not None and (directory / path).is_file():
+            return quote(path.as_posix())
+    return ""
+
+
+def _figure(value: float | None, scale: float, digits: int) -> str:
+    return "–" if value is None else f"{scale * value:.{digits}f}"
+
+
+def _paths(row: Row) -> str:
+    return f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}"
+
+
+def _spread(done: Sequence[Row]) -> Iterator[Section]:
+    """How the figures of the logs spread, where there are some to compare."""
+    drawn = (
+        ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimized.ate_rmse_m),
+        ("Speed", "× real time", lambda row, m: m.times_real_time),
+        ("Memory", "MiB", lambda row, m: row.peak_mib),
+    )
+    drawings = [
+        Drawing(title, "", _sorted_values(title, unit, values))
+        for title, unit, figure in drawn
+        if len(values := _values(done, figure)) > 1
+    ]
+    if drawings:
+        yield Section("Spread", "Every log's figure, the least first.", drawings=tuple(drawings), is_small=True)
+
+
+def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None]) -> list[float]:
+    found = (figure(row, row.metrics) for row in done if row.metrics is not None)
+    return sorted(value for value in found if value is not None)
+
+
+def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
+    with Sheet(name) as sheet:
+        share = 100.0 * (np.arange(len(values)) + 1) / len(values)
+        sheet.axes.step(values, share, where="post", color=color_of(0), marker="o", markersize=2.5)
+        sheet.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
+        sheet.axes.set_ylim(0.0, 105.0)
+        sheet.axes.set_xlabel(f"{name} [{unit}]")
+        sheet.axes.set_ylabel("logs at most so [%]")
+        sheet.axes.grid(visible=True)
+        return sheet.svg()
+
+
+def _ways(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
+    """Every way from above, as far as a page can hold them."""
+    drawings = [
+        Drawing(names[row.log], f"{row.run}", _way(row.key, directory / row.run / "trajectory.tum"))
+        for row in done[:_MOST_WAYS]
+    ]
+    text = f"The first {_MOST_WAYS} of {len(done):,}." if len(done) > _MOST_WAYS else ""
+    if drawings:
+        yield Section("Ways, optimized, seen from above", text, drawings=tuple(drawings), is_small=True)
+
+
+def _way(name: str, trajectory: Path) -> Markup:
+    positions = read_tum(trajectory).poses[:, :2, -1]
+    rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
+    with Sheet(name, height_inches=3.6) as sheet:
+        sheet.axes.plot(*positions[rows].T, color=color_of(0))
+        sheet.axes.plot(*positions[0], color=color_of(0), marker="o", markersize=4.0)
+        sheet.axes.set_aspect("equal", adjustable="datalim")
+        sheet.axes.set_xlabel("x [m]")
+        sheet.axes.set_ylabel("y [m]")
+        sheet.axes.grid(visible=True)
+        return sheet.svg()

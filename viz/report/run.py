@@ -1,0 +1,184 @@
+"""report.html of a run, made of what lies in its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from scanchain import lie
+from scanchain.data import Pose, Trajectory
+from scanchain.evaluation import absolute_error_on_any_course, pair
+from scanchain.evaluation.absolute import path_length
+from scanchain.maps import read_ply
+from scanchain.runs.consistency import nees_of_steps
+from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
+from scanchain.runs.metrics import Metrics
+from scanchain.runs.provenance import Provenance
+from scanchain.runs.step_table import STAGES
+from scanchain.settings import read_layer
+from scanchain.trajectory import read_tum
+from scanchain.viz.pictures.trajectories import Course, Floats, color_of
+from scanchain.viz.report.map_viewer import SCRIPT
+from scanchain.viz.report.page import REPORT_FILE, Fold, Page, Section, write_page
+from scanchain.viz.report.provenance import provenance_folds
+from scanchain.viz.report.run_tables import accuracy_section, stages_section
+from scanchain.viz.report.trajectory_section import Told, trajectory_section
+from scanchain.viz.report.trajectory_sections import (
+    error_section,
+    knowledge_section,
+    loop_section,
+    time_section,
+    way_section,
+)
+from scanchain.words import counted
+
+
+def write_run_report(directory: Path) -> None:
+    """Draw and write the page of a run directory."""
+    metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=Metrics)
+    made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
+    heading, *notes = _summary_lines(directory)
+    page = Page(
+        title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
+        subtitle=heading,
+        facts=tuple(_facts(metrics, made)),
+        warnings=tuple(line for line in (metrics.unreliable, made.stopped, *metrics.warnings) if line),
+        notes=tuple(notes),
+        sections=tuple(_sections(directory, metrics)),
+        folds=(
+            *provenance_folds(made, {}),
+            Fold("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
+        ),
+        script=SCRIPT,
+    )
+    write_page(directory / REPORT_FILE, page)
+
+
+def _summary_lines(directory: Path) -> list[str]:
+    """The summary's heading, then its notes."""
+    lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
+    heading, *lines = [line for line in lines if not line.startswith("UNRELIABLE")]
+    return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
+
+
+def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
+    """The result first, what it took last."""
+    yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
+    yield "accuracy", _accuracy(m)
+    yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
+    yield "state", f"{m.ok:,} ok, {m.degenerate:,} degenerate, {m.lost:,} lost"
+    yield "pose graph", m.fit
+    yield "loop closures", m.closures
+    yield (
+        "matching",
+        f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
+    )
+    yield "map", counted(m.map_points, "point")
+    yield "configuration", made.configuration
+    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time{m.compiling}"
+    yield "machine", f"{made.platform}, {made.cores} cores"
+
+
+def _accuracy(m: Metrics) -> str:
+    if m.ground_truth is None:
+        return "unknown: no ground truth"
+    error = m.ground_truth.optimized
+    share = "" if error.ate_share_of_path is None else f", {100.0 * error.ate_share_of_path:.3f} % of the path"
+    return f"ATE {error.ate_rmse_m:.4f} m{share}"
+
+
+def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
+    """Accuracy, trajectory and map, closures, errors, certainty; time last."""
+    steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
+    trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
+    truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
+    truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
+    gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
+    optimized, before = (_against(each, truth, gap_s) for each in (trajectory, odometry))
+    nees = None if truth is None else nees_of_steps(steps, odometry, truth, gap_s=gap_s)
+    T_world_truth = lie.inverse(optimized.T_truth_way)
+    courses = [
+        _course("optimized", 0, trajectory, lie.identity(3), optimized, steps, nees),
+        _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, None),
+    ]
+    if metrics.ground_truth is not None:
+        yield accuracy_section(metrics.ground_truth)
+    is_planar = metrics.dimension == 2
+    way = None if truth is None else lie.transform(T_world_truth, optimized.truth)
+    loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
+    grain_m = float(str(config["maps.voxel_size_m"]))
+    yield trajectory_section(courses[0], Told.read(steps, loops_file), way, points, grain_m)
+    if config["loops.enabled"]:
+        yield from loop_section(courses[0], loops_file, "Loop closures")
+    text = (
+        "Odometry and truth are moved onto the optimized trajectory as for the ATE." if truth is not None else ""
+    )
+    yield way_section(courses, courses, way, is_planar=is_planar, text=text)
+    if metrics.ground_truth is not None:
+        yield from error_section(courses, metrics.ground_truth.source)
+    yield from knowledge_section(courses[:1], is_planar=is_planar)
+    yield stages_section(metrics)
+    yield from time_section(courses[:1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Off:
+    """A way against the truth: how it was moved onto it, and (N,) meters off, NaN where nothing is known.
+
+    ``truth`` : (K, 3) true positions at the scans that have one; more would lengthen the path by their noise
+    """
+
+    T_truth_way: Pose
+    errors_m: Floats
+    truth: Floats
+
+
+def _against(trajectory: Trajectory, truth: Trajectory | None, gap_s: float | None) -> _Off:
+    errors_m = np.full(len(trajectory), np.nan)
+    if truth is None:
+        return _Off(np.eye(4), errors_m, np.empty((0, 3)))
+    pairs = pair(trajectory, truth, gap_s=gap_s)
+    ate = absolute_error_on_any_course(pairs)
+    errors_m[pairs.places] = ate.errors_m
+    return _Off(ate.T_reference_estimate, errors_m, pairs.reference[:, :3, 3])
+
+
+def _course(
+    name: str, place: int, trajectory: Trajectory, T_world_way: Pose, off: _Off, steps: pa.Table | None,
+    nees: Floats | None,
+) -> Course:  # fmt: skip
+    """One of the two ways in the frame of the map; what is known of the scans belongs to the first."""
+    unknown = np.full(len(trajectory), np.nan)
+    poses = T_world_way @ trajectory.poses
+    return Course(
+        name=name,
+        color=color_of(place),
+        is_dashed=False,
+        positions=poses[:, :3, 3],
+        distance_m=path_length(poses),
+        error_m=off.errors_m,
+        relation_error_m=np.empty(0),
+        seconds=unknown if steps is None else _seconds(steps),
+        nees=unknown if nees is None else nees,
+        observability=unknown if steps is None else steps["observability"].to_numpy(),
+    )
+
+
+def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
+    """The poses of columns whose names begin so."""
+    columns = [steps[f"{prefix}{name}"].to_numpy() for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    poses = np.tile(np.eye(4), (len(steps), 1, 1))
+    poses[:, :3, :3] = lie.from_quaternion(np.stack(columns[3:], axis=1))
+    poses[:, :3, 3] = np.stack(columns[:3], axis=1)
+    return Trajectory(steps["stamp_ns"].to_numpy(), poses)
+
+
+def _seconds(steps: pa.Table) -> Floats:
+    """All stages but reading."""
+    return np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)

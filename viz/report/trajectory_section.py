@@ -1,0 +1,124 @@
+"""Trajectory and map in a run's report: states of the scans, closures by verdict, truth; flat and in space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from scanchain.data import Points, State
+from scanchain.runs.verdicts import BACK_END
+from scanchain.viz.pictures import trajectory_figures as figures
+from scanchain.viz.pictures.map_figures import map_picture, path_over_map, surroundings
+from scanchain.viz.pictures.trajectories import CLOSURES, TRUTH, Course, Floats, PathLine
+from scanchain.viz.report.map_viewer import map_scene
+from scanchain.viz.report.page import Chip, Drawing, Section
+from scanchain.words import counted
+
+_CONTRADICTED = "contradicted"
+_COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6"}
+_MAX_PIECES = 3000  # of a path; of longer ones the worst state of successive scans
+_MAX_CLOSURES = 1500  # of a verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a run's tables say of its path: a row a scan, a row a closure tried (None without loop closing)."""
+
+    steps: pa.Table
+    closures: pa.Table | None
+
+    @classmethod
+    def read(cls, steps: pa.Table, closures_file: Path) -> Told:
+        """With the closures, where their file is."""
+        return cls(steps, pq.ParquetFile(closures_file).read() if closures_file.exists() else None)
+
+
+def trajectory_section(
+    course: Course, told: Told, truth: Floats | None, points: Points, grain_m: float
+) -> Section:
+    """The optimized path and the map (M, 3), in one frame; ``truth`` (K, 3) likewise, None where there is none.
+
+    grain_m : of the map
+    """
+    is_flat = not np.ptp(points[:, 2]) if len(points) else True
+    lines, chips = zip(*_lines(course.positions, told, truth), strict=True)
+    low, high = surroundings(*figures.frame([course], truth), [points])
+    drag = "Drag to move" if is_flat else "Drag to turn, Shift-drag to move"
+    above = "seen from above; dark is low, bright is high."
+    over_map = path_over_map("path", points, course.positions, lines, low, high)
+    drawings = (
+        Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
+        *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture("map", points, low, high)),)),
+        Drawing(
+            "Map to be explored",
+            f"{drag}, click it and scroll to zoom, double-click to begin anew; two fingers zoom and move.",
+            map_scene(points, lines, low, high, grain_m=grain_m, is_flat=is_flat),
+            is_wide=not is_flat,
+        ),
+    )
+    joined = "Contradicted: scans joined by closures that the back end rejected because the rest contradicts them."
+    text = joined if any(chip.name.startswith(_CONTRADICTED) for chip in chips) else ""
+    return Section("Trajectory and map", text, chips, drawings)
+
+
+def _lines(path: Floats, told: Told, truth: Floats | None) -> Iterator[tuple[PathLine, Chip]]:
+    """What is drawn and how it is called, the path first; of what there is none there is no line."""
+    yield PathLine(path, "#2f7de1", 1.2), Chip("trajectory", "#2f7de1")
+    yield from _closure_lines(path, told.closures)
+    marks = _states(told)
+    for state, color in _COLORS.items():
+        count = int((marks == list(_COLORS).index(state)).sum())
+        if count:
+            line = PathLine(_stretches(path, marks, list(_COLORS).index(state)), color, 2.6)
+            yield line, Chip(f"{state}: {counted(count, 'scan')}", color)
+    if truth is not None:
+        yield PathLine(truth, TRUTH, 0.9, is_dashed=True), Chip("ground truth", TRUTH, is_dashed=True)
+
+
+def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[PathLine, Chip]]:
+    if closures is None or not closures.num_rows:
+        return
+    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
+    rejected_by = np.array(closures["rejected_by"].to_pylist())
+    for by, (name, color) in CLOSURES.items():
+        chosen = rejected_by == by
+        count = int(chosen.sum())
+        if count:
+            pairs = path[ends[chosen][:: max(1, -(-count // _MAX_CLOSURES))]]
+            gaps = np.full((len(pairs), 1, 3), np.nan)
+            line = np.concatenate([pairs, gaps], axis=1).reshape(-1, 3)
+            yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
+
+
+def _states(told: Told) -> NDArray[np.int64]:
+    """(N,) of every scan its place in ``_COLORS``, −1 where nothing is wrong."""
+    names = list(_COLORS)
+    states = told.steps["state"].to_pylist()
+    marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
+    if told.closures is None or not told.closures.num_rows:
+        return marks
+    keyframes = np.append(np.flatnonzero(told.steps["keyframe"].to_numpy() >= 0), len(marks))
+    chosen = told.closures.filter(pc.field("rejected_by") == BACK_END)
+    for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
+        end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
+        stretch = marks[scan:end]
+        stretch[stretch < 0] = names.index(_CONTRADICTED)
+    return marks
+
+
+def _stretches(path: Floats, marks: NDArray[np.int64], mark: int) -> Floats:
+    """The parts of the path that lead to a scan of this mark, NaN elsewhere."""
+    size = max(1, -(-len(path) // _MAX_PIECES))
+    groups = [slice(k, k + size) for k in range(0, len(path), size)]
+    is_marked = np.array([bool((marks[group] == mark).any()) for group in groups])
+    positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
+    shown = is_marked | np.append(is_marked[1:], False)
+    positions[~shown] = np.nan
+    return positions

@@ -1,0 +1,188 @@
+"""The parts of a report that speak of courses; those of which nothing is known are left out."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from scanchain.viz.pictures import trajectory_figures as figures
+from scanchain.viz.pictures.map_figures import loops_picture
+from scanchain.viz.pictures.trajectories import CLOSURES, TRUTH, Course, Floats
+from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
+
+_TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
+_MEDIANS = "Of long logs, medians of neighboring scans."
+_FIGURES = re.compile(
+    r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
+)  # of one closure; limits stand behind them
+
+
+def chip(course: Course) -> Chip:
+    """The course in a legend."""
+    return Chip(course.name, course.color, course.is_dashed)
+
+
+def _legend(courses: Sequence[Course]) -> tuple[Chip, ...]:
+    """Of several courses; one needs none."""
+    return tuple(chip(course) for course in courses) if len(courses) > 1 else ()
+
+
+def way_section(
+    courses: Sequence[Course], framing: Sequence[Course], truth: Floats | None, *, is_planar: bool, text: str
+) -> Section:
+    """Where they went; ``framing`` are those that must be seen whole."""
+    corners = figures.frame(framing, truth)
+    drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", courses, truth, *corners))]
+    if not is_planar:
+        height = figures.height("height", courses, truth, *corners)
+        drawings.append(Drawing("Height", "Over the distance traveled.", height))
+    chips = _legend(courses) if truth is None else (*map(chip, courses), _TRUTH_CHIP)
+    return Section("Trajectories", text, chips, tuple(drawings))
+
+
+def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Section]:
+    """How far off they were."""
+    known = _with(courses, "error_m")
+    if not known:
+        return
+    yield Section(
+        "Error",
+        f"Distance of each pose from the true one after rigid alignment, against {truth_name}.",
+        _legend(known),
+        (
+            Drawing("Over the distance", _MEDIANS, figures.error_over_distance("error", known)),
+            Drawing(
+                "Distribution",
+                "Share of the scans that are off by less.",
+                figures.distribution("errors", known, "error_m", 1.0, "position error [m]"),
+            ),
+        ),
+    )
+
+
+def relation_section(courses: Sequence[Course]) -> Iterator[Section]:
+    """How far off they were over relations set by hand."""
+    known = _with(courses, "relation_error_m")
+    if known:
+        drawing = Drawing(
+            "Distribution",
+            "Share of the relations that are off by less.",
+            figures.distribution("relations", known, "relation_error_m", 1.0, "error of a relation [m]"),
+        )
+        text = "Distance between the motion of a relation and that of the trajectory."
+        yield Section("Error over relations", text, _legend(known), (drawing,))
+
+
+def time_section(courses: Sequence[Course]) -> Iterator[Section]:
+    """How long a scan took."""
+    known = _with(courses, "seconds")
+    if known:
+        yield Section(
+            "Time per scan",
+            "",
+            _legend(known),
+            (
+                Drawing("Along the log", _MEDIANS, figures.time_per_scan("time", known)),
+                Drawing(
+                    "Distribution",
+                    "Share of the scans that took less.",
+                    figures.distribution("times", known, "seconds", 1e3, "time of a scan [ms]"),
+                ),
+            ),
+        )
+
+
+def knowledge_section(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Section]:
+    """What they knew of themselves: covariances against errors, and directions that nothing determined."""
+    told = _with(courses, "observability")
+    if not told:
+        return
+    along = Drawing(
+        "Observability along the way",
+        "How many times the least that it takes is known of the worst direction, worst of neighboring scans. "
+        "Below the dotted line a scan is called degenerate.",
+        figures.observability("observability", told),
+    )
+    whose = f" of {told[0].name}" if len(told) > 1 else ""
+    where = Drawing(
+        "Where little was seen",
+        f"The same on the way{whose}.",
+        figures.observability_plan("blind", told[0]),
+    )
+    drawings = (*_consistency(courses, is_planar=is_planar), along, where)
+    yield Section("Certainty", "", _legend(told), drawings)
+
+
+def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Drawing]:
+    judged = _with(courses, "nees")
+    if judged:
+        yield Drawing(
+            "Covariance consistency",
+            "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
+            "they are too large, to the right too small.",
+            figures.consistency("nees", judged, 3 if is_planar else 6),
+        )
+
+
+def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
+    """Every loop closure tried, and how many of them met which verdict."""
+    if not path.exists():
+        return
+    table = pq.ParquetFile(path).read()  # read_table imports much more
+    if not table.num_rows:
+        yield Section(title, "None was tried: the way came back to no place that it had left.")
+        return
+    ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
+    rejected_by = np.array(table["rejected_by"].to_pylist())
+    counts = Counter(rejected_by.tolist())
+    low, high = figures.frame([course], None)
+    picture = loops_picture(f"loops {course.name}", course, course.positions[ends], rejected_by, low, high)
+    yield Section(
+        title,
+        f"{len(ends):,} tried; each is a row of loops.parquet.",
+        tuple(Chip(f"{name}: {counts[by]:,}", color) for by, (name, color) in CLOSURES.items()),
+        (Drawing("On the way", "", picture),),
+        _verdict_grid(table),
+    )
+
+
+def _verdict_grid(closures: pa.Table) -> Grid:
+    """Closures by verdict and reason, the figures of each left out of it, most frequent first."""
+    groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+    for place, (by, reason) in enumerate(
+        zip(*(closures[key].to_pylist() for key in ("rejected_by", "reason")), strict=True)
+    ):
+        groups[CLOSURES[by][0], _FIGURES.sub("", reason, count=1)].append(place)
+    overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
+    heads = (
+        Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
+        Head("reason", is_text=True),
+    )  # fmt: skip
+    rows = tuple(
+        Row(
+            verdict,
+            (
+                Cell(f"{len(places):,}"),
+                Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
+                Cell(_millimeters(float(np.median(residual_m[places])))),
+                Cell(reason, is_wide=True),
+            ),
+        )
+        for (verdict, reason), places in sorted(groups.items(), key=lambda group: -len(group[1]))
+    )
+    return Grid(heads, rows)
+
+
+def _millimeters(value_m: float) -> str:
+    """– for what no point has."""
+    return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
+
+
+def _with(courses: Sequence[Course], key: str) -> list[Course]:
+    return [course for course in courses if np.isfinite(getattr(course, key)).any()]
