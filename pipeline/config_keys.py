@@ -21,6 +21,7 @@ _UNITS = {  # by the ending of a name; the first that fits
     "_voxels": "voxels", "_keyframes": "keyframes",
 }  # fmt: skip
 _YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+_UNLIMITED = ("log.end_s", "log.max_range_m", "preprocess.max_range_m", "local_map.max_distance_m")  # take inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,8 @@ class ConfigKey:
         if parsed is None:
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
-            raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{unit}")
+            finite = " and finite" if text.lstrip("+").lower() == "inf" or value == math.inf else ""
+            raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{finite}{unit}")
         return parsed
 
     def parse(self, text: str, source: str) -> Value:
@@ -101,6 +103,11 @@ class ConfigKey:
             return value if isinstance(value, bool) else None
         return value if isinstance(value, str) and (self.kind == "str" or value in self.choices) else None
 
+    @property
+    def _may_be_infinite(self) -> bool:
+        """Whether +∞ means that there is no limit."""
+        return self.name in _UNLIMITED
+
     def _number(self, value: object) -> Value | None:
         """The number if it is one and lies within the limits; −∞ and NaN never do, +∞ where it means no limit."""
         if isinstance(value, bool) or not isinstance(value, Real):
@@ -110,7 +117,7 @@ class ConfigKey:
         except OverflowError:  # an int of hundreds of digits
             return None
         above = number >= self.low if self.low_is_allowed else number > self.low
-        if not above or number > self.high or number == -math.inf:
+        if not above or number > self.high or (math.isinf(number) and not self._may_be_infinite):
             return None
         return number if self.kind == "float" else int(number) if number.is_integer() else None
 

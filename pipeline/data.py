@@ -174,9 +174,14 @@ class Match:
         return self.inliers / max(self.points, 1)
 
     @property
+    def is_contradicted(self) -> bool:
+        """Whether the correspondences contradict the pose along a direction that they determine."""
+        return self.fit < LEAST_FIT
+
+    @property
     def is_fit(self) -> bool:
         """Whether the pose is a minimum that the correspondences agree with, in every direction or not."""
-        return self.at_minimum and self.fit >= LEAST_FIT
+        return self.at_minimum and not self.is_contradicted
 
 
 @dataclass(frozen=True, slots=True)

@@ -193,6 +193,7 @@ def test_a_key_like_none_there_is_points_to_the_list(key):
         ("log.every", "0", "a whole number >= 1"),
         ("log.every", "1.5", "a whole number >= 1"),
         ("log.every", "inf", "a whole number >= 1"),
+        ("local_map.voxel_size_m", "inf", "a number > 0 and finite, in m"),
         ("log.start_s", "-0.1", "a number >= 0, in s"),
         ("maps.slice_min_z_m", "-inf", "a number, in m"),
     ],

@@ -145,7 +145,7 @@ def _against(
         "kitti": partial(kitti_error_on_any_course, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))
-    results = Results({"ate": ate}, {}, pairs.description, pairs.warnings)
+    results = Results({"ate": ate}, {}, pairs.description, [*filter(None, [ate.complaint]), *pairs.warnings])
     for name, metric in metrics.items():
         try:
             results.found[name] = metric()

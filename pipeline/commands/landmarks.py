@@ -136,6 +136,8 @@ def landmarks(
     click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
+    if not all(study.converged for study in studies):
+        ctx.exit(1)
 
 
 _OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.figures import Figures
 from scanchain.comparison.outcome import STEPS_FILE, Outcome
-from scanchain.data import Matrix, Pose, State, Trajectory
+from scanchain.data import LEAST_FIT, Matrix, Pose, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     RelationError,
@@ -97,8 +97,11 @@ def doubt(outcome: Outcome) -> str:
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return ""
-    table = pq.read_table(path, columns=["state", "scan_points"])
-    return unreliable(Counter(map(State, table["state"].to_pylist())), table["scan_points"].to_pylist())
+    table = pq.read_table(path, columns=["state", "scan_points", "fit"])
+    states = [State(name) for name in table["state"].to_pylist()]
+    fits = table["fit"].to_pylist()
+    contradicted = sum(state is State.OK and fit < LEAST_FIT for state, fit in zip(states, fits, strict=True))
+    return unreliable(Counter(states), contradicted, table["scan_points"].to_pylist())
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

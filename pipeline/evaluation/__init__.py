@@ -4,6 +4,7 @@ from scanchain.evaluation.absolute import (
     AbsoluteError,
     absolute_error,
     absolute_error_on_any_course,
+    far_off,
     on_the_estimate,
 )
 from scanchain.evaluation.alignment import Alignment, align
@@ -56,6 +57,7 @@ __all__ = [
     "check_overlap",
     "disagreement",
     "during",
+    "far_off",
     "kitti_error",
     "kitti_error_on_any_course",
     "motion_nees",

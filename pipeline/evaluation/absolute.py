@@ -14,7 +14,19 @@ from scanchain.evaluation.alignment import Alignment, align
 from scanchain.evaluation.pairing import Pairs, pair
 from scanchain.evaluation.statistics import Statistics
 
+_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth
 _SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+
+
+def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str:
+    """That an ATE is too large for odometry that works, in words; empty where it is not."""
+    if share is None or share <= _FAR_OFF_SHARE or ate_rmse_m <= _FAR_OFF_M:
+        return ""
+    return (
+        f"far from the ground truth: ATE {ate_rmse_m:.2f} m, {100.0 * share:.1f} % of a path of "
+        f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, or the truth "
+        "is in another unit, keeps another clock or follows another body"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +58,11 @@ class AbsoluteError:
     def share_of_path(self) -> float | None:
         """Root mean squared translational error over the length of the path; None where that is too short."""
         return self.translation_m.rmse / self.path_length_m if self.path_length_m >= _SHORTEST_PATH_M else None
+
+    @property
+    def complaint(self) -> str:
+        """That the estimate is far from the reference, in words; empty where it is not."""
+        return far_off(self.translation_m.rmse, self.share_of_path, self.path_length_m)
 
     @property
     def summary(self) -> str:

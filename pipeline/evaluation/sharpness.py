@@ -28,6 +28,7 @@ RADIUS_M = {2: 0.2, 3: 0.5}
 REACH_M = 40.0  # points further off are too sparse to judge by
 MIN_NEIGHBORS = 10
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000
+_AT_ONCE = 64  # queries whose neighbors are held in memory
 _HELD = 0.5  # share of the query points of the best map, below which a map has fallen apart
 
 
@@ -97,9 +98,11 @@ def _eigenvalues(points: Points) -> NDArray[np.float64]:
     """(Q, d) ascending, m², of the covariance around every query point; NaN where there are too few neighbors."""
     d = points.shape[1]
     queries = points[:: max(1, len(points) // MAX_QUERIES)]
-    neighbors = KDTree(points).query_ball_point(queries, RADIUS_M[d], return_sorted=False)
+    tree = KDTree(points)
     result = np.full((len(queries), d), np.nan)
-    for row, chosen in enumerate(neighbors):
-        if len(chosen) >= MIN_NEIGHBORS:
-            result[row] = np.linalg.eigvalsh(np.cov(points[chosen].T))
+    for begin in range(0, len(queries), _AT_ONCE):  # all neighbors of all queries take gigabytes
+        some = queries[begin : begin + _AT_ONCE]
+        for row, chosen in enumerate(tree.query_ball_point(some, RADIUS_M[d], return_sorted=False), begin):
+            if len(chosen) >= MIN_NEIGHBORS:
+                result[row] = np.linalg.eigvalsh(np.cov(points[chosen].T))
     return result

@@ -45,7 +45,8 @@ def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
         try:
             data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file, raw))
         except (CloudFileError, OSError) as error:
-            return Contents([], f"{file}: {error}; it was left out")
+            unreadable = Message(channel, stamp_ns, memoryview(b""))  # counts among the scans, as a malformed one
+            return Contents([unreadable], f"{file}: {error}; it was left out")
         return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
     index.make = make
