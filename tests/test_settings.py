@@ -1,9 +1,11 @@
 """The effective configuration: what wins over what, and what a wrong key or value is told."""
 
+import re
 import tomllib
 
 import msgspec
 import pytest
+from msgspec.structs import fields
 from scenes import ROOT, configured
 
 from scanchain.config import Config
@@ -304,6 +306,14 @@ def test_every_default_and_every_preset_lies_within_its_own_range():
     for dimension in (2, 3):
         for name, value in flatten(load_settings(dimension).config).items():
             assert config_keys()[name].check(value, name) == value
+
+
+def test_every_key_has_a_description_and_every_description_a_key():
+    for name, key in config_keys().items():
+        assert len(key.description) > 15, name
+    for section in fields(Config):
+        described = re.findall(r"^ {4}(\w+) : ", section.type.__doc__, re.MULTILINE)
+        assert described == [field.name for field in fields(section.type)]
 
 
 @pytest.mark.parametrize(
