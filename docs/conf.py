@@ -25,3 +25,5 @@ python_maximum_signature_line_length = 100
 html_theme = "furo"
 html_title = f"scanchain {version}"
 html_copy_source = False
+html_static_path = ["style.css"]
+html_css_files = ["style.css"]
