@@ -118,6 +118,10 @@ def test_flags_beat_the_file_and_the_preset_and_are_told(tmp_path):
     )
 
 
+def test_booleans_are_told_as_a_file_holds_them():
+    says(load_settings(2, overrides=[flag("loops.refine", "off")]).source, "loops.refine false")
+
+
 def test_of_two_flags_for_one_key_the_later_wins():
     settings = load_settings(2, overrides=[flag("log.every", "2"), flag("log.every", "5")])
     assert settings.config.log.every == 5
