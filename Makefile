@@ -4,13 +4,15 @@ SHELL := /bin/bash
 BIN := .venv/bin
 RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
+DOCS := .venv/docs-installed
 
-.PHONY: help demo test lint clean
+.PHONY: help demo test lint docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, print their accuracy (about two minutes once installed)"
 	@echo "make test   run the whole test suite"
 	@echo "make lint   format, lint, type and import checks"
+	@echo "make docs   build the documentation into build/docs; warnings are errors"
 	@echo "make clean  remove the environment, logs and runs of the demo"
 
 demo: $(RUNTIME)
@@ -33,6 +35,10 @@ lint: $(DEV)
 	$(BIN)/basedpyright | sed 's|[^ ]*build/lint/scanchain/viz|viz|; s|[^ ]*build/lint/scanchain|pipeline|'
 	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 
+docs: $(DOCS)
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
+	@echo "Open build/docs/index.html"
+
 $(RUNTIME): pyproject.toml setup.py
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12')"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -41,6 +47,10 @@ $(RUNTIME): pyproject.toml setup.py
 
 $(DEV): pyproject.toml setup.py $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+$(DOCS): pyproject.toml setup.py $(RUNTIME)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 clean:

@@ -1,4 +1,7 @@
-"""The configuration: frozen structs; units in the keys, ranges in the types, unknown keys refused."""
+"""The configuration: frozen structs; units in the keys, ranges in the types, unknown keys refused.
+
+``scanchain config show`` and the reference show the line that the docstring of a section has for each of its keys.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +34,24 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What is read from the log. Empty topics are found automatically.
+    """What is read from the log.
 
-    Scans that are malformed or have no valid point are left out, counted and reported; a run stops when they are
-    more than ``max_bad_scans_percent`` of all, rounded up: 0 allows none, anything above at least one.
-    ``rate_hz`` is how often the scans of a folder come whose files are not named by their stamps.
-    ``point_times`` is the unit of the per-point times, or the sense in which a lidar without any spins; it takes
-    ``revolution_s`` for a turn that begins, at the stamp, at the azimuth ``revolution_start_rad`` (π is the rear).
+    topic : lidar topic; found automatically where empty
+    odometry_topic : wheel odometry, ``nav_msgs/Odometry`` or stamped poses; found automatically where empty
+    ground_truth_topic : true poses, used for evaluation only
+    start_s : what comes before is left out, counted from the first message
+    end_s : what comes after is left out
+    every : every N-th scan is taken
+    rate_hz : scan rate of a folder of clouds whose files are not named by their stamps; 0 where they are
+    max_bad_scans_percent : share of scans that may be malformed or empty, rounded up; such scans are left out
+        and counted, and a run stops when there are more
+    min_range_m : returns nearer than this are dropped by the reader and counted
+    max_range_m : returns farther than this are dropped by the reader and counted
+    point_times : unit of the per-point times, or sense of rotation of a spinning lidar without any, whose
+        points are timed by azimuth
+    revolution_s : duration of a revolution, for points timed by azimuth
+    revolution_start_rad : azimuth at which a revolution begins, at the stamp; π is the rear
+    prefetch_chunks : chunks of an MCAP file decompressed ahead of use
     """
 
     topic: str = ""
@@ -57,11 +71,18 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What is done to a scan before it is matched: cropped, thinned out, freed of the lidar's own motion.
+    """How a scan is prepared for matching: cropped, downsampled, deskewed.
 
-    Voxels are as large as said where the place is wide, and down to ``min_scale`` times that where it is narrow:
-    the median range spans about ``range_voxels`` voxels of the local map, or more. Those of matching shrink
-    further, to those of the map at the least, until about ``match_points`` are matched.
+    min_range_m : returns nearer than this are not used
+    max_range_m : returns farther than this are not used
+    deskew : whether the motion of the lidar during a scan is removed, where its points have times
+    map_voxel_m : voxel size to which scans are downsampled before they are inserted into the local map
+    match_voxel_m : largest voxel size to which scans are downsampled before they are matched
+    match_points : number of points to match; the voxels of matching shrink, down to those of the map, until
+        about that many remain
+    range_voxels : voxels of the local map that the median range of a scan spans, at the least; all voxels
+        shrink where the surroundings are narrow
+    min_scale : smallest factor by which voxels shrink in narrow surroundings; 1 keeps their size fixed
     """
 
     min_range_m: NonNegative = 0.5
@@ -75,7 +96,17 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """The map that scans are matched against."""
+    """The voxel map that scans are matched against.
+
+    voxel_size_m : edge length of its voxels
+    max_distance_m : voxels farther than this from the lidar are removed
+    max_insertions : voxels that none of this many last insertions has touched are removed
+    insert_distance_m : a scan is inserted once the lidar has moved this far since the last insertion; 0
+        inserts every scan
+    insert_angle_rad : a scan is inserted once the lidar has turned this far; 0 inserts every scan
+    min_points_alone : points from which on the surface of a voxel is fitted without the points of its
+        neighbors
+    """
 
     voxel_size_m: Positive = 1.0
     max_distance_m: Positive = 100.0
@@ -86,11 +117,26 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How a scan is aligned; the first scans, and those after a loss, search wide.
+    """How a scan is aligned; the first scans, and those after a loss, are searched with the ``wide_`` limits.
 
-    A scan is degenerate where a direction has less than ``min_information``, a share of what all points together
-    could tell of it, or where, in 3D, the points tell less than ``min_signal`` times what the errors of the map's
-    normals alone would feign.
+    matcher : ``plicp``: point-to-plane or point-to-line by Levenberg-Marquardt; ``svd``: point-to-point in
+        closed form
+    optimizer : method of the nonlinear least squares of ``plicp``
+    max_iterations : limit of the iterations of one alignment
+    reach_voxels : neighboring voxels searched for a correspondence, in each direction
+    max_distance_m : largest distance of a correspondence; it shrinks with the voxels
+    kernel_scale_m : scale of the Geman-McClure kernel on the residuals
+    wide_reach_voxels : ``reach_voxels`` of a wide search
+    wide_max_distance_m : ``max_distance_m`` of a wide search
+    wide_kernel_scale_m : scale at which the kernel of a wide search begins, before it narrows to
+        ``kernel_scale_m``
+    tolerance_m : translation of a step below which an alignment has converged
+    tolerance_rad : rotation of a step below which an alignment has converged
+    sensor_noise_m : standard deviation of a range, which scales information and covariance
+    min_inlier_share : share of the points with a correspondence below which a scan is lost
+    min_information : information per inlier, 0 to 1, below which a direction is degenerate
+    min_signal : signal-to-noise ratio of the information below which a direction of a 3D scan is degenerate,
+        noise being what errors of the map's normals alone would induce
     """
 
     matcher: Literal["plicp", "svd"] = "plicp"
@@ -111,11 +157,22 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How the motion is predicted, how far off the prediction may be, and when a keyframe is made.
+    """How motion is predicted, how wide a failed match is searched for, and when a keyframe is made.
 
-    ``wheel_sigma`` and ``velocity_sigma`` are standard deviations of a prediction at the worst; how good it is as
-    a rule is learned while running. ``max_speed`` and ``max_turn`` are how far a planar scan that fits badly is
-    looked for, per second since the last one.
+    prior : motion prediction: by wheel odometry, at constant velocity, or by the wheels where the log has them
+    wheel_sigma_m : largest standard deviation of a translation predicted by the wheels; the usual one is
+        estimated while running
+    wheel_sigma_rad : the same of a rotation
+    velocity_sigma_m : largest standard deviation of a translation predicted at constant velocity; the usual
+        one is estimated while running
+    velocity_sigma_rad : the same of a rotation
+    max_speed_m_s : speed of the robot, which limits how far a planar scan that matched badly is searched for,
+        and any scan after a gap
+    max_turn_rad_s : turn rate of the robot, which limits that search in the plane
+    keyframe_distance_m : a keyframe is made once the lidar has moved this far since the last one
+    keyframe_angle_rad : a keyframe is made once the lidar has turned this far
+    edge_sigma_m : translational standard deviation added to that of an odometry edge of the pose graph
+    edge_sigma_rad : rotational standard deviation added to that of an odometry edge
     """
 
     prior: Literal["auto", "wheel", "constant-velocity"] = "auto"
@@ -134,16 +191,28 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
 class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """How revisits are found and verified.
 
-    The search radius is what odometry may have drifted since the place was seen, ``drift`` meters a meter, at
-    least ``min_radius_m`` and at most ``max_radius_m``.
-
-    In 3D, places are also recognized by their looks from above, as far as ``place_radius_m`` around where voxels
-    have their full size, wherever odometry has them within ``place_drift`` meters a meter. They look alike from
-    ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
-    ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
-    direction by ``min_place_information``.
-
-    In the plane ``refine`` aligns every scan once more, at the end, to the map of all keyframes.
+    enabled : whether loops are closed
+    drift : drift of the odometry in meters a meter, which sets the search radius along the shortest path of
+        the graph
+    min_radius_m : smallest search radius
+    max_radius_m : largest search radius, and largest correction by one closure
+    min_travel_m : path length between two keyframes from which on they may close a loop
+    submap_keyframes : keyframes before and after its center that make up a submap, which scans are matched to
+    min_overlap : share of the points on surfaces of the submap from which on a closure is accepted
+    min_information : information per inlier of the worst direction from which on a closure is accepted
+    edge_sigma_m : translational standard deviation added to that of a loop edge
+    edge_sigma_rad : rotational standard deviation added to that of a loop edge
+    optimize_every : keyframes between two optimizations of the graph, at the least
+    recognize_places : whether revisits are also found by place recognition, from descriptors of submaps seen
+        from above
+    place_radius_m : radius of a descriptor; it shrinks with the voxels
+    place_drift : drift in meters a meter within which recognized places are accepted
+    min_likeness : descriptor similarity from which on a place is verified by matching
+    min_place_overlap : ``min_overlap`` of a recognized place
+    min_place_information : ``min_information`` of a recognized place
+    min_agreement : agreement about free space from which on a recognized place is accepted, relative to that
+        of each submap with itself
+    refine : whether at the end every planar scan is aligned once more, to the map of all keyframes
     """
 
     enabled: bool = True
@@ -168,7 +237,14 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How the pose graph is optimized."""
+    """How the pose graph is optimized.
+
+    optimizer : method of the nonlinear least squares
+    max_iterations : limit of the iterations
+    tolerance : relative change of χ², step length, and relative gradient below which it has converged
+    robust : loss of loop edges; ``truncated`` also gives each of them a verdict, by graduated non-convexity
+    robust_scale : normalized error from which on the loss gives way, in standard deviations
+    """
 
     optimizer: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "newton", "gradient-descent"] = (
         "levenberg-marquardt"
@@ -182,8 +258,14 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
 class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """The maps that are written at the end.
 
-    Without what ``remove_moving`` finds to have moved, the cloud has one point a voxel; it is written as PLY, and
-    as PCD and LAZ where asked for.
+    voxel_size_m : edge length of the voxels of the point cloud, which has one point in each
+    remove_moving : whether points are left out that other scans looked through
+    write_pcd : whether the point cloud is also written as ``map.pcd``
+    write_laz : whether the point cloud is also written as ``map.laz``
+    grid_resolution_m : edge length of a cell of the occupancy grid
+    grid_max_range_m : range up to which a beam is drawn into the occupancy grid
+    slice_min_z_m : lower limit of the slice that the occupancy grid of a 3D log shows, relative to the lidar
+    slice_max_z_m : upper limit of that slice
     """
 
     voxel_size_m: Positive = 0.2
@@ -197,16 +279,20 @@ class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What goes into the rerun recording."""
+    """What goes into the rerun recording.
+
+    local_map_every : keyframes between two drawings of the local map
+    max_map_points : points drawn of the local map, and at least as many of the final map
+    """
 
     local_map_every: Count = 20
     max_map_points: Count = 20000
 
 
 class OutputsConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What a run directory holds beside the files that are always there.
+    """Files of a run directory beside those that are always there.
 
-    ``mcap`` adds results.mcap, the poses and maps as ROS 2 messages.
+    mcap : whether ``results.mcap`` is written: poses and maps as ROS 2 messages
     """
 
     mcap: bool = False

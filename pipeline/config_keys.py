@@ -1,4 +1,4 @@
-"""Every key of the configuration tree, flat: its type, unit, range and default."""
+"""Every key of the configuration tree, flat: its type, unit, range, default and description."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class ConfigKey:
     default : before presets, files and flags
     low, high : limits of a number; ``low_is_allowed`` is False where it must be exceeded
     choices : what a choice offers
+    description : what it sets, from the docstring of its section
     """
 
     name: str
@@ -44,6 +45,7 @@ class ConfigKey:
     high: float
     low_is_allowed: bool
     choices: tuple[str, ...]
+    description: str
 
     @property
     def unit(self) -> str:
@@ -128,12 +130,22 @@ def section_keys(section: type) -> tuple[ConfigKey, ...]:
     tree = inspect.type_info(section)
     assert isinstance(tree, inspect.StructType)
     words = re.findall("[A-Z][a-z]*", section.__name__.removesuffix("Config"))
+    descriptions = _descriptions(section.__doc__ or "")
     return tuple(
-        _leaf(f"{'_'.join(words).lower()}.{field.name}", field.type, field.default) for field in tree.fields
+        _leaf(
+            f"{'_'.join(words).lower()}.{field.name}", field.type, field.default, descriptions.get(field.name, "")
+        )
+        for field in tree.fields
     )
 
 
-def _leaf(name: str, kind: inspect.Type, default: Value) -> ConfigKey:
+def _descriptions(docstring: str) -> dict[str, str]:
+    """What the lines ``name : description`` of a docstring say, those that continue them included."""
+    entries = re.findall(r"^ *(\w+) : (.*(?:\n {8,}\S.*)*)", docstring, re.MULTILINE)
+    return {name: " ".join(text.split()) for name, text in entries}
+
+
+def _leaf(name: str, kind: inspect.Type, default: Value, description: str) -> ConfigKey:
     low, high, low_is_allowed = -math.inf, math.inf, True
     choices: tuple[str, ...] = ()
     match kind:
@@ -150,4 +162,4 @@ def _leaf(name: str, kind: inspect.Type, default: Value) -> ConfigKey:
             high = float(kind.le) if kind.le is not None else high
         case _:
             raise TypeError(f"{name}: configuration keys are bool, int, float, str or a choice, not {kind}")
-    return ConfigKey(name, word, default, low, high, low_is_allowed, choices)
+    return ConfigKey(name, word, default, low, high, low_is_allowed, choices, description)

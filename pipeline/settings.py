@@ -110,7 +110,7 @@ def load_settings(
     is_final = dimension is not None  # else a preset may still change all but log.*
     _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
     unused = {**_idle_keys(values, dimension), **idle} if is_final else {}
-    changed = "".join(f", {key} {values[key]}" for key in flags if key not in unused)
+    changed = "".join(f", {key} {_as_in_toml(values[key])}" for key in flags if key not in unused)
     without_effect = tuple(
         f"{_named(key, values[key], origin)} has no effect: {unused[key]}"
         for key, origin in (origins | flags).items()
@@ -121,8 +121,13 @@ def load_settings(
 
 def _named(key: str, value: Value, origin: str) -> str:
     """A setting as the user wrote it."""
-    text = str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else value
+    text = f"{value:g}" if isinstance(value, float) else _as_in_toml(value)
     return f"{origin} {text}" if origin.startswith("--") else f"{origin}: {key} {text}"
+
+
+def _as_in_toml(value: Value) -> str:
+    """The value as a file holds it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:

@@ -890,11 +890,12 @@ def test_evaluate_agrees_with_the_metrics_of_the_run(call, tmp_path, office):
         assert tree["ate"]["translation_m"]["rmse"] == pytest.approx(said["ate_rmse_m"], abs=1e-6)
 
 
-def test_config_show_lists_every_key_with_unit_and_range_and_marks_changes(call):
+def test_config_show_lists_every_key_with_unit_range_and_description_and_marks_changes(call):
     code, output, errors = call("config", "show", "--lidar", "2d", "--log.every", "7")
     assert (code, errors) == (0, "")
     says(output, "# preset lidar2d of 2D logs, log.every 7; * differs")
-    lines = {line[2:].split()[0]: line for line in output.splitlines()[1:]}
+    rows = output.splitlines()[1:]
+    lines = {line[2:].split()[0]: line for line in rows if not line.startswith(6 * " ")}
     defaults = flatten(configured(3))
     values = flatten(configured(2, {"log.every": 7}))
     assert list(lines) == list(values)
@@ -910,14 +911,17 @@ def test_config_show_lists_every_key_with_unit_and_range_and_marks_changes(call)
         ">",
         "0",
     ]
+    said = " ".join(rows[rows.index(lines["matching.max_distance_m"]) + 1].split())
+    assert said == "largest distance of a correspondence; it shrinks with the voxels"
 
 
-def test_config_show_as_json_has_value_unit_range_and_default(call, tmp_path):
+def test_config_show_as_json_has_value_unit_range_default_and_description(call, tmp_path):
     (tmp_path / "mine.toml").write_text("[matching]\nmax_distance_m = 0.3\n")
     rows = json.loads(call("config", "show", "--json", "--config", tmp_path / "mine.toml")[1])
     row = next(row for row in rows if row["key"] == "matching.max_distance_m")
     assert row == {
         "key": "matching.max_distance_m", "value": 0.3, "unit": "m", "range": "number > 0", "default": 2.0,
+        "description": "largest distance of a correspondence; it shrinks with the voxels",
     }  # fmt: skip
     assert next(row for row in rows if row["key"] == "log.end_s")["value"] is None
 

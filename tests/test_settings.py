@@ -1,9 +1,11 @@
 """The effective configuration: what wins over what, and what a wrong key or value is told."""
 
+import re
 import tomllib
 
 import msgspec
 import pytest
+from msgspec.structs import fields
 from scenes import ROOT, configured
 
 from scanchain.config import Config
@@ -114,6 +116,10 @@ def test_flags_beat_the_file_and_the_preset_and_are_told(tmp_path):
     assert load_settings(2, overrides=[flag("matching.max_distance_m", "0.9")]).config == configured(
         2, {"matching.max_distance_m": 0.9}
     )
+
+
+def test_booleans_are_told_as_a_file_holds_them():
+    says(load_settings(2, overrides=[flag("loops.refine", "off")]).source, "loops.refine false")
 
 
 def test_of_two_flags_for_one_key_the_later_wins():
@@ -305,6 +311,14 @@ def test_every_default_and_every_preset_lies_within_its_own_range():
     for dimension in (2, 3):
         for name, value in flatten(load_settings(dimension).config).items():
             assert config_keys()[name].check(value, name) == value
+
+
+def test_every_key_has_a_description_and_every_description_a_key():
+    for name, key in config_keys().items():
+        assert len(key.description) > 15, name
+    for section in fields(Config):
+        described = re.findall(r"^ {4}(\w+) : ", section.type.__doc__, re.MULTILINE)
+        assert described == [field.name for field in fields(section.type)]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from scanchain.settings import Settings, config_keys, dump, flatten, load_settin
 _FILE = click.option(
     "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset."
 )
+_INDENT = 6 * " "
 _LIDAR = click.option(
     "--lidar", type=click.Choice(["2d", "3d"]), help="The preset that a log of this kind would get."
 )
@@ -23,7 +25,7 @@ _LIDAR = click.option(
 
 @click.group()
 def config() -> None:
-    """Show the configuration: every key with unit and range.
+    """Show the configuration: every key with unit, range and description.
 
     \b
     Examples:
@@ -40,7 +42,7 @@ def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @_effective
 def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bool) -> None:
-    """Print every key with its value, unit, range and default.
+    """Print every key with its value, unit and range, and what it sets.
 
     \b
     Examples:
@@ -59,6 +61,7 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
                 "unit": k.unit,
                 "range": k.range,
                 "default": _plain(k.default),
+                "description": k.description,
             }
             for k in keys
         ]
@@ -72,8 +75,13 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
         for k in config_keys().values()
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
+    for row, key in zip(cells, config_keys().values(), strict=True):
         click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        click.echo(
+            textwrap.fill(
+                key.description.replace("``", ""), 100, initial_indent=_INDENT, subsequent_indent=_INDENT
+            )
+        )
 
 
 @config.command("dump", cls=OverrideCommand)

@@ -1,0 +1,29 @@
+"""How the documentation is built: ``make docs``. Nothing is fetched from the network."""
+
+import sys
+from importlib.metadata import version as installed
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))  # command_reference, config_reference and docstrings lie beside it
+
+project = "scanchain"
+version = release = installed("scanchain")
+copyright = "the authors of scanchain"
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "command_reference", "config_reference", "docstrings"]
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 3
+
+autodoc_class_signature = "mixed"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autoclass_content = "both"
+autodoc_type_aliases = {name: name for name in ("Logs", "Matrix", "Points", "Pose", "RawPoints")}
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+
+html_theme = "furo"
+html_title = f"scanchain {version}"
+html_copy_source = False
+html_static_path = ["style.css"]
+html_css_files = ["style.css"]
