@@ -24,7 +24,7 @@ class DriftingOdometry:
     def first_points(self):
         return self.odometry.first_points
 
-    def track(self, scan):
+    def process(self, scan):
         tracked = self.odometry.process(scan)
         motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
