@@ -17,11 +17,10 @@ from naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, write
 from rerun.chunk import RrdReader
 from scenes import ROOT
 
-from scanchain.__main__ import _record
+from scanchain.api import open_recorder
 from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
-from scanchain.runs.job import Job
-from scanchain.runs.progress import Unwatched
+from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
@@ -205,7 +204,7 @@ def job(log, out, **options):
 
 
 def test_a_run_says_that_it_is_complete_and_what_it_read(tmp_path, office):
-    finished = run(job(office, tmp_path / "a", command=("scanchain", "run")), _record, Unwatched())
+    finished = run(job(office, tmp_path / "a", command=("scanchain", "run")), open_recorder, Unwatched())
     assert finished.path == tmp_path / "a" and names(tmp_path) == ["a"]
     said = run_file(finished.path)
     assert (said["complete"], said["stopped"], said["command"]) == (True, "", ["scanchain", "run"])
@@ -221,7 +220,7 @@ def test_a_run_says_that_it_is_complete_and_what_it_read(tmp_path, office):
 
 
 def test_a_run_that_the_user_stops_is_whole_up_to_there_and_marked_partial(tmp_path, office):
-    finished = run(job(office, tmp_path / "a"), _record, Watcher(50))
+    finished = run(job(office, tmp_path / "a"), open_recorder, Watcher(50))
     assert names(tmp_path) == [finished.path.name] and ".partial-" in finished.path.name
     said = run_file(finished.path)
     assert not said["complete"] and "stopped by the user after 50 scans" in said["stopped"]
@@ -238,12 +237,12 @@ def test_a_run_that_the_user_stops_tells_of_the_scans_that_it_left_out(tmp_path)
     said = [
         scan_said(stamp_ns, laser_scan(stamp_ns, each)) for stamp_ns, each in zip(stamps_ns, ranges, strict=True)
     ]
-    finished = run(job(write(tmp_path / "log.mcap", said), tmp_path / "a"), _record, Watcher(20))
+    finished = run(job(write(tmp_path / "log.mcap", said), tmp_path / "a"), open_recorder, Watcher(20))
     assert finished.stopped and "of /scan was left out (the first: " in finished.metrics.warnings[0]
 
 
 def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office):
-    text = run(job(office, tmp_path / "a"), _record, Watcher(20)).summary
+    text = run(job(office, tmp_path / "a"), open_recorder, Watcher(20)).summary
     assert "(wheels /odom; lidar at" in text and "not used" not in text
 
 
@@ -251,7 +250,7 @@ def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_pat
     with pytest.raises(
         PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then"
     ) as e:
-        run(job(office, tmp_path / "a"), _record, Watcher(20, RuntimeError("boom")))
+        run(job(office, tmp_path / "a"), open_recorder, Watcher(20, RuntimeError("boom")))
     folder = partial_in(tmp_path)
     assert str(folder) in str(e.value) and names(tmp_path) == [folder.name]
     said = run_file(folder)
@@ -266,7 +265,7 @@ def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_pat
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_an_interrupt_and_a_full_disk_keep_the_scans_without_a_traceback(tmp_path, office, error):
     with pytest.raises(PartialRunError, match="20 scans until then"):
-        run(job(office, tmp_path / "a"), _record, Watcher(20, error))
+        run(job(office, tmp_path / "a"), open_recorder, Watcher(20, error))
     folder = partial_in(tmp_path)
     assert "traceback.txt" not in names(folder) and len(np.loadtxt(folder / "odometry.tum")) == 20
 
@@ -274,13 +273,13 @@ def test_an_interrupt_and_a_full_disk_keep_the_scans_without_a_traceback(tmp_pat
 @pytest.mark.parametrize("error", [InputError("bad"), KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_ends_a_run_before_its_first_scan_leaves_nothing(tmp_path, office, error):
     with pytest.raises(type(error)):
-        run(job(office, tmp_path / "a"), _record, Watcher(0, error))
+        run(job(office, tmp_path / "a"), open_recorder, Watcher(0, error))
     assert names(tmp_path) == []
 
 
 def test_a_bug_before_the_first_scan_leaves_its_traceback_alone(tmp_path, office):
     with pytest.raises(PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans"):
-        run(job(office, tmp_path / "a"), _record, Watcher(0, ZeroDivisionError("boom")))
+        run(job(office, tmp_path / "a"), open_recorder, Watcher(0, ZeroDivisionError("boom")))
     folder = partial_in(tmp_path)
     assert "ZeroDivisionError" in (folder / "traceback.txt").read_text()
     assert not run_file(folder)["complete"]
@@ -292,7 +291,7 @@ def test_a_bad_scan_in_the_middle_is_bad_input_and_what_was_before_it_is_kept(tm
     path = write(tmp_path / "log.mcap", [*good, bad])
     none_bad = Override("log.max_bad_scans_percent", "0", "--log.max_bad_scans_percent")
     with pytest.raises(InputError, match=r"scan 5 of /scan has no valid point .*; 5 scans until then are in"):
-        run(job(path, tmp_path / "a", overrides=(none_bad,)), _record, Unwatched())
+        run(job(path, tmp_path / "a", overrides=(none_bad,)), open_recorder, Unwatched())
     assert not (tmp_path / "a").exists()
     assert len(np.loadtxt(partial_in(tmp_path) / "odometry.tum")) == 5
 
@@ -300,9 +299,9 @@ def test_a_bad_scan_in_the_middle_is_bad_input_and_what_was_before_it_is_kept(tm
 def test_a_forced_run_that_crashes_leaves_the_old_run_whole(tmp_path, office):
     old = an_old_run(tmp_path / "a")
     with pytest.raises(PartialRunError):
-        run(job(office, old, force=True), _record, Watcher(20, RuntimeError("boom")))
+        run(job(office, old, force=True), open_recorder, Watcher(20, RuntimeError("boom")))
     assert names(old) == ["old.txt", "run.json"]
-    run(job(office, old, force=True), _record, Unwatched())
+    run(job(office, old, force=True), open_recorder, Unwatched())
     assert "old.txt" not in names(old) and run_file(old)["complete"]
 
 
@@ -313,17 +312,17 @@ def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_
             an_old_run(tmp_path / "a")
 
     with pytest.raises(InputError, match=r"a: exists; .*60 scans until then are in"):
-        run(job(office, tmp_path / "a"), _record, Slow())
+        run(job(office, tmp_path / "a"), open_recorder, Slow())
     assert names(tmp_path / "a") == ["old.txt", "run.json"]
     folder = partial_in(tmp_path)
     assert not run_file(folder)["complete"]
-    usual = run(job(office, tmp_path / "b"), _record, Unwatched()).path
+    usual = run(job(office, tmp_path / "b"), open_recorder, Unwatched()).path
     tables = [pq.read_table(path / "steps.parquet").select(["x", "y", "qz"]) for path in (folder, usual)]
     assert tables[0].equals(tables[1])
 
 
 def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_its_run_exists(tmp_path, office):
-    left = run(job(office, tmp_path / "a"), _record, Watcher(20)).path.rename(
+    left = run(job(office, tmp_path / "a"), open_recorder, Watcher(20)).path.rename(
         tmp_path / f"a.partial-{_NO_PROCESS}"
     )
     with pytest.raises(
@@ -331,31 +330,31 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_
     ):
         RunDirectory(left, force=False)
     told = Telling()
-    run(job(office, tmp_path / "a"), _record, told)
+    run(job(office, tmp_path / "a"), open_recorder, told)
     assert f"{left.name} is of a run that was stopped; --resume would go on with it" in "\n".join(told.lines)
     with pytest.raises(InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume goes on"):
         RunDirectory(tmp_path / "a", force=False)
-    resumed = run(job(office, tmp_path / "a", force=True, resume=True), _record, Unwatched())
+    resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Unwatched())
     assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
 
 
 def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
     told = Telling()
-    run(job(office, tmp_path / "a"), _record, told)
+    run(job(office, tmp_path / "a"), open_recorder, told)
     stages = ["closing the last", "optimizing", "refining 60 scans", "the map", "the recording", "the report"]
     after = told.lines[told.lines.index("through") + 1 :]
     assert [stage for line in after for stage in stages if stage in line] == stages == stages[: len(after)]
 
 
 def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
-    text = run(job(office, tmp_path / "a"), _record, Watcher(3)).summary
+    text = run(job(office, tmp_path / "a"), open_recorder, Watcher(3)).summary
     assert "1 keyframe\n" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 
 def test_a_file_named_twice_is_refused(tmp_path, office):
     twice = dataclasses.replace(job(office, tmp_path / "a"), logs=(office, office))
     with pytest.raises(InputError, match=r"office.mcap: is named 2 times"):
-        run(twice, _record, Unwatched())
+        run(twice, open_recorder, Unwatched())
     assert names(tmp_path) == []
 
 
