@@ -43,12 +43,12 @@ _HOMES = {
     "load_settings": "settings",
     "open_log": "logs",
     "optimize": "api",
-    "read_g2o": "graph.g2o",
+    "read_g2o": "graph.files.g2o",
     "read_tum": "trajectory",
     "rigid_transform": "matching",
     "run": "api",
     "simulate": "simulation",
-    "write_g2o": "graph.g2o_write",
+    "write_g2o": "graph.files.g2o_write",
     "write_tum": "trajectory",
 }
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from scanchain import checks
 from scanchain.data import Points
 from scanchain.preprocess import downsample as first_per_voxel
-from scanchain.runs.job import Job
-from scanchain.runs.progress import Unwatched
+from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
 from scanchain.settings import Override, load_settings
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
     from scanchain.graph.pose_graph import PoseGraph
-    from scanchain.runs.recorder import Recorder, SinkName
+    from scanchain.runs.job import Recorder, SinkName
 
 Logs = str | Path | Sequence[str | Path]
 

@@ -1,8 +1,12 @@
-"""A clock that stands still while kernels are compiled, once after an installation: it measures work alone."""
+"""Compilation of kernels, once after an installation: announced, and left out of the times that are measured."""
 
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
 
@@ -50,3 +54,48 @@ def compiled_s() -> float:
 def working_s() -> float:
     """Seconds as ``perf_counter`` has them, less those of compiling; only differences have a meaning."""
     return perf_counter() - compiled_s()
+
+
+@contextmanager
+def announcing_compilation(say: Callable[[str], None], warm_up: Sequence[str] = ()) -> Iterator[None]:
+    """Name each module of kernels when its compilation begins; kernels from the cache on disk are not named.
+
+    warm_up : arguments of ``python -m`` for a second process, which compiles what this one will need later
+    """
+    announcer = _Announcer(say, warm_up)
+    try:
+        with event.install_listener("numba:compile", announcer):
+            yield
+    finally:
+        if announcer.beside is not None:
+            announcer.beside.kill()
+            announcer.beside.wait()
+
+
+class _Announcer(event.Listener):
+    def __init__(self, say: Callable[[str], None], warm_up: Sequence[str]) -> None:
+        self.say, self.warm_up = say, warm_up
+        self.modules: set[str] = set()
+        self.beside: subprocess.Popen[bytes] | None = None
+
+    def on_start(self, event: Any) -> None:
+        module = event.data["dispatcher"].py_func.__module__
+        if module.startswith("scanchain.") and module not in self.modules:
+            if not self.modules:
+                self.say("compiling, once after the installation:")
+                self.beside = _started(self.warm_up)
+            self.modules.add(module)
+            self.say(f"  {module.removeprefix('scanchain.')}")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+def _started(arguments: Sequence[str]) -> subprocess.Popen[bytes] | None:
+    """``python -m`` with these arguments, its output discarded; None without any."""
+    if not arguments:
+        return None
+    nothing = subprocess.DEVNULL
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", *arguments], stdin=nothing, stdout=nothing, stderr=nothing
+    )

@@ -8,8 +8,7 @@ import pytest
 from scenes import kitti_scans, shared_data
 
 from scanchain import baselines, lie
-from scanchain.baselines.at_stamp import AtStamp
-from scanchain.baselines.baseline import finite
+from scanchain.baselines.baseline import AtStamp, finite
 from scanchain.data import Trajectory
 from scanchain.errors import InputError, MissingExtraError
 from scanchain.evaluation import absolute_error, pair

@@ -17,10 +17,10 @@ from scenes import ROOT
 from web_server import serving
 
 from scanchain.__main__ import main
-from scanchain.batch.collecting import collect
+from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
-from scanchain.memory import resident_mib
+from scanchain.processes import resident_mib
 from scanchain.simulation import simulate
 from scanchain.source import Address
 from scanchain.viz.report.batch import names_of

@@ -30,7 +30,7 @@ from scenes import ROOT, configured
 
 from scanchain import lie
 from scanchain.__main__ import scanchain
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand
 from scanchain.data import Trajectory
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.logs.writing.writer import LogWriter

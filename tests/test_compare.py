@@ -13,14 +13,13 @@ from scenes import shared_data
 
 from scanchain import lie
 from scanchain.__main__ import main
-from scanchain.comparison.columns import COLUMNS
 from scanchain.comparison.compare import Contest, compare
-from scanchain.comparison.evidence import method_folder
-from scanchain.comparison.figures import Figures
+from scanchain.comparison.figures import COLUMNS, Figures
 from scanchain.comparison.judging import doubt
 from scanchain.comparison.methods import OURS, default_names, resolve
 from scanchain.comparison.outcome import EndReport, Outcome, Status
-from scanchain.comparison.race import race
+from scanchain.comparison.processes import race
+from scanchain.comparison.results import method_folder
 from scanchain.comparison.scan_store import store
 from scanchain.comparison.table import Row, Table, markdown, read_table, text
 from scanchain.data import Trajectory
@@ -28,12 +27,12 @@ from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, disagreement, motion_nees, pair, sampled_map, sharpness
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
-from scanchain.runs.progress import Unwatched
+from scanchain.processes import Limits
+from scanchain.runs.job import Unwatched
 from scanchain.runs.provenance import Provenance
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum, write_kitti, write_tum
-from scanchain.watched import Limits
 
 TESTS = Path(__file__).parent
 NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself")
@@ -112,7 +111,7 @@ def bad(office, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{TESTS}:{TESTS.parent}")
         patch.setenv("HANGS_FILE", str(hanging))
-        patch.setattr("scanchain.watched.monotonic", lambda: 1000.0 * hanging.exists())
+        patch.setattr("scanchain.processes.monotonic", lambda: 1000.0 * hanging.exists())
         code = main(
             [
                 "compare", str(office), "--out", str(folder / "out"),
@@ -194,7 +193,7 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
             report, blank, Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1))), blank + len(ran), blank, folder
         )
 
-    monkeypatch.setattr("scanchain.comparison.race._run", fake)
+    monkeypatch.setattr("scanchain.comparison.processes._run", fake)
     methods = resolve(("plicp",), 2, file=None)
     outcomes = race(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
     assert len(ran) == len(set(ran)) == 3

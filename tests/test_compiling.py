@@ -8,14 +8,12 @@ import pytest
 from numba import njit
 
 from scanchain.api import open_recorder
-from scanchain.clock import compiled_s, working_s
+from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.matching import VoxelMap
 from scanchain.runs import results
-from scanchain.runs.compiling import telling_of_compilation
-from scanchain.runs.job import Job
-from scanchain.runs.progress import Unwatched
-from scanchain.runs.rehearsal import rehearse
+from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import run
+from scanchain.runs.warm_up import warm_up
 from scanchain.simulation import simulate
 
 
@@ -37,7 +35,7 @@ def kernel(module):
 
 def test_each_module_of_kernels_is_named_once_and_others_are_not():
     told = Told()
-    with telling_of_compilation(told):
+    with announcing_compilation(told.say):
         for module in (
             "scanchain.kernels.voxels.voxel_shapes",
             "scanchain.kernels.voxels.voxel_shapes",
@@ -52,7 +50,7 @@ def test_what_is_compiled_already_is_not_told():
     told = Told()
     compiled = kernel("scanchain.kernels.voxels.voxel_shapes")
     compiled(2)
-    with telling_of_compilation(told):
+    with announcing_compilation(told.say):
         compiled(3)
     assert told.lines == []
 
@@ -65,7 +63,7 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
         return begun[-1]
 
     monkeypatch.setattr(subprocess, "Popen", remembered)
-    with telling_of_compilation(Told(), ("http.server", "0")):
+    with announcing_compilation(Told().say, ("http.server", "0")):
         assert not begun
         for module in ("scanchain.kernels.voxels.voxel_shapes", "scanchain.kernels.geometry.eigen"):
             kernel(module)(2)
@@ -75,16 +73,16 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
 
 def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", None)
-    with telling_of_compilation(Told(), ("http.server", "0")):
+    with announcing_compilation(Told().say, ("http.server", "0")):
         pass
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_rehearsal_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
+def test_a_warm_up_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
     made = {}
     for name in ("cloud_of", "grid_of"):
-        monkeypatch.setattr(f"scanchain.runs.rehearsal.{name}", _remembering(made, name))
-    rehearse(dimension)
+        monkeypatch.setattr(f"scanchain.runs.warm_up.{name}", _remembering(made, name))
+    warm_up(dimension)
     assert list(made) == ["cloud_of", "grid_of"]
     (result, _), cloud = made["cloud_of"]
     assert len(result.keyframes) == len(result.trajectory) == 3 and len(result.state.edges) >= 2

@@ -41,7 +41,9 @@ def test_every_name_on_the_page_exists(page):
     names = [name for name in re.findall(r"`(scanchain(?:\.\w+)+)`", text) if not exists(name)]
     keys = set(re.findall(rf"(?:`|--)((?:{SECTIONS})\.[a-z_]+)(?=[` ])", text)) - KEYS
     keys = {key for key in keys if key.rpartition(".")[2] not in ("mcap", "parquet", "toml", "rrd", "tum")}
-    files = [file for file in re.findall(r"`((?:pipeline|viz|tests)/[\w/]+\.py)`", text) if not (ROOT / file).exists()]
+    files = [
+        file for file in re.findall(r"`((?:pipeline|viz|tests)/[\w/]+\.py)`", text) if not (ROOT / file).exists()
+    ]
     benchmarks = [
         name
         for name in re.findall(r"tests\.benchmarks\.(\w+)", text)

@@ -11,7 +11,7 @@ from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.doubt import Doubt
-from scanchain.runs.verdicts import final_verdicts
+from scanchain.runs.closures import final_verdicts
 
 
 def chain(count, sigma_m=0.01):

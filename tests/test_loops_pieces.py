@@ -15,7 +15,7 @@ from scanchain.logs import open_log
 from scanchain.loops.pieces import Pieces
 from scanchain.loops.submaps import Submaps
 from scanchain.odometry import Odometry
-from scanchain.runs.verdicts import final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam
 
 

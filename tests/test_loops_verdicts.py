@@ -17,9 +17,8 @@ from scanchain.data import Proposal, Verdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.logs import open_log
-from scanchain.runs.closure_table import write_closures
+from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.verdicts import final_verdicts
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
 

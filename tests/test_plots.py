@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.viz.pictures.plots import GridPicture, draw_map
+from scanchain.viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scanchain.errors import InputError
-from scanchain.memory import resident_mib
 from scanchain.point_store import PointStore
+from scanchain.processes import resident_mib
 
 
 def cloud(count, seed=0):

@@ -22,8 +22,8 @@ from scanchain import lie
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
 from scanchain.errors import InputError
+from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.verdicts import final_verdicts
 from scanchain.viz.recording import entities, shapes, viewer
 from scanchain.viz.recording.blueprint import blueprint
 from scanchain.viz.recording.messages import Message

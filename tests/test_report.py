@@ -17,17 +17,15 @@ from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from scanchain.__main__ import main
-from scanchain.comparison.columns import COLUMNS
+from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.simulation import simulate
 from scanchain.viz.pictures.map_figures import surroundings
-from scanchain.viz.pictures.trajectories import Course, PathLine
-from scanchain.viz.pictures.trajectory_figures import plan
-from scanchain.viz.report.map_viewer import SCRIPT, map_scene
+from scanchain.viz.pictures.trajectory_figures import Course, PathLine, plan
 from scanchain.viz.report.page import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
-from scanchain.viz.report.trajectory_section import Told, trajectory_section
+from scanchain.viz.report.trajectory_map import SCRIPT, Told, map_scene, trajectory_section
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent

@@ -20,8 +20,7 @@ from scenes import ROOT
 from scanchain.api import open_recorder
 from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
-from scanchain.runs.job import Job
-from scanchain.runs.progress import Unwatched
+from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override

@@ -9,10 +9,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from scanchain.baselines.baseline import Baseline
+from scanchain.baselines.baseline import Baseline, InPlane
 from scanchain.baselines.genz import GENZ, GenzIcp, GenzSettings
 from scanchain.baselines.gicp import GICP, PLANAR_GICP, PLANAR_VGICP, VGICP, SmallGicpModel, SmallGicpPairs
-from scanchain.baselines.in_plane import InPlane
 from scanchain.baselines.kiss import KISS, PLANAR_KISS, KissIcp
 from scanchain.baselines.open3d_pairs import OPEN3D, PLANAR_OPEN3D, Open3dPairs, Residual
 from scanchain.errors import InputError

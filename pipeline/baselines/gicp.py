@@ -12,8 +12,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.baselines.at_stamp import AtStamp
-from scanchain.baselines.baseline import finite, middle
+from scanchain.baselines.baseline import AtStamp, finite, middle
 from scanchain.config import Count, Positive
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import MissingExtraError

@@ -8,8 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from scanchain.baselines.at_stamp import AtStamp
-from scanchain.baselines.baseline import finite, middle
+from scanchain.baselines.baseline import AtStamp, finite, middle
 from scanchain.config import Count, NonNegative, Positive
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import MissingExtraError

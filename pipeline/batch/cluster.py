@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 
-from scanchain.batch.attempt import attempt
-from scanchain.batch.task import Row, Task
+from scanchain.batch.task import Row, Task, attempt
 from scanchain.errors import InputError, MissingExtraError
 
 _NODE_LOSSES = 10  # of a task, before it counts as lost

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.ground_truth import ground_truth
-from scanchain.commands.limit_options import limit_options
-from scanchain.commands.log_type import LOG
-from scanchain.commands.override_command import OverrideCommand, overrides
+from scanchain.commands.options import LOG, OverrideCommand, ground_truth, limit_options, overrides
 from scanchain.commands.run import aliases
 from scanchain.errors import InputError, ScanchainError
 from scanchain.settings import Override
@@ -82,9 +79,8 @@ def batch(
       scanchain batch --manifest logs.txt --out /shared/all --ray auto
       scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
-    from scanchain.batch.batch import Batch, run_batch
+    from scanchain.batch.batch import Batch, collect, run_batch
     from scanchain.batch.cluster import on_cluster
-    from scanchain.batch.collecting import collect
     from scanchain.commands.terminal import Terminal
 
     if ray is not None and workers is not None:

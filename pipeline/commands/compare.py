@@ -7,10 +7,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.ground_truth import ground_truth
-from scanchain.commands.limit_options import limit_options
-from scanchain.commands.log_type import LOG
-from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, alias, ground_truth, limit_options, overrides
 from scanchain.errors import ScanchainError
 from scanchain.source import Source
 

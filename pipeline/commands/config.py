@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from scanchain.commands.override_command import OverrideCommand, overrides
+from scanchain.commands.options import OverrideCommand, overrides
 from scanchain.config_keys import Value
 from scanchain.settings import Settings, config_keys, dump, flatten, load_settings
 

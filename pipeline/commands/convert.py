@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.log_type import LOG
-from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, alias, overrides
 from scanchain.errors import InputError
 from scanchain.settings import load_settings
 from scanchain.source import Source

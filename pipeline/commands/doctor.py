@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.log_type import LOG
-from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, alias, overrides
 from scanchain.settings import load_settings
 from scanchain.source import Source
 

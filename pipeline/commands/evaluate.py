@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.ground_truth import max_gap_option
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand, max_gap_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,7 +101,8 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --optimizer dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
-    from scanchain.commands.outputs import check_output
+    from scanchain.clock import announcing_compilation
+    from scanchain.commands.options import check_output
     from scanchain.commands.terminal import Terminal
     from scanchain.landmarks.files.npz import read_landmark_data
     from scanchain.landmarks.files.write import text_of, tree_of
@@ -109,7 +110,6 @@ def landmarks(
     from scanchain.landmarks.study import Options
     from scanchain.landmarks.study_file import study_file
     from scanchain.landmarks.study_log import study_log
-    from scanchain.runs.compiling import telling_of_compilation
     from scanchain.runs.directory import RunDirectory
     from scanchain.viz.report.landmarks import write_report
 
@@ -119,7 +119,7 @@ def landmarks(
     if recording is not None:
         check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
-        with telling_of_compilation(terminal):
+        with announcing_compilation(terminal.say):
             studies = [
                 study_log(each, options) if isinstance(each, Path) else study_file(each, options)
                 for each in problems

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from scanchain.commands.graph_answer import Answer
-from scanchain.commands.outputs import check_output
-from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.commands.options import OverrideCommand, alias, check_output, overrides
 from scanchain.errors import InputError, told
 from scanchain.settings import Override, load_settings
 

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.ground_truth import ground_truth, max_gap_option
-from scanchain.commands.log_type import LOG
-from scanchain.commands.override_command import OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, alias, ground_truth, max_gap_option, overrides
 from scanchain.errors import InputError, ScanchainError
 from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.recorder import SinkName
+    from scanchain.runs.job import SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look through them often costs a twentieth

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand
 
 
 @click.group()

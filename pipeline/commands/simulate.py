@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand
 from scanchain.errors import InputError
 from scanchain.words import counted
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.outputs import check_output
-from scanchain.commands.override_command import OnceCommand
+from scanchain.commands.options import OnceCommand, check_output
 from scanchain.errors import InputError
 
 
@@ -52,7 +51,7 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         )
     if path.suffix != ".rrd":
         raise InputError(f"{path}: is no recording (.rrd); give a run directory")
-    from scanchain.viz.recording.show import show
+    from scanchain.viz.recording.viewer import show
 
     with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
         show(path, click.echo, in_browser=web)

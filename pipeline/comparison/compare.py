@@ -12,20 +12,18 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
-from scanchain.comparison.evidence import Evidence, Reference, write_evidence
 from scanchain.comparison.judging import judge
-from scanchain.comparison.maps import maps_of
 from scanchain.comparison.methods import default_names, resolve
-from scanchain.comparison.race import limits_for, race
+from scanchain.comparison.processes import limits_for, race
+from scanchain.comparison.results import Evidence, Reference, write_evidence
 from scanchain.comparison.scan_store import StoredScans, store
-from scanchain.comparison.summary import summarize
-from scanchain.comparison.table import Table, write_table
+from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair, read_relations, read_truth, relation_error
 from scanchain.logs import Log, open_log
 from scanchain.runs.directory import RUN_FILE, RunDirectory
-from scanchain.runs.progress import Progress
+from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
 from scanchain.source import Source

@@ -27,8 +27,8 @@ from scanchain.evaluation import (
     relative_error_over_distance,
     relative_error_over_time,
 )
-from scanchain.runs.consistency import COLUMNS, nees_of_steps
 from scanchain.runs.metrics import unreliable
+from scanchain.runs.step_table import COLUMNS, nees_of_steps
 
 Answer = TypeVar("Answer")
 

@@ -12,9 +12,8 @@ from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Step, Timing, Trajectory
 from scanchain.odometry import Odometry
-from scanchain.runs.closure_table import write_closures
+from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.verdicts import final_verdicts
 from scanchain.slam import Slam
 
 

@@ -1,19 +1,29 @@
-"""The table of a comparison: as JSON, CSV, Markdown, and as a person reads it in a terminal."""
+"""The table of a comparison: made of its results; as JSON, CSV, Markdown, and as text for a terminal."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 
-from scanchain.comparison.columns import COLUMNS, columns_of
-from scanchain.comparison.figures import Figures
-from scanchain.comparison.outcome import Status
-from scanchain.runs.provenance import Provenance
+from scanchain.baselines import BASELINES
+from scanchain.comparison.figures import COLUMNS, Figures, columns_of
+from scanchain.comparison.judging import doubt, representative
+from scanchain.comparison.methods import Method
+from scanchain.comparison.outcome import EndReport, Outcome, Status
+from scanchain.comparison.results import Evidence
+from scanchain.comparison.scan_store import StoredScans
+from scanchain.data import Points
+from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_step, sharpness
+from scanchain.logs import Log
+from scanchain.processes import Limits
+from scanchain.runs.provenance import Provenance, package_version
 
 TABLE_FILE = "table.json"
 
@@ -137,3 +147,84 @@ def _csv(table: Table) -> str:
     for row in table.rows:
         writer.writerow([row.name, row.status, *(getattr(row.figures, key) for key in keys)])
     return buffer.getvalue()
+
+
+def summarize(evidence: Evidence, log: Log, limits: Limits, provenance: Provenance) -> Table:
+    """Every method's row, with what only all of them together tell: sharpness and disagreement."""
+    scans, sharp = evidence.scans, sharpness_of(evidence.maps)
+    finals = [representative(evidence.outcomes[method.name]).trajectory.poses for method in evidence.methods]
+    apart_m = disagreement(finals)
+    rows = [
+        _row(evidence, method, sharp.get(method.name), np.delete(apart_m[place], place))
+        for place, method in enumerate(evidence.methods)
+    ]
+    packages = sorted({BASELINES[method.base].package for method in evidence.methods if method.base in BASELINES})
+    return Table(
+        log=", ".join(str(path) for path in log.paths),
+        topic=log.topic,
+        dimension=scans.dimension,
+        scans=len(scans),
+        points_per_scan=float(scans.points.mean()),
+        repeats=max(len(runs) for runs in evidence.outcomes.values()),
+        truth=evidence.reference.source,
+        truth_note=evidence.reference.note,
+        rows=rows,
+        disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
+        notes=[
+            f"every run may take {limits.time_s:,.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
+            *log.notes,
+            *log.damage,
+        ],
+        provenance=provenance,
+        baselines={name: _installed(name) for name in packages},
+    )
+
+
+def _row(evidence: Evidence, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
+    outcomes, judged = evidence.outcomes[method.name], evidence.judged[method.name]
+    end = _end([outcome.report for outcome in outcomes])
+    known = apart_m[np.isfinite(apart_m)]
+    figures: Figures = msgspec.structs.replace(
+        judged.figures,
+        thickness_m=sharp.thickness_m if sharp else None,
+        entropy=sharp.mean_map_entropy if sharp else None,
+        disagreement_m=float(np.median(known)) if len(known) else None,
+    )
+    return Row(
+        name=method.name,
+        base=method.base,
+        status=end.status,
+        reason=end.reason,
+        description=representative(outcomes).report.description,
+        doubt=doubt(representative(outcomes)),
+        settings=method.settings,
+        figures=figures,
+        definitions=list(judged.definitions),
+    )
+
+
+def _end(reports: list[EndReport]) -> EndReport:
+    """How it ended: badly if one run did."""
+    return next((report for report in reports if report.status is not Status.OK), reports[0])
+
+
+def _installed(package: str) -> str:
+    """Of a package, which may come under the name of its variant without CUDA."""
+    return package_version(package) or package_version(f"{package}-cpu")
+
+
+def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[str, Points]:
+    """Sampled maps (M, d) of the methods that came to their end."""
+    step = sampling_step(int(scans.points.sum()))
+    whole = {name: representative(runs) for name, runs in outcomes.items()}
+    return {
+        name: sampled_map(scans.scans(), outcome.trajectory, step)
+        for name, outcome in whole.items()
+        if outcome.is_whole
+    }
+
+
+def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
+    """Of the maps that hold together."""
+    answers = sharpness(list(maps.values())) if maps else []
+    return {name: answer for name, answer in zip(maps, answers, strict=True) if answer is not None}

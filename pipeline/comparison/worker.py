@@ -9,15 +9,18 @@ import sys
 import traceback
 from collections.abc import Iterable
 from contextlib import nullcontext, suppress
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
+from typing import Protocol
 
 import msgspec
 import numpy as np
 from numpy.lib.format import open_memmap
 
-from scanchain.comparison import runner
+from scanchain.baselines import BASELINES, Baseline, InPlane
+from scanchain.clock import announcing_compilation
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import (
     CPU_FILE,
@@ -30,10 +33,70 @@ from scanchain.comparison.outcome import (
 )
 from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import MissingExtraError, ScanchainError
-from scanchain.memory import die_first, peak_mib
-from scanchain.runs.compiling import telling_of_compilation
-from scanchain.runs.progress import Unwatched
+from scanchain.errors import InputError, MissingExtraError, ScanchainError
+from scanchain.processes import die_first, peak_mib
+from scanchain.runs.job import Unwatched
+
+
+class Runner(Protocol):
+    """Scans in, poses out."""
+
+    @property
+    def description(self) -> str:
+        """What it does, with its settings."""
+        ...
+
+    def track(self, scan: Scan) -> Pose:
+        """T_odom_lidar (d+1, d+1) at the scan's stamp."""
+        ...
+
+    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
+        """The last word on all poses; what else is known goes into files of the folder."""
+        ...
+
+
+def start(method: Method, T_base_lidar: Pose) -> Runner:
+    """The method before its first scan. Raises MissingExtraError where its package is not installed."""
+    if not method.is_ours:
+        return _Others(method, len(T_base_lidar) - 1)
+    from scanchain.comparison.ours import start_ours  # much code, which is not to count as memory of the others
+
+    return start_ours(method, T_base_lidar)
+
+
+def can_start_again(method: Method) -> bool:
+    """Whether an instance knows nothing of those before it, so that one may be thrown away to get warm."""
+    return method.base not in BASELINES or BASELINES[method.base].forgets
+
+
+class _Others:
+    def __init__(self, method: Method, dimension: int) -> None:
+        self.baseline = _baseline(method, dimension)
+        self.description = self.baseline.description
+
+    def track(self, scan: Scan) -> Pose:
+        return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
+
+    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
+        return odometry
+
+
+def _baseline(method: Method, dimension: int) -> Baseline:
+    if method.base not in BASELINES:
+        return _brought(method)
+    entry = BASELINES[method.base]
+    baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
+    return baseline if dimension == 3 else InPlane(baseline, is_raised=entry.is_raised)
+
+
+def _brought(method: Method) -> Baseline:
+    """An object of the user's own class, made with the settings as keywords."""
+    module, _, name = method.base.partition(":")
+    try:
+        return getattr(import_module(module), name)(**method.settings)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{method.base} cannot be had ({error}); check PYTHONPATH") from error
+
 
 METHOD_FILE = "method.msgpack"
 _WARM_UP_SCANS = 4
@@ -44,7 +107,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     """Track every scan, then finish."""
     began = perf_counter()
     warm_up(scans.scans(), method, scans.T_base_lidar)
-    racer = runner.start(method, scans.T_base_lidar)
+    racer = start(method, scans.T_base_lidar)
     start_s = perf_counter() - began
     size = scans.dimension + 1
     poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
@@ -66,9 +129,9 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
-    if not runner.can_start_again(method):
+    if not can_start_again(method):
         return
-    racer = runner.start(method, T_base_lidar)
+    racer = start(method, T_base_lidar)
     with suppress(Exception):
         for scan in islice(scans, _WARM_UP_SCANS):
             racer.track(scan)
@@ -80,7 +143,7 @@ def main() -> None:
     die_first()
     method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
     compiler = _Compiler()
-    with telling_of_compilation(compiler) if method.is_ours else nullcontext():
+    with announcing_compilation(compiler.say) if method.is_ours else nullcontext():
         report = _report(open_store(store), method, folder)
     report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=compiler.has_compiled)
     (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))

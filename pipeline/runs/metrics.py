@@ -15,9 +15,9 @@ from scanchain.data import LEAST_FIT, State, Trajectory, fit_text
 from scanchain.errors import InputError
 from scanchain.evaluation import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
 from scanchain.evaluation.absolute import far_off, path_length
+from scanchain.runs.closures import BACK_END, VERIFICATION, JudgedClosure
 from scanchain.runs.results import Cloud
 from scanchain.runs.step_table import STAGES, StepTable
-from scanchain.runs.verdicts import BACK_END, VERIFICATION, JudgedClosure
 from scanchain.slam import SlamResult
 from scanchain.words import counted
 

@@ -16,18 +16,14 @@ from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.logs import Log
-from scanchain.runs.closure_table import write_closures
+from scanchain.runs.closures import JudgedClosure, final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
-from scanchain.runs.job import Job
-from scanchain.runs.progress import Progress
-from scanchain.runs.recorder import OpenRecorder, Recorder
-from scanchain.runs.results import Cloud, write_results
-from scanchain.runs.results_mcap import write_results_mcap
+from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
+from scanchain.runs.results import Cloud, record_results, results_of, write_results
 from scanchain.runs.resume.checkpoint import Checkpoints
 from scanchain.runs.resume.journal import JOURNAL_FILE, Journal
 from scanchain.runs.resume.resuming import Left, after, go_on_recording, set_aside
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.verdicts import JudgedClosure, final_verdicts
 from scanchain.slam import Slam, SlamResult
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
@@ -83,16 +79,14 @@ def process(
         judged = final_verdicts(result.closures, result.state)
         progress.say("drawing and writing the map")
         with directory.results() as folder:
-            cloud = write_results(folder, result, judged, config, recording)
-            write_closures(folder / "loops.parquet", judged, result.keyframes, log.dimension)
-            steps.write(folder / "steps.parquet", result.trajectory)
-            _show_truth(true_poses, job.max_gap_s, result, recording)
-            if config.outputs.mcap:
-                write_results_mcap(folder, log, steps, result)
+            results = results_of(log, config, steps, result, judged)
+            write_results(folder, results)
+            record_results(recording, results)
+            _record_truth(true_poses, job.max_gap_s, result, recording)
         slam.points.close()
         held_s = _hold(recording, progress)
         progress.say("writing the rest of the recording")
-    return Processed(result, cloud, judged, (*notes, *recording.warnings), held_s)
+    return Processed(result, results.cloud, judged, (*notes, *recording.warnings), held_s)
 
 
 def _begin(
@@ -110,7 +104,7 @@ def _begin(
     return checkpoint.slam, scans, checkpoints
 
 
-def _show_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:
+def _record_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:
     """Ground truth into the recording, moved onto the trajectory; one that does not fit is warned of elsewhere."""
     with suppress(InputError):
         reference = true_poses(result.trajectory.stamps_ns)

@@ -1,10 +1,11 @@
-"""The files that hold what a log amounts to: trajectories, graph, maps."""
+"""Results of a run: the table of its output files and their writers, and the maps made from the keyframes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Points, Pose
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
+from scanchain.logs import Log
 from scanchain.maps import (
     OccupancyGrid,
     View,
@@ -25,58 +27,107 @@ from scanchain.maps import (
     write_pcd,
     write_ply,
 )
-from scanchain.runs.recorder import Recorder
-from scanchain.runs.verdicts import JudgedClosure
+from scanchain.runs.closures import JudgedClosure, write_closures
+from scanchain.runs.job import Recorder
+from scanchain.runs.results_mcap import write_results_mcap
+from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
 
-GRAPH_FILE = "graph.g2o"  # what is in force; rejected edges stand in graph_rejected.g2o, if there are any
+GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The point cloud of the world: points (N, d), meters, and how many were left out as having moved."""
+    """The point cloud of the world: points (N, d), meters, and the number left out because they moved."""
 
     points: Points
     removed: int
 
 
-def write_results(
-    folder: Path, result: SlamResult, judged: Sequence[JudgedClosure], config: Config, recording: Recorder
-) -> Cloud:
-    """Write trajectories, graph and maps into a run directory, and show them in the recording."""
-    write_tum(folder / "trajectory.tum", result.trajectory)
-    write_tum(folder / "odometry.tum", result.odometry)
-    write_kitti(folder / "trajectory.kitti.txt", result.trajectory)
-    write_g2o(folder / GRAPH_FILE, result.graph)
-    if result.graph.is_rejected.any():
-        write_g2o(rejected_path(folder / GRAPH_FILE), result.graph, edges="rejected")
-    indices = np.arange(len(result.trajectory), dtype=np.int64)
-    recording.log_trajectory(result.trajectory.stamps_ns, result.trajectory.poses, indices)
-    recording.log_closures(judged, result.state)
-    dimension = result.trajectory.dimension
-    cloud = cloud_of(result, config)
-    write_ply(folder / "map.ply", cloud.points)
-    if config.maps.write_pcd:
-        write_pcd(folder / "map.pcd", cloud.points)
-    if config.maps.write_laz:
-        write_laz(folder / "map.laz", cloud.points)
-    recording.log_map(cloud.points)
-    grid = grid_of(result, config.maps)
-    write_map(folder, grid)
-    if dimension == 2:
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Everything known after the last scan of a log: what the files of a run directory are written from."""
+
+    log: Log
+    config: Config
+    steps: StepTable
+    result: SlamResult
+    judged: tuple[JudgedClosure, ...]
+    cloud: Cloud
+    grid: OccupancyGrid
+
+
+class Output(NamedTuple):
+    """A file of a run directory: its name, its writer, and whether the configuration asks for it."""
+
+    file: str
+    write: Callable[[Path, Results], None]
+    is_wanted: Callable[[Config], bool] = lambda config: True
+
+
+def _write_graph(path: Path, results: Results) -> None:
+    graph = results.result.graph
+    write_g2o(path, graph)
+    if graph.is_rejected.any():
+        write_g2o(rejected_path(path), graph, edges="rejected")
+
+
+OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
+    Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
+    Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
+    Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
+    Output(GRAPH_FILE, _write_graph),
+    Output("map.ply", lambda path, r: write_ply(path, r.cloud.points)),
+    Output("map.pcd", lambda path, r: write_pcd(path, r.cloud.points), lambda config: config.maps.write_pcd),
+    Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
+    Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
+    Output(
+        "loops.parquet",
+        lambda path, r: write_closures(path, r.judged, r.result.keyframes, r.result.trajectory.dimension),
+    ),
+    Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory)),
+    Output(  # after the maps, which it reads
+        "results.mcap",
+        lambda path, r: write_results_mcap(path, r.log, r.steps, r.result),
+        lambda config: config.outputs.mcap,
+    ),
+)
+
+
+def results_of(
+    log: Log, config: Config, steps: StepTable, result: SlamResult, judged: tuple[JudgedClosure, ...]
+) -> Results:
+    """The results of a log with the maps made from its keyframes."""
+    return Results(log, config, steps, result, judged, cloud_of(result, config), grid_of(result, config.maps))
+
+
+def write_results(folder: Path, results: Results) -> None:
+    """Write every output that is asked for into a run directory."""
+    for output in OUTPUTS:
+        if output.is_wanted(results.config):
+            output.write(folder / output.file, results)
+
+
+def record_results(recording: Recorder, results: Results) -> None:
+    """Send optimized trajectory, final verdicts, cloud and, in 2D, the occupancy grid to the recording."""
+    trajectory, grid = results.result.trajectory, results.grid
+    indices = np.arange(len(trajectory), dtype=np.int64)
+    recording.log_trajectory(trajectory.stamps_ns, trajectory.poses, indices)
+    recording.log_closures(results.judged, results.result.state)
+    recording.log_map(results.cloud.points)
+    if trajectory.dimension == 2:
         x_m, y_m = grid.origin_m.tolist()
         recording.log_grid(occupancy(grid), resolution_m=grid.resolution_m, origin_m=(x_m, y_m))
-    return cloud
 
 
 def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
-    """Cells as ROS counts them: 0 free to 100 occupied, −1 where nothing was seen."""
+    """Cells in the convention of ROS: 0 free to 100 occupied, −1 unknown."""
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
 
 def cloud_of(result: SlamResult, config: Config) -> Cloud:
-    """The cloud of all keyframes, without what moved if that is wished."""
+    """The cloud of all keyframes, without moving objects if the configuration says so."""
     dimension = result.trajectory.dimension
     built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()

@@ -26,28 +26,27 @@ from scanchain.maps import read_map, read_ply
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
 
-FILE = "results.mcap"
 _WORLD, _ODOM = "world", "odom"
 _PLANAR = [0, 1, 5]  # x, y, yaw among x, y, z, roll, pitch, yaw
 
 
-def write_results_mcap(folder: Path, log: Log, steps: StepTable, result: SlamResult) -> None:
+def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResult) -> None:
     """Write /tf and /odometry scan by scan, and /path, /map and /map_cloud at the log time of the first.
 
     world → odom is the correction by loop closures, odom → the robot the odometry; the robot's frame is the root
-    of the log's fixed transforms, so that the log's own sensors follow it. ``folder`` holds the maps.
+    of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it.
     """
     moving = moving_frame(log)
     first_ns, first_log_ns = steps.rows[0].stamp_ns, steps.rows[0].log_time_ns
-    with LogWriter(folder / FILE) as writer:
+    with LogWriter(path) as writer:
         trajectory = result.trajectory
-        path = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
-        data = pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), path)
+        places = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
+        data = pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), places)
         writer.append("/path", "nav_msgs/msg/Path", data, first_ns, first_log_ns)
-        cells, resolution_m, (x_m, y_m) = read_map(folder)
+        cells, resolution_m, (x_m, y_m) = read_map(path.parent)
         data = pack_grid(first_ns, _WORLD, cells, resolution_m, ORIGIN._replace(x=x_m, y=y_m))
         writer.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
-        data = pack_cloud(first_ns, _WORLD, _rows(read_ply(folder / "map.ply")))
+        data = pack_cloud(first_ns, _WORLD, _rows(read_ply(path.with_name("map.ply"))))
         writer.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)
         _write_motion(writer, moving, steps, trajectory.poses)
 

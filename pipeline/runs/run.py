@@ -12,20 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.clock import compiled_s, working_s
+from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config, RecordingConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.logs import Log, open_log
-from scanchain.runs.compiling import telling_of_compilation
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
-from scanchain.runs.job import Job
+from scanchain.runs.job import Job, OpenRecorder, Progress
 from scanchain.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from scanchain.runs.processing import TruePoses, process
-from scanchain.runs.progress import Progress
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
-from scanchain.runs.recorder import OpenRecorder
 from scanchain.runs.resume.journal import JOURNAL_FILE
 from scanchain.runs.resume.rescue import rescued
 from scanchain.runs.resume.resuming import Left, find_left
@@ -80,8 +77,8 @@ def run(
     steps = StepTable() if left is None else left.steps
     started -= 0.0 if left is None else left.checkpoint.run_s
     _tell_beginning(job, left, progress)
-    rehearsal = ("scanchain.runs.rehearsal", str(log.dimension))
-    with directory, Hashing(job.logs) as hashing, telling_of_compilation(progress, rehearsal):
+    warm_up = ("scanchain.runs.warm_up", str(log.dimension))
+    with directory, Hashing(job.logs) as hashing, announcing_compilation(progress.say, warm_up):
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.comparison.methods import Method, resolve
-from scanchain.comparison.runner import Runner, start
-from scanchain.comparison.worker import warm_up
+from scanchain.comparison.worker import Runner, start, warm_up
 from scanchain.config import LogConfig
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError

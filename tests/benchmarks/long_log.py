@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.logs import open_log
-from scanchain.memory import resident_mib
 from scanchain.odometry import Odometry
+from scanchain.processes import resident_mib
 from scanchain.settings import load_settings
 from scanchain.simulation import SENSORS, simulate
 

@@ -15,7 +15,7 @@ from time import thread_time
 
 from scanchain import Slam
 from scanchain.logs import open_log
-from scanchain.memory import resident_mib
+from scanchain.processes import resident_mib
 from scanchain.settings import load_settings
 from scanchain.simulation import SENSORS, simulate
 

@@ -19,7 +19,7 @@ from scanchain import lie
 from scanchain.data import Trajectory, Verdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
-from scanchain.runs.verdicts import final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
 from scanchain.slam import SlamResult

@@ -30,7 +30,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
-from scanchain.runs.verdicts import JudgedClosure, final_verdicts
+from scanchain.runs.closures import JudgedClosure, final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of

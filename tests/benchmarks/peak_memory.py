@@ -14,7 +14,7 @@ from pathlib import Path
 
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
-from scanchain.memory import peak_mib
+from scanchain.processes import peak_mib
 from tests.benchmarks.contest import create
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -107,7 +107,7 @@ def track(path: Path) -> float:
 
 def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
     """A run in this process, which was begun at that time, with a watch over what it consists of."""
-    from scanchain import __main__ as command
+    from scanchain import api
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.loops import LoopCloser
     from scanchain.point_store import PointStore
@@ -125,11 +125,11 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("journal", Journal, "append")
     watch.over("map", results, "build_point_map", "write_ply", "draw_grid", "write_map")
     watch.over("what moved", results, "moved")
-    watch.over("other results", processing, "write_results", "write_closures")
+    watch.over("other results", processing, "write_results", "record_results")
     watch.over("other results", StepTable, "write")
     watch.over("other results", run, "_judge", "measure")
-    watch.over("report", command, "_report")
-    open_recording = command._record
+    watch.over("report", api, "write_report")
+    open_recording = api.open_recorder
 
     def record(*arguments: Any, **options: Any) -> Any:
         recording = open_recording(*arguments, **options)
@@ -137,9 +137,9 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
         watch.over("recording", sys.modules["scanchain.viz.recording.messages"].Message, "send")
         return recording
 
-    command._record = watch.timed("recording", record)
+    api.open_recorder = watch.timed("recording", record)
     with tempfile.TemporaryDirectory() as folder:
-        assert command.main(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
+        assert main(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
     return watch.seconds
 
 

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scanchain.comparison.evidence import RELATIONS_FILE, SCANS_FILE
+from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
-from scanchain.viz.pictures.trajectories import Course, Floats, color_of
+from scanchain.viz.pictures.trajectory_figures import Course, Floats, color_of
 
 
 def read_courses(directory: Path) -> list[Course]:

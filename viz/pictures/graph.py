@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import GraphState
 from scanchain.graph.optimization import GraphChange, fit
-from scanchain.viz.pictures.figure_file import write_figure
+from scanchain.viz.pictures.figure import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.study import Estimate, Study
-from scanchain.viz.pictures.figure_file import write_figure
+from scanchain.viz.pictures.figure import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,8 +9,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.data import Points
-from scanchain.viz.pictures.svg import INK, Sheet
-from scanchain.viz.pictures.trajectories import CLOSURES, Course, Floats, PathLine
+from scanchain.viz.pictures.figure import INK, Sheet
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, Course, Floats, PathLine
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000

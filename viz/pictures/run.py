@@ -1,16 +1,161 @@
-"""A run directory as one picture: its ways over its map."""
+"""A run as one picture: its trajectories, before and after optimization, over its map, seen from above."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.plots import GridPicture, draw_map
+from scanchain.viz.pictures.figure import write_figure
+from scanchain.viz.pictures.map_figures import extent
+from scanchain.viz.pictures.trajectory_figures import TRUTH
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_WIDTH_INCHES = 8.0
+_MAX_POINTS = 400_000
+_ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
+_POINTS = "#8a8f98"
+_FREE, _OCCUPIED = 35, 65  # percent; what is below is drawn white, above dark
+_UNKNOWN = 0.90
+
+
+@dataclass(frozen=True, slots=True)
+class GridPicture:
+    """An occupancy grid: cells (H, W) from 0 free to 100 occupied, −1 unknown; row 0 at the lowest y.
+
+    ``origin_m`` : x, y of the outer corner of cells[0, 0]
+    """
+
+    cells: NDArray[np.int8]
+    resolution_m: float
+    origin_m: tuple[float, float]
+
+
+def draw_map(
+    path: Path,
+    *,
+    title: str,
+    optimized: Matrix,
+    odometry: Matrix | None = None,
+    ground_truth: Matrix | None = None,
+    points: NDArray[np.floating] | None = None,
+    grid: GridPicture | None = None,
+) -> None:
+    """Draw ways (N, d+1, d+1) over a map, all in the world frame, to a PNG.
+
+    points : (M, d) of the map; of a 3D one the height is the shade
+    ground_truth : moved onto the estimate beforehand; nothing is aligned here
+    """
+    ways = [way for way in (optimized, odometry, ground_truth) if way is not None and len(way)]
+    low, high = _frame(ways, points, grid)
+    figure, axes = _paper(low, high)
+    if grid is not None:
+        _draw_grid(axes, grid)
+    if points is not None and len(points):
+        _draw_points(axes, points)
+    _draw_way(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
+    _draw_way(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
+    _draw_way(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
+    _mark_ends(axes, optimized)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_title(title, loc="left", fontsize=11)
+    if len(ways):
+        axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    write_figure(path, figure, dpi=150)
+
+
+def _frame(
+    ways: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of what must be seen: every way, the map but for outliers, and a margin."""
+    corners: list[NDArray[np.floating]] = [way[:, :2, -1] for way in ways]
+    if points is not None and len(points):
+        corners.append(np.array(extent(points[:, :2])))
+    elif grid is not None:
+        rows, columns = np.nonzero(grid.cells >= _OCCUPIED)
+        if len(rows):
+            seen = np.array(extent(np.stack([columns, rows], axis=-1).astype(np.float64)))
+            corners.append(np.array(grid.origin_m) + grid.resolution_m * seen)
+    known = np.concatenate(corners) if corners else np.zeros((1, 2))
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(0.04 * float((high - low).max()), 1.0)
+    return low - margin, high + margin
+
+
+def _paper(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure, Axes]:
+    """A sheet in the proportions of the map."""
+    from matplotlib.figure import Figure
+
+    width, height = high - low
+    figure = Figure(
+        figsize=(_WIDTH_INCHES, float(np.clip(_WIDTH_INCHES * height / width, 3.0, 12.0))), layout="constrained"
+    )
+    axes = figure.add_subplot()
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.tick_params(labelsize=9, color="#999999")
+    for spine in axes.spines.values():
+        spine.set_color("#cccccc")
+    return figure, axes
+
+
+def _draw_grid(axes: Axes, grid: GridPicture) -> None:
+    """Free white, occupied dark, unknown a light gray, like the paper around the grid."""
+    share = np.clip((grid.cells - float(_FREE)) / (_OCCUPIED - _FREE), 0.0, 1.0)
+    shade = np.where(grid.cells < 0, _UNKNOWN, 1.0 - 0.85 * share)
+    axes.set_facecolor((_UNKNOWN, _UNKNOWN, _UNKNOWN))
+    rows, columns = grid.cells.shape
+    (x, y), size_m = grid.origin_m, grid.resolution_m
+    extent = (x, x + size_m * columns, y, y + size_m * rows)
+    axes.imshow(shade, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="antialiased")
+
+
+def _draw_points(axes: Axes, points: NDArray[np.floating]) -> None:
+    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    size = float(np.clip(60_000.0 / len(shown), 0.15, 2.0))
+    if points.shape[1] == 2:
+        axes.scatter(shown[:, 0], shown[:, 1], s=size, c=_POINTS, linewidths=0, rasterized=True)
+        return
+    low, high = np.percentile(shown[:, 2], (2.0, 98.0))
+    order = np.argsort(shown[:, 2])
+    axes.scatter(
+        shown[order, 0], shown[order, 1], s=size, c=shown[order, 2], cmap="bone_r",
+        vmin=low - 0.6 * (high - low), vmax=high, linewidths=0, rasterized=True,
+    )  # fmt: skip
+
+
+def _draw_way(
+    axes: Axes, way: Matrix | None, name: str, color: str, style: str | tuple[int, tuple[int, int]], width: float
+) -> None:
+    """Draw one line, its length in the legend."""
+    if way is None or not len(way):
+        return
+    x, y = way[:, 0, -1], way[:, 1, -1]
+    length_m = float(np.linalg.norm(np.diff(way[:, :-1, -1], axis=0), axis=1).sum())
+    axes.plot(x, y, color=color, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
+
+
+def _mark_ends(axes: Axes, way: Matrix) -> None:
+    if not len(way):
+        return
+    marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
+    axes.plot(*way[0, :2, -1], marker="o", label="start", **marks)
+    axes.plot(*way[-1, :2, -1], marker="s", label="end", **marks)
 
 
 def draw_run(directory: Path, picture: Path) -> None:

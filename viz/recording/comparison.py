@@ -11,12 +11,12 @@ import pyarrow.parquet as pq
 import rerun as rr
 import rerun.blueprint as rrb
 
-from scanchain.comparison.evidence import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.compared_trajectories import read_courses
-from scanchain.viz.pictures.trajectories import Course
+from scanchain.viz.pictures.trajectory_figures import Course
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.blueprint import eye, time_panel, up_to_now, whole_log
 from scanchain.viz.recording.messages import Message, Times

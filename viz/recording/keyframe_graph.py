@@ -11,8 +11,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from scanchain.data import Closure, GraphState, Step, Verdict
+from scanchain.runs.closures import JudgedClosure, final_verdicts
 from scanchain.runs.step_table import StepRow
-from scanchain.runs.verdicts import JudgedClosure, final_verdicts
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
 

@@ -19,9 +19,9 @@ from rerun.error_utils import catch_and_log_exceptions
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step
 from scanchain.errors import InputError
-from scanchain.runs.recorder import SinkName
+from scanchain.runs.closures import JudgedClosure
+from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepRow
-from scanchain.runs.verdicts import JudgedClosure
 from scanchain.viz.recording import entities, shapes, viewer
 from scanchain.viz.recording.batching import Batcher
 from scanchain.viz.recording.blueprint import blueprint

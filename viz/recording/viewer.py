@@ -1,4 +1,4 @@
-"""rerun's viewer as a process of its own, and whether one listens; it is never waited for without a limit."""
+"""rerun's viewer as a process of its own, in a window or a browser; it is never waited for without a limit."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, sleep
 from urllib.parse import quote
 
-from scanchain.errors import ScanchainError
+from scanchain.errors import InputError, ScanchainError
 
 HOST = "127.0.0.1"
 PORT = 9876
@@ -115,3 +117,33 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
             return
         sleep(0.02)
     raise ViewerError(f"no viewer: it did not answer within {_START_S:.0f} s; try `rerun` on its own")
+
+
+def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
+    """Open a .rrd file: a window that lives on by itself, or a page served on this machine until Ctrl-C.
+
+    tell : told the page's address
+    """
+    if in_browser:
+        _serve(path, tell)
+        return
+    if not has_display():
+        raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
+    command = [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, str(path), "--new"]
+    subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
+
+
+def _serve(path: Path, tell: Callable[[str], None]) -> None:
+    """Until KeyboardInterrupt; whatever ends this ends the server."""
+    server = start_web(PORT, WEB_PORT, path)
+    try:
+        address = web_address(PORT, WEB_PORT)
+        tell(address)
+        if has_display():
+            webbrowser.open(address)
+        code = server.wait()
+        raise ViewerError(f"the web viewer of {path} ended with code {code}; try `rerun {path}` on its own")
+    except KeyboardInterrupt:
+        return
+    finally:
+        stop(server)

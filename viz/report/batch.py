@@ -16,8 +16,8 @@ from scanchain.batch.task import Row, State, said_file
 from scanchain.runs.metrics import Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.svg import Sheet
-from scanchain.viz.pictures.trajectories import color_of
+from scanchain.viz.pictures.figure import Sheet
+from scanchain.viz.pictures.trajectory_figures import color_of
 from scanchain.viz.report import page
 from scanchain.viz.report.page import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
 from scanchain.words import counted

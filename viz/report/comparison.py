@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain.comparison.columns import Column, columns_of
-from scanchain.comparison.evidence import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.figures import Column, columns_of
 from scanchain.comparison.outcome import CLOSURES_FILE, Status
+from scanchain.comparison.results import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
 from scanchain.comparison.table import Row as TableRow
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
@@ -18,14 +18,14 @@ from scanchain.trajectory import read_tum
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.compared_trajectories import read_courses
 from scanchain.viz.pictures.map_figures import map_picture, surroundings
-from scanchain.viz.pictures.trajectories import Course, Floats
+from scanchain.viz.pictures.trajectory_figures import Course, Floats
 from scanchain.viz.report.page import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
-from scanchain.viz.report.provenance import provenance_folds
-from scanchain.viz.report.trajectory_sections import (
+from scanchain.viz.report.sections import (
     chip,
     error_section,
     knowledge_section,
     loop_section,
+    provenance_folds,
     relation_section,
     time_section,
     way_section,

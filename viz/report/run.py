@@ -16,26 +16,23 @@ from scanchain.data import Pose, Trajectory
 from scanchain.evaluation import absolute_error_on_any_course, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
-from scanchain.runs.consistency import nees_of_steps
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
-from scanchain.runs.metrics import Metrics
+from scanchain.runs.metrics import Accuracy, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
-from scanchain.runs.step_table import STAGES
+from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.trajectories import Course, Floats, color_of
-from scanchain.viz.report.map_viewer import SCRIPT
-from scanchain.viz.report.page import REPORT_FILE, Fold, Page, Section, write_page
-from scanchain.viz.report.provenance import provenance_folds
-from scanchain.viz.report.run_tables import accuracy_section, stages_section
-from scanchain.viz.report.trajectory_section import Told, trajectory_section
-from scanchain.viz.report.trajectory_sections import (
+from scanchain.viz.pictures.trajectory_figures import Course, Floats, color_of
+from scanchain.viz.report.page import REPORT_FILE, Cell, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.sections import (
     error_section,
     knowledge_section,
     loop_section,
+    provenance_folds,
     time_section,
     way_section,
 )
+from scanchain.viz.report.trajectory_map import SCRIPT, Told, trajectory_section
 from scanchain.words import counted
 
 
@@ -182,3 +179,49 @@ def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
 def _seconds(steps: pa.Table) -> Floats:
     """All stages but reading."""
     return np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)
+
+
+def accuracy_section(truth: GroundTruth) -> Section:
+    """How far off both ways were."""
+    rows = tuple(
+        Row(
+            name, tuple(Cell(text, is_bad=bool(complaint) and k == 0) for k, text in enumerate(_figures(accuracy)))
+        )
+        for name, accuracy, complaint in (
+            ("optimized", truth.optimized, truth.complaint),
+            ("odometry", truth.odometry, ""),
+        )
+    )
+    heads = (
+        Head("way"), Head("ATE", "m", "rmse"), Head("ATE mean", "m"), Head("ATE max", "m"), Head("ATE/path", "%"),
+        Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
+    )  # fmt: skip
+    missing = f", {truth.optimized.missing}" if truth.optimized.missing else ""
+    text = (
+        f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."
+    )
+    return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimized.definition,)))
+
+
+def stages_section(metrics: Metrics) -> Section:
+    """Time by stage."""
+    heads = (Head("stage"), *(Head(stage, "ms") for stage in STAGES), Head("all but read", "ms"))
+    names = (*STAGES, "all_but_read")
+    rows = [
+        Row(name, tuple(Cell(f"{figures_ms[stage]:.2f}") for stage in names))
+        for name, figures_ms in (("median", metrics.median_ms), ("95th percentile", metrics.p95_ms))
+    ]
+    return Section("Time of a scan", grid=Grid(heads, tuple(rows)))
+
+
+def _figures(accuracy: Accuracy) -> Iterator[str]:
+    for value, scale, digits in (
+        (accuracy.ate_rmse_m, 1.0, 4),
+        (accuracy.ate_mean_m, 1.0, 4),
+        (accuracy.ate_max_m, 1.0, 4),
+        (accuracy.ate_share_of_path, 100.0, 3),
+        (accuracy.ate_rotation_rmse_rad, np.degrees(1.0), 3),
+        (accuracy.kitti_translation_share, 100.0, 3),
+        (accuracy.kitti_rotation_rad_per_m, np.degrees(1.0), 4),
+    ):
+        yield "–" if value is None else f"{scale * value:.{digits}f}"

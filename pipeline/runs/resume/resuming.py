@@ -10,7 +10,7 @@ from pathlib import Path
 from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
-from scanchain.runs.recorder import Recorder
+from scanchain.runs.job import Recorder
 from scanchain.runs.resume.checkpoint import Checkpoint, Checkpoints, read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.runs.step_table import StepRow, StepTable

@@ -1,18 +1,71 @@
-"""A method in a process of its own, and how it ended."""
+"""Every method over the stored scans, run by run, each in a process of its own with limits on time and memory."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import REPORT_FILE, SECONDS_FILE, EndReport, Status
+from scanchain.comparison.outcome import REPORT_FILE, SECONDS_FILE, EndReport, Outcome, Status, read_outcome
+from scanchain.comparison.scan_store import StoredScans
 from scanchain.comparison.worker import METHOD_FILE
-from scanchain.watched import Ending, KilledFor, Limits, run_within
+from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
+from scanchain.runs.job import Progress
+
+_LEAST_S, _SCAN_S = 300.0, 1.0  # of the time limit
+_SHARE = 0.75  # of the memory that is free
+
+
+def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
+    """The limits asked for, else 300 s and one more a scan, and three quarters of the memory that is free."""
+    return Limits(
+        _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
+        _SHARE * available_mib() if memory_mib is None else memory_mib,
+    )
+
+
+def race(
+    methods: Sequence[Method],
+    scans: StoredScans,
+    folder: Path,
+    *,
+    repeat: int,
+    limits: Limits,
+    progress: Progress,
+) -> dict[str, list[Outcome]]:
+    """``repeat`` runs of every method, each round starting with another one; one not installed is tried once."""
+    outcomes: dict[str, list[Outcome]] = {method.name: [] for method in methods}
+    for turn in range(repeat):
+        for place in range(len(methods)):
+            method = methods[(place + turn) % len(methods)]
+            if any(outcome.report.status is Status.MISSING for outcome in outcomes[method.name]):
+                continue
+            outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
+            if outcome.is_whole and outcome.report.has_compiled:
+                progress.say(f"{method.name}: compiled its kernels, once after the installation; run anew")
+                outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
+            outcomes[method.name].append(outcome)
+            progress.say(_said(method.name, turn, repeat, outcome))
+    return outcomes
+
+
+def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Outcome:
+    folder.mkdir()
+    report = run_watched(method, scans.folder, folder, limits)
+    return read_outcome(folder, report, scans.stamps_ns, scans.dimension)
+
+
+def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
+    which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
+    if outcome.report.status is Status.OK:
+        return f"{name}{which}: {outcome.seconds.sum():.1f} s"
+    return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
+
 
 _LOOK_S = 0.02
 _WORDS = 300  # of what a process said last

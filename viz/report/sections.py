@@ -1,8 +1,9 @@
-"""The parts of a report that speak of courses; those of which nothing is known are left out."""
+"""Sections that reports of runs and of comparisons share; those without data are left out."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,10 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from scanchain.runs.provenance import Provenance
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import loops_picture
-from scanchain.viz.pictures.trajectories import CLOSURES, TRUTH, Course, Floats
-from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, Course, Floats
+from scanchain.viz.report.page import Cell, Chip, Drawing, Fold, Grid, Head, Row, Section
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _MEDIANS = "Of long logs, medians of neighboring scans."
@@ -186,3 +188,13 @@ def _millimeters(value_m: float) -> str:
 
 def _with(courses: Sequence[Course], key: str) -> list[Course]:
     return [course for course in courses if np.isfinite(getattr(course, key)).any()]
+
+
+def provenance_folds(made: Provenance, others: dict[str, str]) -> Iterator[Fold]:
+    """The command, and the versions that it ran with."""
+    yield Fold("Command", shlex.join(made.command))
+    versions = {"python": made.python} | made.versions | others
+    yield Fold("Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items()))
+    yield Fold(
+        "Log files", "\n".join(f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
+    )

@@ -1,14 +1,18 @@
-"""A small drawing that becomes an SVG inside a page and takes the page's colors, light or dark."""
+"""Figures by matplotlib: an SVG inside a page that takes its colors, light or dark, or a PNG file."""
 
 from __future__ import annotations
 
 import io
 import re
+from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+
+from scanchain.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,3 +95,10 @@ class Sheet:
         for color, variable in _VARIABLES.items():
             text = text.replace(color, variable)
         return Markup(text)
+
+
+def write_figure(path: Path, figure: Figure, **options: Any) -> None:
+    """Write it on white; ``options`` are those of savefig. Raises OSError."""
+    picture = BytesIO()
+    figure.savefig(picture, facecolor="white", format="png", **options)
+    write_whole(path, picture.getvalue())

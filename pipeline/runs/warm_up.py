@@ -1,6 +1,4 @@
-"""What comes after odometry, done with a few made-up scans: its kernels are compiled, once and for all.
-
-    python -m scanchain.runs.rehearsal 3
+"""``python -m scanchain.runs.warm_up 3``: compile what comes after odometry with a few synthetic scans.
 
 A run whose kernels have to be compiled first starts this beside itself, on a core that it does not need yet.
 """
@@ -24,8 +22,8 @@ _STEP_M = 1.0
 _POINTS = 100
 
 
-def rehearse(dimension: int) -> None:
-    """Place scans of a lidar that drives straight on, optimize, draw the maps; write nothing."""
+def warm_up(dimension: int) -> None:
+    """Compile by processing scans of a lidar that drives straight on: pose graph and both maps; write nothing."""
     config = load_settings(dimension).config
     slam = Slam(config, lie.identity(dimension))
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
@@ -48,4 +46,4 @@ def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Loca
 
 
 if __name__ == "__main__":
-    rehearse(int(sys.argv[1]))
+    warm_up(int(sys.argv[1]))

@@ -1,0 +1,176 @@
+"""Options that commands share: the LOG argument, configuration keys as flags, --gt, limits, output checks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scanchain.errors import InputError
+from scanchain.settings import Override
+from scanchain.source import Source, source_of
+
+
+class OnceCommand(click.Command):
+    """Refuses an option given twice that holds one value: the last would win without a word."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments once for what is named twice, then as usual."""
+        _, _, named = self.make_parser(ctx).parse_args(args=list(args))
+        for parameter, count in Counter(named).items():
+            if count > 1 and isinstance(parameter, click.Option) and _holds_one_value(parameter):
+                raise click.UsageError(f"{parameter.opts[0]} is given {count} times; give it once", ctx)
+        return super().parse_args(ctx, args)
+
+
+def _holds_one_value(option: click.Option) -> bool:
+    return not (option.multiple or option.is_flag or option.count)
+
+
+class OverrideCommand(OnceCommand):
+    """Takes any configuration key as ``--section.key value``.
+
+    Options with a dot in their name are taken out of the arguments before click sees the rest.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Split the arguments into overrides, kept in the context, and ordinary ones."""
+        rest: list[str] = []
+        overrides: list[Override] = []
+        words = iter(args)
+        for word in words:
+            if word == "--":
+                rest += [word, *words]
+                break
+            flag, equals, text = word.partition("=")
+            if not flag.startswith("--") or "." not in flag:
+                rest.append(word)
+                continue
+            if not equals:
+                text = next(words, "")
+                if not text:
+                    raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
+            overrides.append(Override(flag[2:], text, flag))
+        ctx.meta[_KEY] = tuple(overrides)
+        return super().parse_args(ctx, rest)
+
+
+def overrides(ctx: click.Context, aliases: Sequence[Override] = ()) -> tuple[Override, ...]:
+    """The keys that a command's options set: ``aliases`` as --matcher, and the ``--section.key`` options.
+
+    Raises click.UsageError where two of them set the same key.
+    """
+    chosen: dict[str, Override] = {}
+    for override in (*aliases, *ctx.meta[_KEY]):
+        other = chosen.setdefault(override.key, override)
+        if other is override:
+            continue
+        if other.flag == override.flag:
+            raise click.UsageError(
+                f"{other.flag} is given twice ({other.text}, {override.text}); give it once", ctx
+            )
+        raise click.UsageError(f"{other.flag} and {override.flag} both set {override.key}; give one of them", ctx)
+    return tuple(chosen.values())
+
+
+def alias(key: str, value: Any, flag: str) -> tuple[Override, ...]:
+    """The key that an option of its own sets, none where the option was not given."""
+    return () if value is None else (Override(key, str(value), flag),)
+
+
+_KEY = "scanchain.commands.overrides"
+
+
+class _LogType(click.ParamType):
+    name = "log"
+
+    def convert(self, value: str | Source, param: click.Parameter | None, ctx: click.Context | None) -> Source:
+        """What a word names."""
+        return source_of(value)
+
+
+LOG = _LogType()
+
+
+def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
+    """The option ``--max-gap``."""
+    return click.option(
+        "--max-gap",
+        type=float,
+        callback=_checked_gap,
+        metavar="SECONDS",
+        help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
+    )(command)
+
+
+def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not 0.0 <= value < inf:
+        raise InputError(f"--max-gap is {value:g} s; choose a number from 0 up")
+    return value
+
+
+def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
+    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
+    if text is None:
+        return None, ()
+    path = Path(text)
+    if text.startswith("/") and not path.exists() and not path.suffix:
+        return None, (Override("log.ground_truth_topic", text, "--gt"),)
+    return path, ()
+
+
+_MIB_PER_GIB = 1024.0
+_ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
+
+
+class _MemoryType(click.ParamType):
+    """A number of GiB, handed on in MiB."""
+
+    name = "memory"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        return _MIB_PER_GIB * _ABOVE_ZERO.convert(value, param, ctx)
+
+
+def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
+    """``--time-limit`` as ``time_limit`` in seconds, ``--memory-limit`` as ``memory_mib``; None where not given.
+
+    what : that is limited; time_default, memory_default : what holds otherwise, in words
+    """
+
+    def decorate(command: Any) -> Any:
+        for option in (
+            click.option(
+                "--memory-limit",
+                "memory_mib",
+                type=_MemoryType(),
+                metavar="GIB",
+                help=f"What {what} may take. [default: {memory_default}]",
+            ),
+            click.option(
+                "--time-limit",
+                type=_ABOVE_ZERO,
+                metavar="SECONDS",
+                help=f"What {what} may take. [default: {time_default}]",
+            ),
+        ):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def check_output(path: Path, *, force: bool, endings: Sequence[str] = ()) -> None:
+    """Refuse what could not be written after the work, would replace something, or has none of these suffixes."""
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file")
+    if endings and path.suffix not in endings:
+        raise InputError(f"{path}: name a file that ends in {' or '.join(endings)}")
+    if path.exists() and not force:
+        raise InputError(f"{path}: exists; choose another name, or --force to replace it")

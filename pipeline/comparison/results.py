@@ -1,0 +1,187 @@
+"""Results of a comparison, and its files beside the table: tables of scans and relations, a folder a method."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.comparison.judging import Judged, judge, observability, representative
+from scanchain.comparison.methods import Method
+from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
+from scanchain.comparison.scan_store import StoredScans
+from scanchain.data import Matrix, Points, Trajectory
+from scanchain.evaluation import Relations, during
+from scanchain.evaluation.absolute import path_length
+from scanchain.maps import write_ply
+from scanchain.runs.step_table import pose_columns
+from scanchain.trajectory import write_tum
+
+SCANS_FILE, RELATIONS_FILE = "per_scan.parquet", "per_relation.parquet"
+SETTINGS_FILE, TRUTH_FILE = "settings.toml", "ground_truth.tum"
+_PICTURE_POINTS = 150_000
+METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tum"
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What errors are against: poses, relations, both or nothing; ``note`` says what is missing."""
+
+    truth: Trajectory | None
+    relations: Relations | None
+    source: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """All runs of all methods by name, what was found of each, and the map (M, d) of each that came to its end."""
+
+    methods: Sequence[Method]
+    scans: StoredScans
+    outcomes: Mapping[str, list[Outcome]]
+    judged: Mapping[str, Judged]
+    maps: Mapping[str, Points]
+    reference: Reference
+
+
+def write_evidence(folder: Path, evidence: Evidence) -> None:
+    """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
+    write_scans(folder / SCANS_FILE, list(_runs(evidence)), evidence.scans.stamps_ns)
+    write_relations(folder / RELATIONS_FILE, evidence.judged)
+    if evidence.reference.truth is not None:
+        write_tum(folder / TRUTH_FILE, during(evidence.reference.truth, evidence.scans.stamps_ns))
+    settings = {method.name: {"method": method.base} | method.settings for method in evidence.methods}
+    (folder / SETTINGS_FILE).write_text(tomli_w.dumps(settings), encoding="utf-8")
+    for method in evidence.methods:
+        _write_method(method_folder(folder, method.name), evidence, method.name)
+
+
+def _runs(evidence: Evidence) -> Iterator[RunOfMethod]:
+    """Every run, judged by itself."""
+    stamps_ns, truth = evidence.scans.stamps_ns, evidence.reference.truth
+    for name, outcomes in evidence.outcomes.items():
+        for repeat, outcome in enumerate(outcomes):
+            stands_for_all = outcome is representative(outcomes)
+            judged = evidence.judged[name] if stands_for_all else judge([outcome], stamps_ns, truth, None)
+            yield RunOfMethod(name, repeat, outcome, judged)
+
+
+def method_folder(folder: Path, name: str) -> Path:
+    """Where the files of a method lie."""
+    return folder / METHODS_FOLDER / quote(name, safe="+ ")
+
+
+def _write_method(own: Path, evidence: Evidence, name: str) -> None:
+    outcome, judged = representative(evidence.outcomes[name]), evidence.judged[name]
+    own.mkdir(parents=True)
+    if outcome.is_whole:
+        write_tum(own / TRAJECTORY_FILE, outcome.trajectory)
+    if name in evidence.maps:
+        write_ply(own / MAP_FILE, picture_points(evidence.maps[name], judged))
+    for file in (STEPS_FILE, CLOSURES_FILE, "output.txt"):
+        source = outcome.folder / file
+        if source.exists() and source.stat().st_size:
+            shutil.copy(source, own / file)
+
+
+_NOTES = {
+    "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
+    "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
+    "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
+    "distance_m": "traveled up to the scan, by the method itself",
+    "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
+    "nees": "of the motion up to the scan; null where the method does not tell its covariance",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunOfMethod:
+    """A run of a method, and what was found of it."""
+
+    name: str
+    repeat: int
+    outcome: Outcome
+    judged: Judged
+
+
+def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.int64]) -> None:
+    """Write the scans of all runs, those that failed up to where they came."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    tables = [pa.table(_columns(run, stamps_ns)) for run in runs]
+    pq.write_table(pa.concat_tables(tables).replace_schema_metadata(_NOTES), path, compression="zstd")
+
+
+def write_relations(path: Path, judged: Mapping[str, Judged]) -> None:
+    """Write the errors over relations, where there are any."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    errors = {name: each.relations for name, each in judged.items() if each.relations is not None}
+    tables = [
+        pa.table(
+            {
+                "method": pa.array([name] * len(error.used), pa.string()),
+                "relation": error.used,
+                "error_m": error.errors_m,
+                "error_rad": error.errors_rad,
+            }
+        )
+        for name, error in errors.items()
+    ]
+    if tables:
+        pq.write_table(pa.concat_tables(tables), path, compression="zstd")
+
+
+def final_poses(outcome: Outcome) -> Matrix:
+    """(M, 4, 4) the last word, or what there is of a run that failed."""
+    poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
+    broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
+    return lie.lift(poses[: broken[0]] if len(broken) else poses)
+
+
+def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object]:
+    import pyarrow as pa
+
+    poses = final_poses(run.outcome)
+    count = len(poses)
+    aligned = (run.judged.T_reference_estimate @ poses)[:, :3, 3]
+    known = observability(run.outcome)
+    known = known[:count] if len(known) else np.full(count, np.nan)
+    traveled_m = path_length(poses) if count else np.empty(0)
+    numbers = {
+        "seconds": run.outcome.seconds[:count],
+        "cpu_seconds": run.outcome.cpu_seconds[:count],
+        **pose_columns(poses),
+        **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
+        "distance_m": traveled_m,
+        "error_m": run.judged.errors_m[:count],
+        "error_rad": run.judged.errors_rad[:count],
+        "nees": run.judged.nees[:count],
+        "observability": known,
+    }
+    return {
+        "method": pa.array([run.name] * count, pa.string()),
+        "repeat": pa.array([run.repeat] * count, pa.int64()),
+        "index": pa.array(np.arange(count)),
+        "stamp_ns": pa.array(stamps_ns[:count]),
+        **{name: pa.array(values, pa.float64(), from_pandas=True) for name, values in numbers.items()},
+    }
+
+
+def picture_points(points: Points, judged: Judged) -> Points:
+    """Some of a map's points (M, 3), in the frame of the ground truth where there is one."""
+    thinned = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
+    T = judged.T_reference_estimate
+    if points.shape[1] == 2:
+        T = lie.flatten(T)
+    return lie.transform(T, thinned)
