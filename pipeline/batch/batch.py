@@ -16,7 +16,7 @@ from scanchain.batch.attempt import attempt
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, finished_row, key_of, unfinished_row
 from scanchain.errors import InputError
-from scanchain.logs.remote.sizes import misspelled, spelled
+from scanchain.logs.files import misspelled, spelled
 from scanchain.memory import available_mib
 from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of

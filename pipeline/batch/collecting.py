@@ -7,7 +7,7 @@ from glob import glob
 from pathlib import Path
 
 from scanchain.errors import InputError
-from scanchain.logs.remote.files import matching
+from scanchain.logs.files import matching
 from scanchain.source import Source, source_of
 
 _WILD = frozenset("*?[")

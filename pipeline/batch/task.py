@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from scanchain.logs.remote.sizes import spelled
+from scanchain.logs.files import spelled
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings

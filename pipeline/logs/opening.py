@@ -6,19 +6,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from scanchain.errors import InputError
-from scanchain.logs.formats.bags import index_bag, parts_of_bag
+from scanchain.logs.files import RemoteFile, fetch_whole, misspelled
 from scanchain.logs.formats.carmen import index_carmen
 from scanchain.logs.formats.cloud_file import SUFFIXES
 from scanchain.logs.formats.cloud_folder import index_clouds
 from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from scanchain.logs.formats.made import KNOWN, left_out, natural_order, unknown
-from scanchain.logs.mcap.counting import complete
+from scanchain.logs.formats.ros2_bag import index_bag, parts_of_bag
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import MAGIC, FileIndex
-from scanchain.logs.remote.files import RemoteFile
-from scanchain.logs.remote.index import index_by_summary
-from scanchain.logs.remote.sizes import misspelled
-from scanchain.logs.remote.whole import fetch_whole
+from scanchain.logs.mcap.selection import complete
+from scanchain.logs.mcap.summary import index_by_summary
 from scanchain.source import Source
 
 HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.rate_hz has no effect

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
-from scanchain.logs.writing.ros2_definitions import schema_text
+from scanchain.logs.writing.pack import schema_text
 
 KNOWN = (
     "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "

@@ -7,13 +7,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages import foxglove, foxglove_json, foxglove_protobuf
-from scanchain.logs.messages.cdr import CdrReader
+from scanchain.logs.messages import foxglove
+from scanchain.logs.messages.cdr import CdrReader, Ros1Reader
 from scanchain.logs.messages.laser_scan import LaserScanMessage, read_laser_scan, read_multi_echo_scan
-from scanchain.logs.messages.livox import read_livox
-from scanchain.logs.messages.point_cloud import PointCloudMessage, read_point_cloud
+from scanchain.logs.messages.point_cloud import PointCloudMessage, read_livox, read_point_cloud
 from scanchain.logs.messages.poses import StampedPose, decode_odometry, decode_pose, decode_transforms
-from scanchain.logs.messages.ros1 import Ros1Reader
 
 Read = Callable[..., Any]
 _Bind = Callable[[Channel], Read]  # the reader of one channel
@@ -108,8 +106,8 @@ def _form_bound(read: Read, form: type[CdrReader], _: Channel) -> Read:
 def _foxglove(type_name: str, json_type: type, take: Read) -> dict[Kind, _Bind]:
     """A type of Foxglove's, in JSON and in Protobuf."""
     return {
-        Kind("json", type_name): lambda _: _both(partial(foxglove_json.parse, kind=json_type), take),
-        Kind("protobuf", type_name): lambda channel: _both(foxglove_protobuf.parser(channel), take),
+        Kind("json", type_name): lambda _: _both(partial(foxglove.parse_json, kind=json_type), take),
+        Kind("protobuf", type_name): lambda channel: _both(foxglove.protobuf_parser(channel), take),
     }
 
 
@@ -120,23 +118,23 @@ def _both(parse: Read, take: Read) -> Read:
 _SCANS: dict[Kind, _Bind] = {
     **_ros(("sensor_msgs/LaserScan",), read_laser_scan),
     **_ros(("sensor_msgs/MultiEchoLaserScan",), read_multi_echo_scan),
-    **_foxglove("foxglove.LaserScan", foxglove_json.LaserScan, foxglove.laser_scan),
+    **_foxglove("foxglove.LaserScan", foxglove.JsonLaserScan, foxglove.laser_scan),
 }
 _CLOUDS: dict[Kind, _Bind] = {
     **_ros(("sensor_msgs/PointCloud2",), read_point_cloud),
     **_ros(
         tuple(f"{p}/CustomMsg" for p in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")), read_livox
     ),
-    **_foxglove("foxglove.PointCloud", foxglove_json.PointCloud, foxglove.point_cloud),
+    **_foxglove("foxglove.PointCloud", foxglove.JsonPointCloud, foxglove.point_cloud),
 }
 _ODOMETRY: dict[Kind, _Bind] = _ros(("nav_msgs/Odometry",), decode_odometry)
 _POSES: dict[Kind, _Bind] = {
     **_ros(("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"), decode_pose),
-    **_foxglove("foxglove.PoseInFrame", foxglove_json.PoseInFrame, foxglove.pose_in_frame),
+    **_foxglove("foxglove.PoseInFrame", foxglove.JsonPoseInFrame, foxglove.pose_in_frame),
 }
 _TRANSFORMS: dict[Kind, _Bind] = {
     **_ros(("tf2_msgs/TFMessage", "tf/tfMessage"), decode_transforms),
-    **_foxglove("foxglove.FrameTransform", foxglove_json.FrameTransform, foxglove.frame_transform),
-    **_foxglove("foxglove.FrameTransforms", foxglove_json.FrameTransforms, foxglove.frame_transforms),
+    **_foxglove("foxglove.FrameTransform", foxglove.JsonFrameTransform, foxglove.frame_transform),
+    **_foxglove("foxglove.FrameTransforms", foxglove.JsonFrameTransforms, foxglove.frame_transforms),
 }
 LIDAR_TYPES = tuple(sorted({kind.type_name for kind in (*_SCANS, *_CLOUDS)}))

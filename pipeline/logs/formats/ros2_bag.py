@@ -12,11 +12,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from scanchain.errors import InputError
+from scanchain.logs.files import size_of
 from scanchain.logs.formats.made import made_index
 from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.remote.sizes import size_of
-from scanchain.logs.writing.ros2_definitions import schema_text
+from scanchain.logs.writing.pack import schema_text
 from scanchain.words import counted
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
