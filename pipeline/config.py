@@ -33,6 +33,8 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True):
 class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What is read from the log. Empty topics are found automatically.
 
+    ``format`` is the log format: found automatically, a known one by name, or ``module:Class`` of your own.
+
     Scans that are malformed or have no valid point are left out, counted and reported; a run stops when they are
     more than ``max_bad_scans_percent`` of all, rounded up: 0 allows none, anything above at least one.
     ``rate_hz`` is how often the scans of a folder come whose files are not named by their stamps.
@@ -40,6 +42,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     ``revolution_s`` for a turn that begins, at the stamp, at the azimuth ``revolution_start_rad`` (π is the rear).
     """
 
+    format: str = "auto"
     topic: str = ""
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"

@@ -65,7 +65,7 @@ class LogInfo:
 def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
     config = config or LogConfig()
-    indexes = index_files(sources, config.rate_hz)
+    indexes = index_files(sources, config)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
     wheels, truth = ("", "") if log is None else (log.odometry_topic, log.ground_truth_topic)

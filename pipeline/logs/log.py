@@ -56,7 +56,7 @@ def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig =
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
     instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
-    return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
+    return Log(index_files([source_of(each) for each in named], config), config)
 
 
 class Log:

@@ -18,7 +18,7 @@ from typing import IO, NamedTuple, Protocol
 import numpy as np
 
 from scanchain.errors import InputError
-from scanchain.logs.formats.made import made_block, made_channel, made_index, unknown
+from scanchain.logs.formats.made import UnknownFormatError, made_block, made_channel, made_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 from scanchain.source import Source
@@ -39,15 +39,21 @@ _PLAIN_BYTES = 1 << 20  # read at once
 _PACKED_BYTES = 64  # unpacked at once: what comes of so many before damage is lost with it
 
 
+def claims_carmen(_: Path, head: bytes) -> bool:
+    """Whether a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
+    word = head.split(maxsplit=1)[0] if head.strip() else b""
+    is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
+    return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
+
+
 def index_carmen(path: Path, number: int) -> FileIndex:
-    """Find the lines of a log. Raises InputError where the file holds none that is known."""
+    """Index the lines of a log. Raises UnknownFormatError where the file has none of a known kind."""
     text, damage = read_text(path)
     index = made_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
-        raise unknown(
-            path, text, damage.removeprefix(f"{path}: ") or f"text without a line of {b', '.join(KINDS).decode()}"
-        )
+        absent = f"text without a line of {b', '.join(KINDS).decode()}"
+        raise UnknownFormatError(text, damage.removeprefix(f"{path}: ") or absent)
     return index
 
 

@@ -35,7 +35,12 @@ _NOTHING = 0.1  # a contrast that speaks for no layout
 _NS = 1_000_000_000
 
 
-def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
+def claims_clouds(path: Path, _: bytes) -> bool:
+    """Whether it is a folder with such files."""
+    return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
+
+
+def index_clouds(folder: Path, number: int, rate_hz: float = 0.0) -> FileIndex:
     """The files of a folder as the scans of /points.
 
     rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names. Raises InputError where

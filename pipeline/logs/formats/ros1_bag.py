@@ -146,6 +146,11 @@ def _sized(data: Data, offset: int) -> _Span | None:
     return _Span(begin, begin + _LENGTH.unpack_from(data, offset)[0])
 
 
+def claims_ros1_bag(_: Path, head: bytes) -> bool:
+    """Whether a file begins as a bag of any version does."""
+    return head.startswith(b"#ROSBAG")
+
+
 def index_ros1_bag(path: Path, number: int) -> FileIndex:
     """What lies where in a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:

@@ -45,6 +45,11 @@ _MOST_TIMES = 20  # times as large as what is stored
 _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
 
 
+def claims_mcap(path: Path, head: bytes) -> bool:
+    """Whether a file begins as MCAP does, or has nothing to begin with, which is refused as a file of MCAP."""
+    return head.startswith(MAGIC) or not (head or path.is_dir())
+
+
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
     """Walk one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
 
