@@ -36,6 +36,7 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True):
 class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     """What is read from the log.
 
+    format : log format: found automatically, a known one by name, or ``module:Class`` of your own
     topic : lidar topic; found automatically where empty
     odometry_topic : wheel odometry, ``nav_msgs/Odometry`` or stamped poses; found automatically where empty
     ground_truth_topic : true poses, used for evaluation only
@@ -54,6 +55,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     prefetch_chunks : chunks of an MCAP file decompressed ahead of use
     """
 
+    format: str = "auto"
     topic: str = ""
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"

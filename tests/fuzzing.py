@@ -24,7 +24,6 @@ from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.limits import RangeLimits
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
@@ -37,6 +36,7 @@ from scanchain.logs.messages.readers import (
     scan_reader,
     transforms_reader,
 )
+from scanchain.logs.messages.returns import RangeLimits
 
 LONGEST_S = 5.0  # of CPU, so that a busy machine makes no difference
 LONGEST_WAIT_S = 120.0

@@ -105,7 +105,7 @@ def many_chunks(folder, compression=None):
 
 
 def test_a_db3_of_many_blocks_gives_each_scan_once_in_order(tmp_path, monkeypatch):
-    monkeypatch.setattr("scanchain.logs.formats.bags._BLOCK_BYTES", 4000)
+    monkeypatch.setattr("scanchain.logs.formats.ros2_bag._BLOCK_BYTES", 4000)
     sweeps, ros = recorders.clouds(60), Ros(recorders.ROS2)
     told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
     log, scans = read(recorders.bag2_of(tmp_path / "a", told))

@@ -7,7 +7,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.errors import InputError
-from scanchain.logs.writing.ros2_definitions import schema_text
+from scanchain.logs.writing.pack import schema_text
 from scanchain.logs.writing.writer import LogWriter
 
 STAMP_NS = 1_700_000_000_123_456_789

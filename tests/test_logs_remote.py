@@ -16,11 +16,10 @@ from web_server import serving
 from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
-from scanchain.logs import open_log
+from scanchain.logs import files, open_log
 from scanchain.logs.mcap import read_ahead
 from scanchain.logs.mcap.read_ahead import ReadAhead, merged
 from scanchain.logs.opening import index_files
-from scanchain.logs.remote import files
 from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate

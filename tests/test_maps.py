@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.baselines.open3d_pairs import Open3dPairs
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError
-from scanchain.logs.formats.pcd import read_pcd
+from scanchain.logs.formats.cloud_file import read_pcd
 from scanchain.maps import (
     OccupancyGrid,
     PointMap,

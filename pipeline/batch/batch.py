@@ -16,8 +16,7 @@ import msgspec
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
 from scanchain.errors import InputError
-from scanchain.logs.remote.files import matching
-from scanchain.logs.remote.sizes import misspelled, spelled
+from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.processes import available_mib
 from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of

@@ -13,7 +13,7 @@ from threading import Event
 import msgspec
 from msgspec import Struct
 
-from scanchain.logs.remote.sizes import spelled
+from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import package_version

@@ -12,7 +12,9 @@ from scanchain.errors import InputError
 from scanchain.settings import load_settings
 from scanchain.source import Source
 
-_KEYS = tuple(f"log.{name}" for name in ("rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks"))
+_KEYS = tuple(
+    f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks")
+)
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
@@ -45,6 +47,7 @@ def convert(
       an address          https:// or s3://, of any of the files above
       a folder of clouds  PCD, PLY, .npy or .bin of rows x y z (intensity ...), named by their stamps, or with
                           --log.rate_hz
+      a format of yours   read by a class of your own, --log.format my_module:MyFormat
 
     Messages stay as they are. Keys that choose some: --topic (one of several lidars), --log.start_s,
     --log.end_s, --log.every.

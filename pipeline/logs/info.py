@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
+from scanchain.logs.files import size_of
 from scanchain.logs.log import Log
-from scanchain.logs.mcap.counting import times_of
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import whole_span
+from scanchain.logs.mcap.selection import times_of, whole_span
 from scanchain.logs.messages.readers import kind
 from scanchain.logs.opening import index_files
-from scanchain.logs.remote.sizes import size_of
 from scanchain.logs.topics import OtherSensor, other_sensors, topics_of
 from scanchain.source import Source
 
@@ -66,7 +65,7 @@ class LogInfo:
 def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogInfo:
     """What the files hold as one log. Raises InputError only for what is no MCAP file."""
     config = config or LogConfig()
-    indexes = index_files(sources, config.rate_hz)
+    indexes = index_files(sources, config)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
     wheels, truth = ("", "") if log is None else (log.odometry_topic, log.ground_truth_topic)

@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.checks import LONGEST_SWEEP_S, instance
+from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
-from scanchain.logs.mcap.first_messages import first_messages
+from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
 from scanchain.logs.mcap.selection import chosen_span, count_scans, whole_span
-from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages
+from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.limits import RangeLimits, Returns, none_retained
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
+from scanchain.logs.messages.returns import RangeLimits, Returns
 from scanchain.logs.mounting import (
     find_mounting,
     in_plane,
@@ -35,8 +35,7 @@ from scanchain.logs.mounting import (
     leaves_plane,
 )
 from scanchain.logs.opening import HAS_STAMPS, index_files
-from scanchain.logs.tally import Tally, most_bad_scans
-from scanchain.logs.told_poses import Beside, ToldPoses
+from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.source import Source, source_of
 from scanchain.words import counted
@@ -57,7 +56,7 @@ def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig =
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
     instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
-    return Log(index_files([source_of(each) for each in named], config.rate_hz), config)
+    return Log(index_files([source_of(each) for each in named], config), config)
 
 
 class Log:
@@ -150,40 +149,39 @@ class Log:
         """
         self.damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        poses, tally = (
-            ToldPoses(self.odometry_topic, self.ground_truth_topic, self.mounting),
-            Tally(self.topic, self.odometry_topic),
-        )
+        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self.mounting)
+        counts = ScanCounts(self.topic, self.odometry_topic)
         times = PointTimes(self.config)
         self.scans_with_wheels = 0
         count, index, asked = 0, 0, working_s()
         try:
-            for message, beside in self._with_poses(poses, times):
+            for message, recorded in self._with_poses(poses, times):
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
-                complaint = self._complaint(message, count - 1, preprocess)
+                where = f"{self.indexes[message.channel.key[0]].path}: scan {count - 1} of {self.topic}"
+                complaint = defect(message, where, preprocess)
                 if complaint:
-                    tally.skip(complaint)
-                    self._check_bad(tally.bad, complaint)
+                    counts.skip(complaint)
+                    check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, beside, waited_s=working_s() - asked)
-                tally.take(scan)
+                scan = self._scan(index, message, recorded, waited_s=working_s() - asked)
+                counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
                 index += 1
                 asked = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
-            self.damage += [*tally.losses(), *poses.complaints()]
-            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *tally.notes()]
+            self.damage += [*counts.losses(), *poses.complaints()]
+            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if self.damage:
-            scans = counted(count - tally.bad, "scan")
+            scans = counted(count - counts.bad, "scan")
             self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
-    def _scan(self, index: int, message: Decoded, beside: Beside, *, waited_s: float) -> Scan:
+    def _scan(self, index: int, message: Decoded, poses: PosesAtScan, *, waited_s: float) -> Scan:
         returns = message.value
         assert isinstance(returns, Returns)
         return Scan(
@@ -193,7 +191,7 @@ class Log:
             points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
             times_s=returns.times_s,
             dropped=returns.dropped,
-            T_odom_base=self._wheels(index, beside),
+            T_odom_base=self._wheels(index, poses),
             waited_s=waited_s,
         )
 
@@ -215,18 +213,18 @@ class Log:
             "(laser_assembler)"
         )
 
-    def _wheels(self, index: int, beside: Beside) -> Pose | None:
+    def _wheels(self, index: int, poses: PosesAtScan) -> Pose | None:
         """T_odom_base of a scan; where the lidar moves on the base, that of a base which is fixed to the lidar."""
-        mounting, T_base_lidar = self.mounting, beside.T_base_lidar
+        mounting, T_base_lidar = self.mounting, poses.T_base_lidar
         if T_base_lidar is None or not is_moved(mounting.T_base_lidar, T_base_lidar):
-            return beside.T_odom_base
+            return poses.T_odom_base
         if self.dimension == 2 and leaves_plane(mounting.T_base_lidar, T_base_lidar):
             turn_deg = np.degrees(lie.apart(mounting.T_base_lidar, T_base_lidar)[1])
             raise self._out_of_plane(f"{mounting.lidar} has turned by {turn_deg:.0f} deg in /tf at scan {index}")
-        if beside.T_odom_base is None:
+        if poses.T_odom_base is None:
             return None
         now = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        return beside.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
+        return poses.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
 
     def assumed_point_times(self) -> str:
         """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -252,14 +250,14 @@ class Log:
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         if self._truth is None and self.ground_truth_topic:
-            poses = ToldPoses("", self.ground_truth_topic)
+            poses = RecordedPoses("", self.ground_truth_topic)
             decoder = self.pose_decoders[self.ground_truth_topic]
             for message in self._messages({self.ground_truth_topic: decoder}, []):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: ToldPoses, times: PointTimes) -> Iterator[tuple[Decoded, Beside]]:
+    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, PosesAtScan]]:
         """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
@@ -269,9 +267,9 @@ class Log:
             else:
                 poses.take(message)
             while waiting and self._may_go(waiting, message.log_time_ns, poses):
-                yield waiting[0], poses.beside(waiting.popleft())
+                yield waiting[0], poses.at_scan(waiting.popleft())
         while waiting:
-            yield waiting[0], poses.beside(waiting.popleft())
+            yield waiting[0], poses.at_scan(waiting.popleft())
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
         """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
@@ -293,7 +291,7 @@ class Log:
             )
         return height_m
 
-    def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: ToldPoses) -> bool:
+    def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: RecordedPoses) -> bool:
         first = waiting[0].value
         if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
             return True
@@ -302,28 +300,3 @@ class Log:
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
         ahead = self.config.prefetch_chunks
         return decoded_messages(self.indexes, decoders, self.span, ahead=ahead, damage=damage)
-
-    def _check_bad(self, bad: int, complaint: str) -> None:
-        """Refuse more bad scans than are allowed."""
-        if bad > most_bad_scans(self.scan_count, self.config):
-            raise InputError(
-                f"{complaint}; with it {bad} of {counted(self.scan_count, 'scan')} cannot be used, more than "
-                f"log.max_bad_scans_percent ({self.config.max_bad_scans_percent:g}) allows; raise it, or choose "
-                "another --topic"
-            )
-
-    def _complaint(self, message: Decoded, number: int, preprocess: PreprocessConfig | None) -> str:
-        """What is wrong with a scan, empty where it is good."""
-        returns = message.value
-        where = f"{self.indexes[message.channel.key[0]].path}: scan {number} of {self.topic}"
-        if not isinstance(returns, Returns):
-            return f"{where} is malformed: {returns}"
-        if message.log_time_ns >= 1 << 63:
-            return f"{where} has the log time {message.log_time_ns} ns, which no clock shows"
-        farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
-        if farthest_s > LONGEST_SWEEP_S:
-            return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
-        if not len(returns.points):
-            return f"{where} has no valid point ({returns.why})"
-        outside = "" if preprocess is None else none_retained(returns.points, preprocess)
-        return outside and f"{where} has {outside}"

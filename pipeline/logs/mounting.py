@@ -1,4 +1,4 @@
-"""How the lidar sits on the robot: by static transforms, or by those of /tf, which may change."""
+"""Mounting of the lidar on the robot, by static transforms or by those of /tf, which may change."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
-from scanchain.logs.mcap.first_messages import first_messages, spread_messages
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.selection import Span
+from scanchain.logs.mcap.stream import first_messages, spread_messages
 from scanchain.logs.messages.poses import StampedPose, chain, frames_between
 from scanchain.logs.messages.readers import (
     cloud_reader,
@@ -92,14 +92,20 @@ class Mounting(NamedTuple):
         return self.T_base_lidar if T_base_lidar is None else T_base_lidar
 
 
+class MovingFrame(NamedTuple):
+    """A frame and its pose (d+1, d+1) as seen from the lidar."""
+
+    name: str
+    T_lidar_frame: Pose
+
+
 def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span) -> Mounting:
     """The mounting of a lidar as the chosen part of a log shows it."""
     fixed = static_transforms(indexes)
     topics = joint_topics(indexes)
     if not fixed and not topics and wheels is None:
         return Mounting("", "", np.eye(4))
-    read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
-    frame = next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    frame = _frame_of(indexes, lidar)
     told = None
     if wheels is not None and is_odometry(wheels):
         told = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
@@ -121,6 +127,23 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         return Mounting("", frame, np.eye(4), note=note)
     note = "" if base else f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
     return _seen(root, frame, fixed, moving, note)
+
+
+def moving_frame(
+    indexes: Sequence[FileIndex], lidar: Channel, mounting: Mounting, *, dimension: int
+) -> MovingFrame:
+    """The root of the fixed transforms above the lidar, the lidar's own frame where the log has none.
+
+    Transforms of /tf that join it to the base and do not change are as good as fixed ones.
+    """
+    frame = _frame_of(indexes, lidar) or "lidar"
+    transforms = static_transforms(indexes)
+    if mounting.joints and mounting.motion is None:
+        transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
+    root = root_frame(transforms, frame)
+    T_root_lidar = chain(transforms, root, frame)
+    T_root_lidar = np.eye(4) if T_root_lidar is None else T_root_lidar
+    return MovingFrame(root, lie.inverse(in_plane(T_root_lidar) if dimension == 2 else T_root_lidar))
 
 
 def joint_topics(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -251,3 +274,9 @@ def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
             for transforms in first_messages(indexes, topic, transforms_reader(channel)):
                 found += transforms
     return found
+
+
+def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
+    """The frame that the first messages of a lidar are in, empty where they name none."""
+    read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
+    return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

@@ -1,69 +1,153 @@
-"""What lies at a path, and its index: MCAP, ROS bags, CARMEN text, folders of sweeps or of the parts of a log."""
+"""The registry of log formats, and the index of what lies at a path or address."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from scanchain.config import LogConfig
 from scanchain.errors import InputError
-from scanchain.logs.formats.bags import index_bag, parts_of_bag
-from scanchain.logs.formats.carmen import index_carmen
+from scanchain.logs.files import RemoteFile, fetch_whole, misspelled
+from scanchain.logs.formats.carmen import claims_carmen, index_carmen
 from scanchain.logs.formats.cloud_file import SUFFIXES
-from scanchain.logs.formats.cloud_folder import index_clouds
-from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
-from scanchain.logs.formats.made import KNOWN, left_out, natural_order, unknown
-from scanchain.logs.mcap.counting import complete
-from scanchain.logs.mcap.index import index_file
-from scanchain.logs.mcap.records import MAGIC, FileIndex
-from scanchain.logs.remote.files import RemoteFile
-from scanchain.logs.remote.index import index_by_summary
-from scanchain.logs.remote.sizes import misspelled
-from scanchain.logs.remote.whole import fetch_whole
+from scanchain.logs.formats.cloud_folder import claims_clouds, index_clouds
+from scanchain.logs.formats.kitti import (
+    claims_kitti_odometry,
+    claims_kitti_raw,
+    index_kitti_odometry,
+    index_kitti_raw,
+)
+from scanchain.logs.formats.made import UnknownFormatError, left_out, natural_order
+from scanchain.logs.formats.ros1_bag import claims_ros1_bag, index_ros1_bag
+from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, parts_of_bag
+from scanchain.logs.formats.user import index_scans, load_format
+from scanchain.logs.mcap.index import claims_mcap, index_file
+from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.mcap.selection import complete
+from scanchain.logs.mcap.summary import index_by_summary
 from scanchain.source import Source
 
+
+@dataclass(frozen=True, slots=True)
+class LogFormat:
+    """A log format.
+
+    Attributes
+    ----------
+    description : as errors list it
+    claims : whether a path is of this format, by its first bytes (none of a folder) or what lies in it
+    index : index of a path as the n-th file of a log, see ``FileIndex``; it may raise UnknownFormatError
+    takes_rate : whether ``index`` has an argument ``rate_hz``, for scans without stamps
+    """
+
+    description: str
+    claims: Callable[[Path, bytes], bool]
+    index: Callable[..., FileIndex]
+    takes_rate: bool = False
+
+
+FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
+    "mcap": LogFormat("MCAP", claims_mcap, index_file),
+    "ros1": LogFormat("a ROS 1 .bag", claims_ros1_bag, index_ros1_bag),
+    "ros2": LogFormat("a ROS 2 .db3 or the folder of a ROS 2 bag", claims_ros2_bag, index_ros2_bag),
+    "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", claims_carmen, index_carmen),
+    "kitti-raw": LogFormat("a KITTI raw drive", claims_kitti_raw, index_kitti_raw),
+    "kitti-odometry": LogFormat("a KITTI odometry sequence", claims_kitti_odometry, index_kitti_odometry),
+    "clouds": LogFormat("a folder of PCD, PLY, .npy or .bin files", claims_clouds, index_clouds, takes_rate=True),
+}
+AUTO = "auto"  # value of log.format: the format that claims the path
 HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.rate_hz has no effect
 
-Indexer = Callable[[Path, int], FileIndex]
-
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
+_POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
+_HEAD_BYTES = 64  # of a file, by which formats claim it
+_DEFAULTS = LogConfig()
 
 
-def index_files(sources: Sequence[Source], rate_hz: float = 0.0) -> list[FileIndex]:
-    """What lies where in a log's files, folders and addresses, every channel known and counted.
+def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> list[FileIndex]:
+    """Index of each file of a log's files, folders and addresses, every channel known and counted.
 
     Raises InputError for what is no log, or cannot be read.
-
-    rate_hz : at which the files of a folder come whose names tell no time; 0 where that is not known
     """
     if not sources:
         raise InputError("no log was named; give at least one file or folder")
-    files = [part for source in sources for part in _parts(source)]
+    name = config.format
+    if name != AUTO and name not in FORMATS:
+        if ":" not in name:
+            raise InputError(
+                f"log.format {name!r} is unknown; wanted {AUTO}, {', '.join(FORMATS)} or module:Class"
+            )
+        load_format(name)
+        files = list(sources)
+    else:
+        files = [part for source in sources for part in _parts(source)]
     for each in files:
         if complaint := misspelled(each):
             raise InputError(complaint)
-    indexes = [_index(source, number, rate_hz) for number, source in enumerate(files)]
+    indexes = [_index(source, number, config) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
-    indexes[0].notes += [note for source in sources for note in _other_parts(source)]
+    if name == AUTO:
+        indexes[0].notes += [note for source in sources for note in _other_parts(source)]
     return indexes
 
 
-def _index(source: Source, number: int, rate_hz: float) -> FileIndex:
+def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
     if isinstance(source, Path):
-        return _indexer(source, rate_hz)(source, number)
+        return _index_path(source, number, config)
     file = RemoteFile(source)
-    index = index_by_summary(file, number) if file.has_ranges else None
-    return index or _index_whole(file, number)
+    index = index_by_summary(file, number) if file.has_ranges and config.format in (AUTO, "mcap") else None
+    return index or _index_copy(file, number, config)
 
 
-def _index_whole(file: RemoteFile, number: int) -> FileIndex:
+def _index_copy(file: RemoteFile, number: int, config: LogConfig) -> FileIndex:
     """That of a copy of a remote file which has no index to read it by."""
     copy = fetch_whole(file)
-    indexer = _file_indexer(copy)
-    index = index_file(copy, number, file.address) if indexer is index_file else indexer(copy, number)
+    index = _index_path(copy, number, config, file.address)
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
     index.notes.insert(0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were fetched")
     return index
+
+
+def _index_path(path: Path, number: int, config: LogConfig, address: Source | None = None) -> FileIndex:
+    """Index of a path, which may be the copy of what lies at an address."""
+    if config.format != AUTO and config.format not in FORMATS:
+        return index_scans(path, number, config.format, address)
+    head = _head(path) if path.is_file() else b""
+    form = _claiming(path, head) if config.format == AUTO else FORMATS[config.format]
+    index = form.index
+    if form.takes_rate:
+        index = partial(index, rate_hz=config.rate_hz)
+    elif index is index_file:
+        index = partial(index_file, source=address)
+    try:
+        return index(path, number)
+    except UnknownFormatError as error:
+        raise _unknown(path, error.text, error.lack) from None
+
+
+def _claiming(path: Path, head: bytes) -> LogFormat:
+    """The format that claims a path. Raises InputError where none does."""
+    for form in FORMATS.values():
+        if form.claims(path, head):
+            return form
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder of no log that is known; give {_known()}")
+    raise _unknown(path, head, f"starts with {head[:8]!r}")
+
+
+def _unknown(path: Path, text: bytes, lack: str) -> InputError:
+    if _POSE_GRAPH.search(text):
+        return InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize")
+    return InputError(f"{path}: is no log that is known ({lack}); give {_known()}")
+
+
+def _known() -> str:
+    listed = ", ".join(form.description for form in FORMATS.values())
+    return f"{listed}, or name a class of your own that reads it, --log.format module:Class"
 
 
 def _parts(source: Source) -> Sequence[Source]:
@@ -88,42 +172,9 @@ def _other_parts(source: Source) -> list[str]:
     return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))
 
 
-def _indexer(path: Path, rate_hz: float) -> Indexer:
-    return _folder_indexer(path, rate_hz) if path.is_dir() else _file_indexer(path)
-
-
-def _file_indexer(path: Path) -> Indexer:
-    head = _head(path) if path.is_file() else b""
-    if head.startswith(b"#ROSBAG") or head.startswith(b"SQLite format 3\0"):
-        return index_bag
-    if head.startswith((b"BZh", b"\x1f\x8b")) or _looks_like_carmen(head):
-        return index_carmen
-    if head and not head.startswith(MAGIC):
-        raise unknown(path, head, f"starts with {head[:8]!r}")
-    return index_file
-
-
-def _folder_indexer(path: Path, rate_hz: float) -> Indexer:
-    if (path / "metadata.yaml").is_file():
-        return index_bag
-    if (path / "velodyne_points").is_dir():
-        return index_kitti_raw
-    if (path / "velodyne").is_dir() and (path / "times.txt").is_file():
-        return index_kitti_odometry
-    if any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir()):
-        return lambda folder, number: index_clouds(folder, number, rate_hz)
-    raise InputError(f"{path}: is a folder of no log that is known; give {KNOWN}")
-
-
-def _looks_like_carmen(head: bytes) -> bool:
-    """Whether the first line is a comment or begins with a word in capitals and digits, as CARMEN's do."""
-    word = head.lstrip().split(maxsplit=1)[0] if head.strip() else b""
-    return word.startswith(b"#") or (word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper())
-
-
 def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(64)
+            return file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error

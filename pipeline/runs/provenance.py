@@ -15,8 +15,7 @@ import msgspec
 from msgspec import Struct
 
 from scanchain.errors import InputError
-from scanchain.logs.remote.files import RemoteFile
-from scanchain.logs.remote.sizes import files_of, size_of
+from scanchain.logs.files import RemoteFile, files_of, size_of
 from scanchain.source import Source, without_keys
 from scanchain.whole_file import write_whole
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
 from scanchain.logs import Log
-from scanchain.logs.frames import MovingFrame, moving_frame
+from scanchain.logs.mounting import MovingFrame, moving_frame
 from scanchain.logs.writing.pack import (
     ORIGIN,
     Link,
@@ -36,7 +36,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
     world → odom is the correction by loop closures, odom → the robot the odometry; the robot's frame is the root
     of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it.
     """
-    moving = moving_frame(log)
+    moving = moving_frame(log.indexes, log.lidar, log.mounting, dimension=log.dimension)
     first_ns, first_log_ns = steps.rows[0].stamp_ns, steps.rows[0].log_time_ns
     with LogWriter(path) as writer:
         trajectory = result.trajectory

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import MatchingConfig
 from scanchain.logs.doctor.finding import Finding, Severity
-from scanchain.logs.doctor.survey import Survey
+from scanchain.logs.doctor.statistics import Survey
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
 from scanchain.words import counted

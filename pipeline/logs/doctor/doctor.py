@@ -9,7 +9,7 @@ from scanchain.config import Config, LogConfig
 from scanchain.logs.doctor.checks_scans import check_scans
 from scanchain.logs.doctor.checks_time import check_time
 from scanchain.logs.doctor.finding import Finding, Severity
-from scanchain.logs.doctor.survey import survey
+from scanchain.logs.doctor.statistics import survey
 from scanchain.logs.log import Log, open_log
 from scanchain.logs.topics import other_sensors
 from scanchain.source import Source

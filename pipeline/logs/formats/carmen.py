@@ -6,16 +6,21 @@ where stamps step back. Format: https://carmen.sourceforge.net/logger_playback.h
 
 from __future__ import annotations
 
+import bz2
+import math
+import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Set as AbstractSet
 from pathlib import Path
+from typing import IO, NamedTuple, Protocol
 
-from scanchain.logs.formats.carmen_lines import KINDS, SCANS, Line, read_pose, read_scan, stamp_of
-from scanchain.logs.formats.made import made_block, made_channel, made_index, unknown
-from scanchain.logs.formats.packed_text import read_text
+import numpy as np
+
+from scanchain.errors import InputError
+from scanchain.logs.formats.made import UnknownFormatError, made_block, made_channel, made_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import Link, pack_transforms
+from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 from scanchain.source import Source
 from scanchain.words import counted
 
@@ -23,16 +28,32 @@ _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # between the log times of two scans
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
+KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
+SCANS = (b"FLASER", b"ROBOTLASER1")
+_LEAST_CODE_M = 81.83  # of a SICK LMS: from 8183 up its 13 bits are codes, such as that for no return
+_STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
+_HALF_TURN = math.pi
+
+_MOST_BYTES = 2 << 30  # of text
+_PLAIN_BYTES = 1 << 20  # read at once
+_PACKED_BYTES = 64  # unpacked at once: what comes of so many before damage is lost with it
+
+
+def claims_carmen(_: Path, head: bytes) -> bool:
+    """Whether a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
+    word = head.split(maxsplit=1)[0] if head.strip() else b""
+    is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
+    return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
+
 
 def index_carmen(path: Path, number: int) -> FileIndex:
-    """Find the lines of a log. Raises InputError where the file holds none that is known."""
+    """Index the lines of a log. Raises UnknownFormatError where the file has none of a known kind."""
     text, damage = read_text(path)
     index = made_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
-        raise unknown(
-            path, text, damage.removeprefix(f"{path}: ") or f"text without a line of {b', '.join(KINDS).decode()}"
-        )
+        absent = f"text without a line of {b', '.join(KINDS).decode()}"
+        raise UnknownFormatError(text, damage.removeprefix(f"{path}: ") or absent)
     return index
 
 
@@ -141,3 +162,145 @@ def _complaint(path: Source, malformed: list[int]) -> str:
     if not malformed:
         return ""
     return f"{path}: {counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
+
+
+class Line(NamedTuple):
+    """Where a line lies in the text, of which kind it is, and at which log time it counts."""
+
+    kind: bytes
+    begin: int
+    end: int
+    number: int
+    stamp_ns: int
+    log_time_ns: int
+
+
+class CarmenScan(NamedTuple):
+    """A laser line: the scan and the robot's pose, each as a message; ``mounting`` is the laser on the robot."""
+
+    scan: bytes
+    odometry: bytes
+    mounting: Place
+
+
+def stamp_of(words: list[bytes]) -> int:
+    """Nanoseconds of a line's own stamp, the third word from behind, held as the double that CARMEN keeps.
+
+    Raises ValueError or IndexError where that is none.
+    """
+    stamp_ns = int(float(words[-3]) * 1e9)
+    if not 0 <= stamp_ns < LATEST_NS:
+        raise ValueError(f"{stamp_ns} ns is no stamp")
+    return stamp_ns
+
+
+def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: float) -> CarmenScan:
+    """A FLASER or ROBOTLASER1 line. Raises ValueError or IndexError where words are missing or no numbers.
+
+    max_range_m, offset_m : the scanner's reach and its place ahead of the robot's center, as the log's PARAM
+        lines tell them for FLASER; ROBOTLASER1 tells both itself
+    """
+    if words[0] == b"FLASER":
+        count = int(words[1])
+        poses = _numbers(words[2 + count :], 6)
+        step_rad = _STEPS_RAD.get(count, _HALF_TURN / max(count - 1, 1))
+        first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * _HALF_TURN
+        ranges_m = _numbers(words[2:], count)
+        mounting, robot = Place(offset_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), poses[3:]
+    else:
+        first_rad, opening_rad, step_rad, max_range_m = _numbers(words[2:], 4)
+        count = int(words[8])
+        ranges_m = _numbers(words[9:], count)
+        poses = _numbers(words[10 + count + int(words[9 + count]) :], 6)
+        step_rad = step_rad if step_rad > 0.0 else opening_rad / max(count - 1, 1)
+        mounting, robot = _mounting(poses[:3], poses[3:]), poses[3:]
+    scan = pack_laser_scan(
+        stamp_ns,
+        "laser",
+        first_rad,
+        step_rad,
+        np.array(ranges_m),
+        range_min_m=0.0,
+        range_max_m=min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M,
+    )
+    return CarmenScan(scan, pack_odometry(stamp_ns, "odom", "base_link", planar(*robot)), mounting)
+
+
+def read_pose(words: list[bytes], stamp_ns: int, frame: str) -> bytes:
+    """The first three numbers of an ODOM or TRUEPOS line. Raises ValueError where they are none."""
+    return pack_odometry(stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
+
+
+def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
+    """A pose in the plane."""
+    return Place(x_m, y_m, 0.0, 0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
+
+
+def _numbers(words: list[bytes], count: int) -> list[float]:
+    if not 0 <= count <= len(words):
+        raise ValueError(f"{count} numbers are told, {len(words)} words follow")
+    return [float(word) for word in words[:count]]
+
+
+def _mounting(laser: list[float], robot: list[float]) -> Place:
+    """The laser's pose in the robot's frame."""
+    dx, dy, dyaw = (a - b for a, b in zip(laser, robot, strict=True))
+    cosine, sine = math.cos(robot[2]), math.sin(robot[2])
+    return planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
+
+
+class Text(NamedTuple):
+    """What a file unpacks to; ``damage`` says what is wrong with the rest, empty where all is well."""
+
+    data: bytes
+    damage: str
+
+
+class _Unpacker(Protocol):
+    @property
+    def eof(self) -> bool: ...
+    @property
+    def unused_data(self) -> bytes: ...
+    def decompress(self, data: bytes, /) -> bytes: ...
+
+
+def read_text(path: Path) -> Text:
+    """The text of a file. Raises InputError where it cannot be read or unpacks to more than is believed."""
+    text = bytearray()
+    try:
+        with path.open("rb") as file:
+            for piece in _pieces(file):
+                text += piece
+                if len(text) > _MOST_BYTES:
+                    raise InputError(f"{path}: unpacks to more than {_MOST_BYTES:,} bytes; is it a CARMEN log?")
+    except (zlib.error, EOFError, ValueError) as error:
+        return Text(bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})")
+    except OSError as error:
+        if error.errno is None:  # of bz2, not of the system
+            return Text(bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})")
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
+    return Text(bytes(text), "")
+
+
+def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+    head = file.read(3)
+    file.seek(0)
+    if head == b"BZh":
+        yield from _unpacked(file, bz2.BZ2Decompressor)
+    elif head[:2] == b"\x1f\x8b":
+        yield from _unpacked(file, lambda: zlib.decompressobj(zlib.MAX_WBITS | 16))
+    else:
+        while piece := file.read(_PLAIN_BYTES):
+            yield piece
+
+
+def _unpacked(file: IO[bytes], begin: Callable[[], _Unpacker]) -> Iterator[bytes]:
+    """What comes out of one packed stream after the other. Raises EOFError where the last is cut off."""
+    unpacker = begin()
+    while packed := file.read(_PACKED_BYTES):
+        while packed:
+            unpacker = begin() if unpacker.eof else unpacker
+            yield unpacker.decompress(packed)
+            packed = unpacker.unused_data
+    if not unpacker.eof:
+        raise EOFError("it is cut off")

@@ -1,30 +1,66 @@
-"""One cloud in a file, PCD, PLY, .npy or raw numbers, as an array of points with named fields."""
+"""One cloud in a file, PCD, PLY, .npy or raw numbers, as an array of points with named fields.
+
+PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. PLY: Turk 1994.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
+from typing import IO
 
+import lzf
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.logs.formats.pcd import read_pcd
-from scanchain.logs.formats.ply import read_ply
-from scanchain.logs.formats.point_rows import CloudFileError
-
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 _MOST_COLUMNS = 16
-_LIKELY_COLUMNS = (4, 3, 5, 6)  # of .bin files; the first where nothing speaks for another
-_SAMPLE_BYTES, _VOTERS = 1 << 20, 5  # read of a .bin file, and of how many files about
-_SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # sizes of numbers that are plausible, and how many must be
-_FEWEST_ROWS = 20  # that tell columns apart
-_ALIKE, _HARDLY = 0.5, 0.05  # differences of columns, in spreads of the two, and of all, that are none
-_NOTHING = 0.1  # a contrast that speaks for no layout
-_XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+
+_PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
+    (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
+}
+_MOST_PCD_LINES = 100
+_MOST_LZF_RATIO = 1000  # LZF cannot pack tighter than about 1 to 130
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+_MOST_PLY_LINES = 1000
 
 
-def read_cloud_file(path: Path, raw: np.dtype[np.void] = _XYZI) -> NDArray[np.void]:
+class CloudFileError(Exception):
+    """A file that does not hold what its header says; the message says what is wrong."""
+
+
+def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """``count`` lines of numbers."""
+    lines = list(islice((line for line in file if line.strip()), count))
+    try:
+        rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
+    except ValueError as error:
+        raise CloudFileError(f"is no list of {count} points ({error})") from error
+    return _all_of(rows, count)
+
+
+def binary_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """``count`` points, one after the other."""
+    data = file.read(count * point.itemsize)
+    return _all_of(np.frombuffer(data, point, len(data) // max(point.itemsize, 1)), count)
+
+
+def _all_of(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
+    if len(rows) < count:
+        raise CloudFileError(f"ends after {len(rows)} of its {count} points")
+    return rows
+
+
+def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.void]:
     """The points (N,) of a file as they are, little endian, in number types that ROS knows.
 
     raw : a point of a .bin file
@@ -42,7 +78,7 @@ def read_cloud_file(path: Path, raw: np.dtype[np.void] = _XYZI) -> NDArray[np.vo
 
 def read_xyzi(path: Path) -> NDArray[np.void]:
     """The points of a file of float32 x, y, z, intensity, as KITTI and others write them."""
-    return read_raw(path, _XYZI)
+    return read_raw(path, XYZI)
 
 
 def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
@@ -69,81 +105,10 @@ def read_npy(path: Path) -> NDArray[np.void]:
         raise CloudFileError(
             f"is an array {array.shape} of {array.dtype}; give numbers (N, 3), (N, 4) or more columns, x y z first"
         )
-    return np.rec.fromarrays(list(array.T), dtype=_columns(array.dtype, array.shape[1]))
+    return np.rec.fromarrays(list(array.T), dtype=point_of_columns(array.dtype, array.shape[1]))
 
 
-def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
-    """How a point lies in .bin files, which do not say: float32 or float64, x y z and up to three more columns.
-
-    A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
-    columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
-    so that all columns look alike. x, y, z, intensity where nothing speaks for another. Raises CloudFileError
-    where none fits.
-    """
-    sizes = [file.stat().st_size for file in files]
-    filled = [file for file, size in zip(files, sizes, strict=True) if size]
-    if not filled:
-        return _XYZI
-    voters = filled[:: max(len(filled) // _VOTERS, 1)]
-    layouts = [_layout(np.fromfile(file, np.uint8, _SAMPLE_BYTES), sizes) for file in voters]
-    votes = Counter(layout for layout in layouts if layout is not None)
-    if not votes:
-        raise CloudFileError("holds neither float32 nor float64 numbers of 3 to 6 columns")
-    return votes.most_common(1)[0][0]
-
-
-def _layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[np.void] | None:
-    """How the points of one file seem to lie, None where no layout fits."""
-    for kind in (np.dtype("<f4"), np.dtype("<f8")):
-        values = sample[: len(sample) - len(sample) % kind.itemsize].view(kind)
-        if not _are_plausible(values):
-            continue
-        contrasts = {
-            columns: _contrast(values, columns)
-            for columns in _LIKELY_COLUMNS
-            if 2 * sum(size % (columns * kind.itemsize) == 0 for size in sizes) > len(sizes)  # some may be broken
-        }
-        if contrasts:
-            best = max(contrasts, key=lambda columns: contrasts[columns])
-            if contrasts[best] < _NOTHING:
-                best = next(iter(contrasts))
-            if best == 6 and 3 in contrasts and _repeats(values):
-                best = 3
-            return _columns(kind, best)
-    return None
-
-
-def _are_plausible(values: NDArray[np.floating]) -> bool:
-    """Whether bytes that are read as such numbers look like meters and the like: random bits would not."""
-    with np.errstate(invalid="ignore"):
-        size = np.abs(values.astype(np.float64))
-    return bool(np.mean((size == 0.0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))) > _MOSTLY)
-
-
-def _contrast(values: NDArray[np.floating], columns: int) -> float:
-    """How far columns differ in mean and spread, in spreads of all numbers."""
-    rows = _finite_rows(values, columns)
-    if len(rows) < _FEWEST_ROWS:
-        return 0.0
-    spread = float(rows.std()) or 1.0
-    return float(np.ptp(rows.mean(axis=0)) + np.ptp(rows.std(axis=0))) / spread
-
-
-def _repeats(values: NDArray[np.floating]) -> bool:
-    """Whether rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
-    rows = _finite_rows(values, 6)
-    mean, spread = rows.mean(axis=0).reshape(2, 3), rows.std(axis=0).reshape(2, 3)
-    near = _ALIKE * spread.max(axis=0) + _HARDLY * rows.std()
-    return bool(((np.ptp(mean, axis=0) <= near) & (np.ptp(spread, axis=0) <= near)).all())
-
-
-def _finite_rows(values: NDArray[np.floating], columns: int) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # a damaged number may be a signaling NaN
-        rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
-    return rows[np.isfinite(rows).all(axis=1)]
-
-
-def _columns(kind: np.dtype[np.generic], count: int) -> np.dtype[np.void]:
+def point_of_columns(kind: np.dtype[np.generic], count: int) -> np.dtype[np.void]:
     """A point of so many numbers of a kind."""
     names = ["x", "y", "z", "intensity", *(f"column_{k}" for k in range(5, count + 1))][:count]
     return np.dtype([(name, kind.str) for name in names])
@@ -154,3 +119,107 @@ def _ros_type(kind: np.dtype[np.generic]) -> str:
     if kind.kind == "f" and kind.itemsize not in (4, 8):
         return "<f4" if kind.itemsize == 2 else "<f8"
     return "<f8" if kind.itemsize == 8 else kind.newbyteorder("<").str.replace("|", "<")
+
+
+def read_pcd(path: Path) -> NDArray[np.void]:
+    """The points of a file, ascii, binary or binary_compressed, fields as they are."""
+    with path.open("rb") as file:
+        header = _pcd_header(file)
+        try:
+            point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
+        except (KeyError, IndexError, ValueError) as error:
+            raise CloudFileError(f"is no PCD: its header does not tell {error}") from error
+        if form == "ascii":
+            return ascii_rows(file, point, count)
+        return (
+            _lzf_unpacked(file, point, count) if form == "binary_compressed" else binary_rows(file, point, count)
+        )
+
+
+def _pcd_header(file: IO[bytes]) -> dict[str, list[str]]:
+    """The words of each line, by the first."""
+    header: dict[str, list[str]] = {}
+    for _ in range(_MOST_PCD_LINES):
+        words = file.readline(65536).decode("ascii", "replace").split()
+        if words:
+            header[words[0]] = words[1:]
+        if "DATA" in header:
+            break
+    return header
+
+
+def _pcd_point(header: dict[str, list[str]]) -> np.dtype[np.void]:
+    """A point: each field by its name, several numbers of one field as one."""
+    names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+    fields = [
+        (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
+        for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
+    ]
+    return np.dtype(fields)
+
+
+def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """Points that are packed by LZF, field by field."""
+    sizes = file.read(8)
+    if len(sizes) < 8:
+        raise CloudFileError("ends within its header")
+    packed_size, size = struct.unpack("<II", sizes)
+    packed = file.read(packed_size)
+    if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
+        raise CloudFileError(f"does not unpack: {size} bytes are told for {count} points, {len(packed)} are there")
+    try:
+        data = lzf.decompress(packed, size)
+    except ValueError:
+        data = None
+    if data is None or len(data) != size:
+        raise CloudFileError("does not unpack: its bytes are damaged")
+    rows = np.empty(count, point)
+    offset = 0
+    for name in point.names or ():
+        field = point[name]
+        rows[name] = np.frombuffer(data, field, count, offset)
+        offset += count * field.itemsize
+    return rows
+
+
+def read_ply(path: Path) -> NDArray[np.void]:
+    """The vertices of a file, ascii or binary in either byte order, fields as they are."""
+    with path.open("rb") as file:
+        point, count, form = _ply_header(file)
+        return ascii_rows(file, point, count) if form == "ascii" else binary_rows(file, point, count)
+
+
+def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
+    """The layout of a vertex, how many there are, and the form; vertices must come first, as they do."""
+    fields: list[tuple[str, str]] = []
+    form, element, count = "", "", 0
+    for words in _ply_lines(file):
+        match words:
+            case ["format", form, *_] if form in _PLY_ORDERS:
+                pass
+            case ["element", element, number, *_]:
+                if element == "vertex" and number.isdigit():
+                    count = int(number)
+                elif not fields:
+                    raise CloudFileError(f"has {element} before its vertices, which is not understood")
+            case ["property", kind, name] if kind in _PLY_TYPES and element == "vertex":
+                fields.append((name, _PLY_ORDERS.get(form, "<") + _PLY_TYPES[kind]))
+            case ["property", *_] if element == "vertex":
+                raise CloudFileError(f"has the vertex property {' '.join(words[1:])!r}, which is not understood")
+    if not form or not fields:
+        raise CloudFileError("is no PLY with vertices")
+    if len(dict(fields)) < len(fields):
+        raise CloudFileError(f"has a vertex property twice among {' '.join(name for name, _ in fields)}")
+    return np.dtype(fields), count, form
+
+
+def _ply_lines(file: IO[bytes]) -> Iterator[list[str]]:
+    if file.readline(8).strip() != b"ply":
+        raise CloudFileError("is no PLY: its first line is another")
+    for _ in range(_MOST_PLY_LINES):
+        words = file.readline(4096).decode("ascii", "replace").split()
+        if words == ["end_header"]:
+            return
+        yield words
+    raise CloudFileError("is no PLY: its header does not end")

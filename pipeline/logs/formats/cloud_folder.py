@@ -3,26 +3,44 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain.errors import InputError
-from scanchain.logs.formats.cloud_file import SUFFIXES, raw_point, read_cloud_file
+from scanchain.logs.formats.cloud_file import (
+    SUFFIXES,
+    XYZI,
+    CloudFileError,
+    point_of_columns,
+    read_cloud_file,
+)
 from scanchain.logs.formats.made import left_out, made_block, made_channel, made_index, natural_order
-from scanchain.logs.formats.point_rows import CloudFileError
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud
 from scanchain.words import counted
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
-_FIRST_FILES = 3
+_FIRST_FILES = 3  # of which one has to be readable to say what the files hold
+_LIKELY_COLUMNS = (4, 3, 5, 6)  # of .bin files; the first where nothing speaks for another
+_SAMPLE_BYTES, _VOTERS = 1 << 20, 5  # read of a .bin file, and of how many files about
+_SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # sizes of numbers that are plausible, and how many must be
+_FEWEST_ROWS = 20  # that tell columns apart
+_ALIKE, _HARDLY = 0.5, 0.05  # differences of columns, in spreads of the two, and of all, that are none
+_NOTHING = 0.1  # a contrast that speaks for no layout
 _NS = 1_000_000_000
 
 
-def index_clouds(folder: Path, number: int, rate_hz: float) -> FileIndex:
+def claims_clouds(path: Path, _: bytes) -> bool:
+    """Whether it is a folder with such files."""
+    return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
+
+
+def index_clouds(folder: Path, number: int, rate_hz: float = 0.0) -> FileIndex:
     """The files of a folder as the scans of /points.
 
     rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names. Raises InputError where
@@ -111,3 +129,74 @@ def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
             "as in --log.rate_hz 10"
         )
     return stamps_ns
+
+
+def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
+    """How a point lies in .bin files, which do not say: float32 or float64, x y z and up to three more columns.
+
+    A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
+    columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
+    so that all columns look alike. x, y, z, intensity where nothing speaks for another. Raises CloudFileError
+    where none fits.
+    """
+    sizes = [file.stat().st_size for file in files]
+    filled = [file for file, size in zip(files, sizes, strict=True) if size]
+    if not filled:
+        return XYZI
+    voters = filled[:: max(len(filled) // _VOTERS, 1)]
+    layouts = [_likely_layout(np.fromfile(file, np.uint8, _SAMPLE_BYTES), sizes) for file in voters]
+    votes = Counter(layout for layout in layouts if layout is not None)
+    if not votes:
+        raise CloudFileError("holds neither float32 nor float64 numbers of 3 to 6 columns")
+    return votes.most_common(1)[0][0]
+
+
+def _likely_layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[np.void] | None:
+    """How the points of one file seem to lie, None where no layout fits."""
+    for kind in (np.dtype("<f4"), np.dtype("<f8")):
+        values = sample[: len(sample) - len(sample) % kind.itemsize].view(kind)
+        if not _are_plausible(values):
+            continue
+        contrasts = {
+            columns: _contrast(values, columns)
+            for columns in _LIKELY_COLUMNS
+            if 2 * sum(size % (columns * kind.itemsize) == 0 for size in sizes) > len(sizes)  # some may be broken
+        }
+        if contrasts:
+            best = max(contrasts, key=lambda columns: contrasts[columns])
+            if contrasts[best] < _NOTHING:
+                best = next(iter(contrasts))
+            if best == 6 and 3 in contrasts and _repeats(values):
+                best = 3
+            return point_of_columns(kind, best)
+    return None
+
+
+def _are_plausible(values: NDArray[np.floating]) -> bool:
+    """Whether bytes that are read as such numbers look like meters and the like: random bits would not."""
+    with np.errstate(invalid="ignore"):
+        size = np.abs(values.astype(np.float64))
+    return bool(np.mean((size == 0.0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))) > _MOSTLY)
+
+
+def _contrast(values: NDArray[np.floating], columns: int) -> float:
+    """How far columns differ in mean and spread, in spreads of all numbers."""
+    rows = _finite_rows(values, columns)
+    if len(rows) < _FEWEST_ROWS:
+        return 0.0
+    spread = float(rows.std()) or 1.0
+    return float(np.ptp(rows.mean(axis=0)) + np.ptp(rows.std(axis=0))) / spread
+
+
+def _repeats(values: NDArray[np.floating]) -> bool:
+    """Whether rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
+    rows = _finite_rows(values, 6)
+    mean, spread = rows.mean(axis=0).reshape(2, 3), rows.std(axis=0).reshape(2, 3)
+    near = _ALIKE * spread.max(axis=0) + _HARDLY * rows.std()
+    return bool(((np.ptp(mean, axis=0) <= near) & (np.ptp(spread, axis=0) <= near)).all())
+
+
+def _finite_rows(values: NDArray[np.floating], columns: int) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):  # a damaged number may be a signaling NaN
+        rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
+    return rows[np.isfinite(rows).all(axis=1)]

@@ -7,29 +7,38 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 from numpy.linalg import LinAlgError
 
-from scanchain.data import Pose
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.logs.formats.cloud_file import read_xyzi
-from scanchain.logs.formats.kitti_truth import (
-    read_calibration,
-    read_camera_poses,
-    read_oxts,
-    read_seconds,
-    read_times,
-)
+from scanchain.logs.formats.cloud_file import CloudFileError, read_xyzi
 from scanchain.logs.formats.made import made_block, made_channel, made_index, natural_order
-from scanchain.logs.formats.point_rows import CloudFileError
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import pack_cloud, pack_odometry, place
+from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
 _TRUTH = -1  # the block of the ground truth
 _POSE_BYTES = 720
 Told = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
+
+_EARTH_M = 6378137.0
+_MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
+_NS = 1_000_000_000
+
+
+def claims_kitti_raw(path: Path, _: bytes) -> bool:
+    """Whether it is the folder of a drive."""
+    return (path / "velodyne_points").is_dir()
+
+
+def claims_kitti_odometry(path: Path, _: bytes) -> bool:
+    """Whether it is the folder of a sequence."""
+    return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
 
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
@@ -112,7 +121,7 @@ def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], tol
         if wanted is not None and channel.key[1] not in wanted:
             return Contents([], "")
         if block.offset == _TRUTH:
-            return _truth(channel, told)
+            return _truth_messages(channel, told)
         return _sweep(channel, files[block.offset], block.start_ns)
 
     index.make = make
@@ -127,9 +136,117 @@ def _sweep(channel: Channel, file: Path, stamp_ns: int) -> Contents:
     return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
 
-def _truth(channel: Channel, told: Told) -> Contents:
+def _truth_messages(channel: Channel, told: Told) -> Contents:
     messages = []
     for stamp_ns, T_world_lidar in told:
         data = pack_odometry(stamp_ns, "world", "velodyne", place(T_world_lidar))
         messages.append(Message(channel, stamp_ns, memoryview(data)))
     return Contents(messages, "")
+
+
+def read_times(file: Path) -> list[int]:
+    """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
+    return [_parsed(file, number, line) for number, line in enumerate(_lines(file), start=1)]
+
+
+def read_seconds(file: Path) -> list[int]:
+    """Nanoseconds of each line that is a number of seconds."""
+    seconds = _table(file, 1)[:, 0].tolist()
+    if not all(0.0 <= each * _NS < LATEST_NS for each in seconds):
+        raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; fetch it again")
+    return [round(each * _NS) for each in seconds]
+
+
+def read_calibration(file: Path) -> Pose:
+    """The (4, 4) transform of a ``calib_*_to_*.txt`` with its lines ``R:`` and ``T:``."""
+    told = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
+    try:
+        T = np.eye(4)
+        T[:3, :3] = np.array(told["R"].split(), np.float64).reshape(3, 3)
+        T[:3, 3] = np.array(told["T"].split(), np.float64)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); fetch it again") from error
+    return T
+
+
+def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
+    """T_world_lidar (N, 4, 4) of the GPS/INS readings, from the first lidar pose on.
+
+    Latitude and longitude are laid out by the Mercator projection at the first latitude; R = Rz(yaw) Ry(pitch)
+    Rx(roll), as KITTI's development kit defines them.
+    """
+    rows = np.vstack([_table(file, 6)[:1] for file in sorted(folder.glob("*.txt"))] or [np.empty((0, 6))])
+    if not len(rows):
+        return np.empty((0, 4, 4))
+    if np.abs(rows[:, 0]).max() > _MOST_LATITUDE:
+        raise InputError(f"{folder}: tells a latitude beyond {_MOST_LATITUDE:g} degrees; fetch it again")
+    latitude, longitude, up_m, roll, pitch, yaw = rows.T
+    scale = np.cos(np.radians(latitude[0]))
+    T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_imu[:, 0, 3] = scale * _EARTH_M * np.radians(longitude)
+    T_world_imu[:, 1, 3] = scale * _EARTH_M * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
+    T_world_imu[:, 2, 3] = up_m
+    T_world_imu[:, :3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0)
+    T_world_lidar = T_world_imu @ lie.inverse(T_lidar_imu)
+    return lie.inverse(T_world_lidar[0]) @ T_world_lidar
+
+
+def read_camera_poses(file: Path, calibration: Path) -> Matrix:
+    """T_world_lidar (N, 4, 4) of the odometry benchmark's camera poses, from the first lidar pose on."""
+    rows = _table(file, 12)
+    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_camera[:, :3] = rows.reshape(-1, 3, 4)
+    told = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
+    try:
+        T_camera_lidar = np.vstack([np.array(told["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); fetch it again") from error
+    T_world_lidar = T_world_camera @ T_camera_lidar
+    return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
+
+
+def _turn(angles_rad: Matrix, axis: int) -> Matrix:
+    """Rotations (N, 3, 3) about one axis."""
+    a, b = [(1, 2), (2, 0), (0, 1)][axis]
+    R = np.tile(np.eye(3), (len(angles_rad), 1, 1))
+    R[:, a, a] = R[:, b, b] = np.cos(angles_rad)
+    R[:, b, a] = np.sin(angles_rad)
+    R[:, a, b] = -R[:, b, a]
+    return R
+
+
+def _parsed(file: Path, number: int, line: str) -> int:
+    whole, _, fraction = line.strip().partition(".")
+    try:
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        stamp_ns = int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
+        if not 0 <= stamp_ns < LATEST_NS:
+            raise ValueError("before 1970 or after 2038")
+        return stamp_ns
+    except ValueError as error:
+        raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); fetch it again") from error
+
+
+def _table(file: Path, columns: int) -> Matrix:
+    """The first columns of a file of numbers, all of them finite."""
+    words = [line.split() for line in _lines(file)]
+    few = next((number for number, row in enumerate(words, start=1) if len(row) < columns), 0)
+    if few:
+        raise InputError(
+            f"{file}: line {few} has {counted(len(words[few - 1]), 'column')}, {columns} are needed; "
+            "fetch it again"
+        )
+    try:
+        rows = np.array([row[:columns] for row in words], np.float64).reshape(-1, columns)
+    except ValueError as error:
+        raise InputError(f"{file}: is no table of numbers ({error}); fetch it again") from error
+    if not len(rows) or not np.isfinite(rows).all():
+        raise InputError(f"{file}: is empty, or holds numbers that are not finite; fetch it again")
+    return rows
+
+
+def _lines(file: Path) -> list[str]:
+    try:
+        return [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); fetch it again") from error

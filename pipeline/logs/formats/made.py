@@ -7,15 +7,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
-from scanchain.logs.writing.ros2_definitions import schema_text
-
-KNOWN = (
-    "MCAP, a ROS 1 .bag, a ROS 2 .db3, a CARMEN .log or .clf (also .bz2, .gz), or the folder of a ROS 2 bag, "
-    "of KITTI raw or odometry, or of PCD, PLY, .npy or .bin files"
-)
-_POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
+from scanchain.logs.writing.pack import schema_text
 
 
 def made_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
@@ -58,8 +51,10 @@ def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
     return [f"{folder}: only its {taken} files are read, left out are {others}; give those a folder of their own"]
 
 
-def unknown(path: Path, text: bytes, why: str) -> InputError:
-    """The error for a file or folder that is no log; ``text`` is what is read of it, ``why`` what it lacks."""
-    if _POSE_GRAPH.search(text):
-        return InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize")
-    return InputError(f"{path}: is no log that is known ({why}); give {KNOWN}")
+class UnknownFormatError(Exception):
+    """A file or folder that is no log of the format it was taken for: what is read of it, and what it lacks."""
+
+    def __init__(self, text: bytes, lack: str) -> None:
+        super().__init__(lack)
+        self.text = text
+        self.lack = lack

@@ -1,4 +1,7 @@
-"""Messages in the order of log time, over chunks and files that overlap; unpacked and decoded ahead in threads."""
+"""Messages of a log, decoded: all of them in the order of log time, or a sample before the log is read.
+
+Chunks and files may overlap; they are unpacked and decoded ahead in threads.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from heapq import heappop, heappush
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from scanchain.logs.mcap.blocks import DamagedBlockError, read_block, release
 from scanchain.logs.mcap.records import Block, Channel, FileIndex
-from scanchain.logs.mcap.selection import Span
+from scanchain.logs.mcap.selection import EVERYTHING, Span, messages_of
 from scanchain.logs.messages.cdr import MalformedMessageError
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
-
 _THREADS = 2
 _MOST_BYTES_AHEAD = 256_000_000
+
+T = TypeVar("T")
+_SAMPLED_BLOCKS = 8  # of a topic, from the first on, that are searched
 
 
 class Decoded(NamedTuple):
@@ -106,3 +111,48 @@ def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> lis
     if incomplete and incomplete not in damage:
         damage.append(incomplete)
     return messages
+
+
+def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
+    """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
+    yield from _decoded_in(indexes, _blocks_of(indexes, topic)[:_SAMPLED_BLOCKS], topic, decode, EVERYTHING)
+
+
+def spread_messages(
+    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span
+) -> Iterator[T]:
+    """What a topic's messages in blocks from all over a span decode to; malformed ones are passed over."""
+    blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
+    chosen = (
+        blocks
+        if len(blocks) <= _SAMPLED_BLOCKS
+        else [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
+    )
+    yield from _decoded_in(indexes, chosen, topic, decode, span)
+
+
+def _blocks_of(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
+    """Those that may hold messages of the topic, by time."""
+    blocks = [
+        block
+        for index in indexes
+        for block in index.blocks
+        if index.may_hold(block, {n for n, channel in index.channels.items() if channel.topic == topic})
+    ]
+    return sorted(blocks, key=lambda block: block.start_ns)
+
+
+def _decoded_in(
+    indexes: Sequence[FileIndex],
+    blocks: Sequence[Block],
+    topic: str,
+    decode: Callable[[memoryview], T],
+    span: Span,
+) -> Iterator[T]:
+    for block in blocks:
+        for message in messages_of(indexes[block.file], block):
+            if message.channel.topic == topic and span.begin_ns <= message.log_time_ns <= span.end_ns:
+                try:
+                    yield decode(message.data)
+                except MalformedMessageError:
+                    continue

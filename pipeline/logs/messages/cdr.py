@@ -1,4 +1,4 @@
-"""ROS 2 messages in CDR: alignment counts from the fourth byte, byte order is in the second."""
+"""Readers of ROS messages: ROS 2's CDR and ROS 1's packed serialization, by the same methods."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.words import counted
+
+_ORDER = "<"
 
 
 class MalformedMessageError(Exception):
@@ -89,3 +91,35 @@ class CdrReader:
 @cache
 def _layout(order: str, code: str, count: int) -> tuple[struct.Struct, int]:
     return struct.Struct(f"{order}{count}{code}"), struct.calcsize(f"={code}")
+
+
+class Ros1Reader(CdrReader):
+    """Reads one message from front to back, by the same verbs as for CDR."""
+
+    __slots__ = ()
+
+    def __init__(self, data: memoryview) -> None:
+        self.data = data
+        self.offset = 0
+        self.order = _ORDER
+
+    def numbers(self, code: str, count: int = 1) -> tuple[int, ...] | tuple[float, ...]:
+        """``count`` numbers of one struct code."""
+        layout = _packed_layout(code, count)
+        begin, self.offset = self.offset, self.offset + layout.size
+        if self.offset > len(self.data):
+            self._complain(self.offset)
+        return layout.unpack_from(self.data, begin)
+
+    def align(self, size: int) -> None:
+        """Nothing: ROS 1 packs tightly."""
+
+    def header(self) -> tuple[int, str]:
+        """The stamp in nanoseconds and the frame of a std_msgs/Header."""
+        _, seconds, nanoseconds = self.numbers("I", 3)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds), self.string()
+
+
+@cache
+def _packed_layout(code: str, count: int) -> struct.Struct:
+    return struct.Struct(f"{_ORDER}{count}{code}")

@@ -1,22 +1,28 @@
-"""Foxglove's own messages, LaserScan, PointCloud, PoseInFrame and FrameTransforms, told in JSON or Protobuf.
+"""Foxglove's own messages, LaserScan, PointCloud, PoseInFrame and FrameTransforms, in JSON or Protobuf.
 
 Schemas: https://docs.foxglove.dev/docs/sdk/schemas
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
 
+import msgspec
 import numpy as np
+from msgspec import Struct, field
 
 from scanchain.data import Pose
+from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanMessage
 from scanchain.logs.messages.point_cloud import PointCloudMessage, PointField
 from scanchain.logs.messages.poses import StampedPose, pose_matrix
 
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
+
+T = TypeVar("T")
 
 
 class _Stamp(Protocol):
@@ -45,7 +51,7 @@ class _Posed(Protocol):
     pose: _Pose
 
 
-class ToldScan(_Posed, Protocol):
+class _LaserScan(_Posed, Protocol):
     """A foxglove.LaserScan."""
 
     start_angle: float
@@ -59,7 +65,7 @@ class _Field(Protocol):
     type: int
 
 
-class ToldCloud(_Posed, Protocol):
+class _PointCloud(_Posed, Protocol):
     """A foxglove.PointCloud."""
 
     point_stride: int
@@ -67,7 +73,7 @@ class ToldCloud(_Posed, Protocol):
     data: bytes
 
 
-class ToldTransform(Protocol):
+class _Transform(Protocol):
     """A foxglove.FrameTransform."""
 
     timestamp: _Stamp
@@ -77,68 +83,68 @@ class ToldTransform(Protocol):
     rotation: _Quaternion
 
 
-class ToldTransforms(Protocol):
+class _Transforms(Protocol):
     """A foxglove.FrameTransforms."""
 
-    transforms: Sequence[ToldTransform]
+    transforms: Sequence[_Transform]
 
 
-def laser_scan(told: ToldScan) -> LaserScanMessage:
+def laser_scan(message: _LaserScan) -> LaserScanMessage:
     """The scan, without range limits and times, which Foxglove does not tell."""
     with np.errstate(over="ignore"):
-        ranges_m = np.array(told.ranges, np.float64).astype(np.float32)
-    step_rad = (told.end_angle - told.start_angle) / max(len(ranges_m) - 1, 1)
+        ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
+    step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
     return LaserScanMessage(
-        stamp_ns=_stamp_ns(told.timestamp),
-        frame=told.frame_id,
-        first_rad=told.start_angle,
-        last_rad=told.end_angle,
+        stamp_ns=_stamp_ns(message.timestamp),
+        frame=message.frame_id,
+        first_rad=message.start_angle,
+        last_rad=message.end_angle,
         step_rad=step_rad,
         beam_s=0.0,
         scan_s=0.0,
         range_min_m=0.0,
         range_max_m=0.0,
         ranges_m=ranges_m,
-        T_frame_scan=_unless_identity(told.pose),
+        T_frame_scan=_unless_identity(message.pose),
     )
 
 
-def point_cloud(told: ToldCloud) -> PointCloudMessage:
+def point_cloud(message: _PointCloud) -> PointCloudMessage:
     """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
-    if not told.point_stride:
+    if not message.point_stride:
         raise MalformedMessageError("point_stride is zero")
-    count = len(told.data) // told.point_stride
-    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in told.fields]
+    count = len(message.data) // message.point_stride
+    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields]
     return PointCloudMessage(
-        stamp_ns=_stamp_ns(told.timestamp),
-        frame=told.frame_id,
+        stamp_ns=_stamp_ns(message.timestamp),
+        frame=message.frame_id,
         height=1,
         width=count,
         fields=fields,
         is_bigendian=False,
-        point_step=told.point_stride,
-        row_step=count * told.point_stride,
-        data=memoryview(told.data),
-        described=repr((told.point_stride, fields)).encode(),
-        T_frame_cloud=_unless_identity(told.pose),
+        point_step=message.point_stride,
+        row_step=count * message.point_stride,
+        data=memoryview(message.data),
+        described=repr((message.point_stride, fields)).encode(),
+        T_frame_cloud=_unless_identity(message.pose),
     )
 
 
-def pose_in_frame(told: _Posed, dimension: int) -> StampedPose:
+def pose_in_frame(message: _Posed, dimension: int) -> StampedPose:
     """A foxglove.PoseInFrame, flattened for dimension 2."""
-    pose = _pose(told.pose.position, told.pose.orientation, dimension)
-    return StampedPose(_stamp_ns(told.timestamp), told.frame_id, "", pose)
+    pose = _pose(message.pose.position, message.pose.orientation, dimension)
+    return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
 
 
-def frame_transform(told: ToldTransform) -> list[StampedPose]:
+def frame_transform(message: _Transform) -> list[StampedPose]:
     """A foxglove.FrameTransform."""
-    pose = _pose(told.translation, told.rotation, 3)
-    return [StampedPose(_stamp_ns(told.timestamp), told.parent_frame_id, told.child_frame_id, pose)]
+    pose = _pose(message.translation, message.rotation, 3)
+    return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
 
 
-def frame_transforms(told: ToldTransforms) -> list[StampedPose]:
+def frame_transforms(message: _Transforms) -> list[StampedPose]:
     """All transforms of a foxglove.FrameTransforms."""
-    return [transform for each in told.transforms for transform in frame_transform(each)]
+    return [transform for each in message.transforms for transform in frame_transform(each)]
 
 
 def _stamp_ns(stamp: _Stamp) -> int:
@@ -155,3 +161,130 @@ def _pose(position: _Vector, orientation: _Quaternion, dimension: int) -> Pose:
     quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
     quaternion = quaternion if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
     return pose_matrix((position.x, position.y, position.z, *quaternion), dimension)
+
+
+class JsonStamp(Struct, frozen=True):
+    """Seconds and nanoseconds since the epoch."""
+
+    seconds: int = field(name="sec", default=0)
+    nanos: int = field(name="nsec", default=0)
+
+
+class JsonVector(Struct, frozen=True):
+    """Meters."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class JsonQuaternion(Struct, frozen=True):
+    """All zero where it was left out."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 0.0
+
+
+class JsonPose(Struct, frozen=True):
+    """Position and orientation."""
+
+    position: JsonVector = JsonVector()
+    orientation: JsonQuaternion = JsonQuaternion()
+
+
+class JsonLaserScan(Struct, frozen=True):
+    """A foxglove.LaserScan; a range that is null is no number."""
+
+    ranges: list[float | None]
+    start_angle: float
+    end_angle: float
+    timestamp: JsonStamp = JsonStamp()
+    frame_id: str = ""
+    pose: JsonPose = JsonPose()
+
+
+class JsonPackedField(Struct, frozen=True):
+    """A foxglove.PackedElementField."""
+
+    name: str
+    offset: int
+    type: int
+
+
+class JsonPointCloud(Struct, frozen=True):
+    """A foxglove.PointCloud; ``data`` comes in base64."""
+
+    point_stride: int
+    fields: list[JsonPackedField]
+    data: bytes
+    timestamp: JsonStamp = JsonStamp()
+    frame_id: str = ""
+    pose: JsonPose = JsonPose()
+
+
+class JsonPoseInFrame(Struct, frozen=True):
+    """A foxglove.PoseInFrame."""
+
+    pose: JsonPose
+    timestamp: JsonStamp = JsonStamp()
+    frame_id: str = ""
+
+
+class JsonFrameTransform(Struct, frozen=True):
+    """A foxglove.FrameTransform."""
+
+    parent_frame_id: str
+    child_frame_id: str
+    translation: JsonVector = JsonVector()
+    rotation: JsonQuaternion = JsonQuaternion()
+    timestamp: JsonStamp = JsonStamp()
+
+
+class JsonFrameTransforms(Struct, frozen=True):
+    """A foxglove.FrameTransforms."""
+
+    transforms: list[JsonFrameTransform]
+
+
+def parse_json(data: memoryview, kind: type[T]) -> T:
+    """One message. NaN and Infinity, which are no JSON but which Python and others write, are taken."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.ValidationError as error:
+        raise MalformedMessageError(f"it does not fit its type: {error}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        pass
+    try:
+        return msgspec.convert(json.loads(bytes(data)), kind)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessageError(f"it is no JSON of its type: {error}") from error
+
+
+def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:
+    """What parses the messages of a channel; one that cannot be made complains at every message."""
+    from google.protobuf.message import DecodeError
+    from mcap.exceptions import McapError
+    from mcap.records import Schema
+    from mcap_protobuf.decoder import DecoderFactory
+
+    schema = Schema(data=channel.definition, encoding="protobuf", id=1, name=channel.type_name)
+    try:
+        decode = DecoderFactory().decoder_for("protobuf", schema)
+    except (McapError, DecodeError, TypeError, KeyError, RecursionError) as error:
+        reason = f"its schema {channel.type_name} is broken: {' '.join(str(error).split())}"
+        return lambda _: _complain(reason)
+    assert decode is not None
+
+    def parse(data: memoryview) -> Any:
+        try:
+            return decode(bytes(data))
+        except DecodeError as error:
+            raise MalformedMessageError(f"it is no Protobuf of its schema: {error}") from error
+
+    return parse
+
+
+def _complain(reason: str) -> None:
+    raise MalformedMessageError(reason)

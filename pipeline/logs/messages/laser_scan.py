@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Pose
 from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
-from scanchain.logs.messages.limits import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
 
 _MOST_GEOMETRIES = 16
 _NEAREST_M = float(np.finfo(np.float32).tiny)

@@ -1,4 +1,4 @@
-"""sensor_msgs/PointCloud2 to points in space."""
+"""sensor_msgs/PointCloud2 and a Livox driver's CustomMsg to points in space."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scanchain.data import Pose
 from scanchain.kernels.cloud_fields import keep_valid
 from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
-from scanchain.logs.messages.limits import NO_TIMES, RangeLimits, Returns, moved
 from scanchain.logs.messages.point_times import NAMES, PointTimes
+from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64
@@ -20,6 +20,9 @@ _MOST_FIELDS = 1024
 PLANAR_M = 5e-4  # off the plane, at the most, of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # of a cloud, and in all, that tell whether clouds are planar
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
+
+_LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
+_LIVOX_DESCRIBED = b"livox CustomMsg, little endian", b"livox CustomMsg, big endian"
 
 
 class PointField(NamedTuple):
@@ -48,6 +51,14 @@ class PointCloudMessage(NamedTuple):
     data: memoryview
     described: bytes
     T_frame_cloud: Pose | None = None
+
+
+_LIVOX_FIELDS = [
+    PointField("offset_time", 0, 6, 1),
+    PointField("x", 4, 7, 1),
+    PointField("y", 8, 7, 1),
+    PointField("z", 12, 7, 1),
+]
 
 
 def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
@@ -240,3 +251,24 @@ def _why_none(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.floa
     zero = int(np.count_nonzero((x == 0.0) & (y == 0.0) & (z == 0.0)))
     outside = count - undefined - zero
     return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"
+
+
+def read_livox(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
+    """Take a message apart; the points are a view of it, each a row of its own as CDR aligns them."""
+    reader = form(data)
+    stamp_ns, frame = reader.header()
+    reader.numbers("Q")  # time of the first point, by the lidar's clock
+    reader.integer()  # the number of points, told once more by their array
+    reader.numbers("B", 4)  # lidar and reserved
+    count = reader.integer()
+    before = reader.offset
+    reader.offset += _LIVOX_POINT_BYTES
+    reader.align(4)
+    stride = reader.offset - before
+    if (count - 1) * stride + _LIVOX_POINT_BYTES > len(data) - before:
+        raise MalformedMessageError(f"it has {len(data)} bytes, too few for {count} points of {stride} bytes")
+    is_bigendian = reader.order == ">"
+    body, described = data[before:], _LIVOX_DESCRIBED[is_bigendian]
+    return PointCloudMessage(
+        stamp_ns, frame, count, 1, _LIVOX_FIELDS, is_bigendian, _LIVOX_POINT_BYTES, stride, body, described
+    )

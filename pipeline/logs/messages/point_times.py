@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
 from scanchain.data import RawPoints
-from scanchain.logs.messages.limits import NO_TIMES
+from scanchain.logs.messages.returns import NO_TIMES
 
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 

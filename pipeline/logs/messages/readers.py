@@ -1,4 +1,4 @@
-"""Which messages are understood: one registry, from a message's encoding and type to what takes it apart."""
+"""The registries of encodings and message types, from which every channel gets the reader of its messages."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages import foxglove, foxglove_json, foxglove_protobuf
-from scanchain.logs.messages.cdr import CdrReader
+from scanchain.logs.messages import foxglove
+from scanchain.logs.messages.cdr import CdrReader, Ros1Reader
 from scanchain.logs.messages.laser_scan import LaserScanMessage, read_laser_scan, read_multi_echo_scan
-from scanchain.logs.messages.livox import read_livox
-from scanchain.logs.messages.point_cloud import PointCloudMessage, read_point_cloud
+from scanchain.logs.messages.point_cloud import PointCloudMessage, read_livox, read_point_cloud
 from scanchain.logs.messages.poses import StampedPose, decode_odometry, decode_pose, decode_transforms
-from scanchain.logs.messages.ros1 import Ros1Reader
 
 Read = Callable[..., Any]
 _Bind = Callable[[Channel], Read]  # the reader of one channel
@@ -27,7 +25,7 @@ class Kind(NamedTuple):
 
 
 def kind(channel: Channel) -> str:
-    """The message type as package/Type, whatever form the schema's name has."""
+    """Message type as package/Type, whatever form the schema's name has."""
     return channel.type_name.replace("/msg/", "/").replace("::msg::dds_::", "/").rstrip("_")
 
 
@@ -57,47 +55,55 @@ def has_transforms(channel: Channel) -> bool:
 
 
 def scan_reader(channel: Channel) -> Callable[[memoryview], LaserScanMessage]:
-    """What takes a laser scan of the channel apart."""
+    """Reader of the channel's laser scans."""
     return _SCANS[_kind(channel)](channel)
 
 
 def cloud_reader(channel: Channel) -> Callable[[memoryview], PointCloudMessage]:
-    """What takes a cloud of the channel apart."""
+    """Reader of the channel's clouds."""
     return _CLOUDS[_kind(channel)](channel)
 
 
 def pose_reader(channel: Channel, dimension: int) -> Callable[[memoryview], StampedPose]:
-    """What takes a pose of the channel apart, flattened for dimension 2."""
+    """Reader of the channel's poses, flattened for dimension 2."""
     read = (_POSES | _ODOMETRY)[_kind(channel)](channel)
     return partial(read, dimension=dimension)
 
 
 def transforms_reader(channel: Channel) -> Callable[[memoryview], list[StampedPose]]:
-    """What takes transforms of the channel apart."""
+    """Reader of the channel's transforms."""
     return _TRANSFORMS[_kind(channel)](channel)
 
 
 def _kind(channel: Channel) -> Kind:
     """The registry's key; an encoding whose schema is in another language is none of ours."""
-    is_ours = channel.schema_encoding in _LANGUAGES.get(channel.encoding, ())
+    is_ours = channel.schema_encoding in _ENCODINGS.get(channel.encoding, _Encoding(())).schema_languages
     return Kind(channel.encoding if is_ours else "", kind(channel))
 
 
-_LANGUAGES = {
-    "cdr": ("ros2msg", "ros2idl"),
-    "ros1": ("ros1msg",),
-    "json": ("jsonschema", ""),
-    "protobuf": ("protobuf",),
+class _Encoding(NamedTuple):
+    """A message encoding: the languages of its schemas, and how it reads ROS's types or parses Foxglove's."""
+
+    schema_languages: tuple[str, ...]
+    reader: type[CdrReader] | None = None
+    parser: Callable[[Channel, type], Read] | None = None
+
+
+_ENCODINGS = {
+    "cdr": _Encoding(("ros2msg", "ros2idl"), reader=CdrReader),
+    "ros1": _Encoding(("ros1msg",), reader=Ros1Reader),
+    "json": _Encoding(("jsonschema", ""), parser=lambda _, kind: partial(foxglove.parse_json, kind=kind)),
+    "protobuf": _Encoding(("protobuf",), parser=lambda channel, _: foxglove.protobuf_parser(channel)),
 }
 
 
 def _ros(type_names: tuple[str, ...], read: Read) -> dict[Kind, _Bind]:
     """A type that ROS 1 and ROS 2 lay out alike, each in its own serialization."""
-    forms = {"cdr": CdrReader, "ros1": Ros1Reader}
     return {
-        Kind(encoding, name): partial(_form_bound, read, form)
+        Kind(encoding, name): partial(_form_bound, read, each.reader)
         for name in type_names
-        for encoding, form in forms.items()
+        for encoding, each in _ENCODINGS.items()
+        if each.reader is not None
     }
 
 
@@ -108,9 +114,14 @@ def _form_bound(read: Read, form: type[CdrReader], _: Channel) -> Read:
 def _foxglove(type_name: str, json_type: type, take: Read) -> dict[Kind, _Bind]:
     """A type of Foxglove's, in JSON and in Protobuf."""
     return {
-        Kind("json", type_name): lambda _: _both(partial(foxglove_json.parse, kind=json_type), take),
-        Kind("protobuf", type_name): lambda channel: _both(foxglove_protobuf.parser(channel), take),
+        Kind(encoding, type_name): partial(_parser_bound, each.parser, json_type, take)
+        for encoding, each in _ENCODINGS.items()
+        if each.parser is not None
     }
+
+
+def _parser_bound(parser: Callable[[Channel, type], Read], json_type: type, take: Read, channel: Channel) -> Read:
+    return _both(parser(channel, json_type), take)
 
 
 def _both(parse: Read, take: Read) -> Read:
@@ -120,23 +131,23 @@ def _both(parse: Read, take: Read) -> Read:
 _SCANS: dict[Kind, _Bind] = {
     **_ros(("sensor_msgs/LaserScan",), read_laser_scan),
     **_ros(("sensor_msgs/MultiEchoLaserScan",), read_multi_echo_scan),
-    **_foxglove("foxglove.LaserScan", foxglove_json.LaserScan, foxglove.laser_scan),
+    **_foxglove("foxglove.LaserScan", foxglove.JsonLaserScan, foxglove.laser_scan),
 }
 _CLOUDS: dict[Kind, _Bind] = {
     **_ros(("sensor_msgs/PointCloud2",), read_point_cloud),
     **_ros(
         tuple(f"{p}/CustomMsg" for p in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")), read_livox
     ),
-    **_foxglove("foxglove.PointCloud", foxglove_json.PointCloud, foxglove.point_cloud),
+    **_foxglove("foxglove.PointCloud", foxglove.JsonPointCloud, foxglove.point_cloud),
 }
 _ODOMETRY: dict[Kind, _Bind] = _ros(("nav_msgs/Odometry",), decode_odometry)
 _POSES: dict[Kind, _Bind] = {
     **_ros(("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"), decode_pose),
-    **_foxglove("foxglove.PoseInFrame", foxglove_json.PoseInFrame, foxglove.pose_in_frame),
+    **_foxglove("foxglove.PoseInFrame", foxglove.JsonPoseInFrame, foxglove.pose_in_frame),
 }
 _TRANSFORMS: dict[Kind, _Bind] = {
     **_ros(("tf2_msgs/TFMessage", "tf/tfMessage"), decode_transforms),
-    **_foxglove("foxglove.FrameTransform", foxglove_json.FrameTransform, foxglove.frame_transform),
-    **_foxglove("foxglove.FrameTransforms", foxglove_json.FrameTransforms, foxglove.frame_transforms),
+    **_foxglove("foxglove.FrameTransform", foxglove.JsonFrameTransform, foxglove.frame_transform),
+    **_foxglove("foxglove.FrameTransforms", foxglove.JsonFrameTransforms, foxglove.frame_transforms),
 }
 LIDAR_TYPES = tuple(sorted({kind.type_name for kind in (*_SCANS, *_CLOUDS)}))

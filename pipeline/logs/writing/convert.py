@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 from scanchain.logs.mcap.records import FileIndex, name_of
 from scanchain.logs.mcap.selection import EVERYTHING, chosen_span, whole_span
 from scanchain.logs.mcap.stream import Decoded, decoded_messages
-from scanchain.logs.opening import HAS_STAMPS, index_files
+from scanchain.logs.opening import AUTO, HAS_STAMPS, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.source import Source
@@ -47,10 +47,10 @@ def convert(
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
-    indexes = index_files(sources, config.rate_hz)
+    indexes = index_files(sources, config)
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
     is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
-    if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part:
+    if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part and config.format == AUTO:
         raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)

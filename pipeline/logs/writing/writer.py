@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.writing.pack import Link, pack_cloud, pack_laser_scan, pack_odometry, pack_transforms, place
-from scanchain.logs.writing.ros2_definitions import schema_text
+from scanchain.logs.writing.pack import (
+    Link,
+    pack_cloud,
+    pack_laser_scan,
+    pack_odometry,
+    pack_transforms,
+    place,
+    schema_text,
+)
 
 CHUNK_BYTES = 4 * 1024 * 1024
 

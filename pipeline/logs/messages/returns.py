@@ -1,4 +1,4 @@
-"""How near and how far a return may be to be taken from the log, and what is left of a message then."""
+"""Valid returns of a scan message, and the range limits within which a return is valid."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.config import PreprocessConfig
 from scanchain.data import Pose, RawPoints
-from scanchain.words import counted
 
 
 class RangeLimits(NamedTuple):
@@ -33,7 +31,6 @@ class Returns(NamedTuple):
     why: str
 
 
-_SAMPLE = 64  # every so-many-th point is looked at first: as a rule one of them is in range
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
 
@@ -44,17 +41,3 @@ def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
         return points
     d = points.shape[1]
     return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)
-
-
-def none_retained(points: RawPoints, config: PreprocessConfig) -> str:
-    """What is wrong with points (N, d) of which preprocessing retains none; empty where it retains one."""
-    low_m, high_m = config.min_range_m, config.max_range_m
-    squares = np.empty(0)
-    for part in (points[::_SAMPLE], points):
-        squares = np.einsum("ij,ij->i", part, part, dtype=np.float64)
-        if ((low_m * low_m <= squares) & (squares <= high_m * high_m)).any():
-            return ""
-    near_m, far_m = np.sqrt([squares.min(), squares.max()])
-    limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
-    seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"
-    return f"no point between {limits} ({seen}: widen these limits)"

@@ -1,7 +1,7 @@
-"""The index of an MCAP file that lies elsewhere, from its summary alone: two or three requests.
+"""Index of a remote MCAP file from its summary alone: two or three requests.
 
-A file whose summary is absent, damaged, or does not tell where every message lies has to be walked, which takes
-all its bytes. Format: https://mcap.dev/spec
+A file whose summary is absent, damaged, or does not give the position of every message has to be walked, which
+takes all its bytes. Format: https://mcap.dev/spec
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 
+from scanchain.logs.files import RemoteFile
+from scanchain.logs.mcap.index import FOOTER_BODY, is_believable
 from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -25,8 +27,6 @@ from scanchain.logs.mcap.records import (
     FileIndex,
     read_string,
 )
-from scanchain.logs.mcap.walk import FOOTER_BODY, is_believable
-from scanchain.logs.remote.files import RemoteFile
 
 _TAIL_BYTES = 65_536  # read at first; most summaries lie in it
 _FOOTER_BYTES = RECORD.size + FOOTER_BODY.size

@@ -1,21 +1,28 @@
-"""Bytes of a file that lies elsewhere, by ranges, through fsspec: S3, HTTP and whatever else it knows."""
+"""The files of a log: their sizes, and those at an address, read by byte ranges through fsspec or copied whole."""
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
 from collections.abc import Callable
 from functools import cached_property
+from pathlib import Path
+from tempfile import mkdtemp
 from time import sleep
 from typing import Any, TypeVar
 
+from scanchain.download import fetch
 from scanchain.errors import InputError, MissingExtraError
-from scanchain.source import Address
+from scanchain.source import Address, Source
 
 T = TypeVar("T")
-
 _ATTEMPTS = 4
 _PAUSE_S = 0.5  # after the first failure; twice as long after each further one
 _CONNECT_S, _SILENCE_S = 10.0, 30.0  # before a server counts as gone
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
+
+_PIECE_BYTES = 8_000_000
 
 
 class RemoteFile:
@@ -143,3 +150,48 @@ def _reason(error: Exception) -> str:
         return "not found"  # its text would be the address, keys and all
     text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
     return " ".join(text.split()) or type(cause).__name__
+
+
+def fetch_whole(file: RemoteFile) -> Path:
+    """The path of the copy. Raises InputError where it does not come or finds no room."""
+    folder = Path(mkdtemp(prefix="scanchain-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = folder / (file.address.name or "log")
+    try:
+        if file.has_ranges:
+            _copy(file, copy)
+        else:
+            fetch(file.address.url, copy)
+    except OSError as error:
+        raise InputError(f"{copy}: {file.address} cannot be kept there ({error.strerror}); set TMPDIR") from error
+    return copy
+
+
+def _copy(file: RemoteFile, destination: Path) -> None:
+    """Piece by piece, so that a broken line costs one piece only."""
+    with destination.open("wb") as copy:
+        for offset in range(0, file.size, _PIECE_BYTES):
+            copy.write(file.read(offset, min(_PIECE_BYTES, file.size - offset)))
+
+
+def files_of(path: Path) -> list[Path]:
+    """The file itself, or every file in a folder and below, in the order of their names."""
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+
+
+def misspelled(source: Source) -> str:
+    """What is wrong with a name that is no text, which nothing could be written about; empty where it is text."""
+    name = os.path.realpath(source) if isinstance(source, Path) else str(source)
+    return "" if spelled(name) == name else f"{spelled(name)}: the name is not UTF-8; rename it"
+
+
+def spelled(name: str) -> str:
+    """A name as text; bytes in it that are not UTF-8 are written as numbers (x and two digits)."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
+def size_of(source: Source) -> int:
+    """Bytes of all of them, or of what lies at an address."""
+    if not isinstance(source, Path):
+        return RemoteFile(source).size
+    return sum(file.stat().st_size for file in files_of(source))

@@ -1,4 +1,4 @@
-"""ROS bags: those of ROS 2 that are kept in SQLite are read by rosbags; their messages stay as they are."""
+"""ROS 2 bags in SQLite, read by rosbags; their messages stay as they are."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from scanchain.errors import InputError
+from scanchain.logs.files import size_of
 from scanchain.logs.formats.made import made_index
-from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.remote.sizes import size_of
-from scanchain.logs.writing.ros2_definitions import schema_text
+from scanchain.logs.writing.pack import schema_text
 from scanchain.words import counted
 
 _BLOCK_BYTES = 8_000_000  # about, of the file
@@ -25,10 +24,13 @@ _MOST_TRIES = 400  # to read parts of a damaged block
 _LATEST_NS = (1 << 63) - 1
 
 
-def index_bag(path: Path, number: int) -> FileIndex:
-    """The topics of a bag: a .bag, a .db3, or the folder of a ROS 2 bag. Raises InputError for what is none."""
-    if _is_ros1(path):
-        return index_ros1_bag(path, number)
+def claims_ros2_bag(path: Path, head: bytes) -> bool:
+    """Whether it is an SQLite file, or a folder with a bag's metadata."""
+    return head.startswith(b"SQLite format 3\0") or (path / "metadata.yaml").is_file()
+
+
+def index_ros2_bag(path: Path, number: int) -> FileIndex:
+    """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
     index, reader = made_index(path, number), _open(path)
     if not all(_is_sound(connection) for connection in reader.connections):
         raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
@@ -145,10 +147,3 @@ def _definition(type_name: str) -> bytes:
         return schema_text(type_name)
     except (KeyError, ValueError):
         return b""
-
-
-def _is_ros1(path: Path) -> bool:
-    if path.is_dir():
-        return False
-    with path.open("rb") as file:
-        return file.read(7) == b"#ROSBAG"

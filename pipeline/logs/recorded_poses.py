@@ -1,67 +1,71 @@
-"""The poses that a log tells beside its scans: the wheels', the truth, and those of the lidar on the robot."""
+"""Poses recorded beside the scans: of the wheels, of the ground truth, and of the lidar on the robot."""
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
 
+from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.logs.mcap.stream import Decoded
-from scanchain.logs.messages.limits import Returns
 from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.messages.returns import Returns
 from scanchain.logs.mounting import Mounting, edge
-from scanchain.logs.wheels import WheelTrack
 from scanchain.words import counted
 
+_REMEMBERED = 512  # readings
+_NEAREST_NS = 500_000_000
 
-class Beside(NamedTuple):
+
+class PosesAtScan(NamedTuple):
     """T_odom_base (d+1, d+1) and T_base_lidar (4, 4) at a scan's stamp; None where no reading is near."""
 
     T_odom_base: Pose | None
     T_base_lidar: Pose | None
 
 
-class ToldPoses:
-    """Takes in pose messages and answers where the wheels were; malformed ones are counted."""
+class RecordedPoses:
+    """Pose messages by topic, looked up at the stamp of a scan; malformed ones are counted."""
 
     def __init__(self, odometry_topic: str, ground_truth_topic: str, mounting: Mounting | None = None) -> None:
         self.odometry_topic = odometry_topic
         self.ground_truth_topic = ground_truth_topic
-        self.wheels = WheelTrack()
+        self.wheels = PoseTrack()
         self.mounting = mounting
-        self.joints = {joint: WheelTrack() for joint in (() if mounting is None else mounting.joints)}
+        self.joints = {joint: PoseTrack() for joint in (() if mounting is None else mounting.joints)}
         self.truth: list[StampedPose] = []
         self.malformed: Counter[str] = Counter()
         self.reasons: dict[str, str] = {}
 
     def take(self, message: Decoded) -> None:
         """Sort one message in."""
-        topic, told = message.channel.topic, message.value
-        if isinstance(told, list):
-            self._take_joints(told)
+        topic, pose = message.channel.topic, message.value
+        if isinstance(pose, list):
+            self._take_joints(pose)
             return
-        if not isinstance(told, StampedPose):
+        if not isinstance(pose, StampedPose):
             self.malformed[topic] += 1
-            self.reasons.setdefault(topic, str(told))
+            self.reasons.setdefault(topic, str(pose))
             return
         if topic == self.odometry_topic:
-            self.wheels.add(told.stamp_ns, told.T_parent_child)
+            self.wheels.add(pose.stamp_ns, pose.T_parent_child)
         if topic == self.ground_truth_topic:
-            self.truth.append(told)
+            self.truth.append(pose)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether everything that a scan at the instant needs has been told."""
+        """Whether all poses that a scan at the instant needs have been read."""
         needed = [self.wheels] if self.odometry_topic else []
         return all(track.covers(stamp_ns) for track in (*needed, *self.joints.values()))
 
-    def beside(self, scan: Decoded) -> Beside:
-        """What holds at the scan's stamp."""
+    def at_scan(self, scan: Decoded) -> PosesAtScan:
+        """The poses at the scan's stamp."""
         if not isinstance(scan.value, Returns):
-            return Beside(None, None)
+            return PosesAtScan(None, None)
         stamp_ns = scan.value.stamp_ns
-        return Beside(self.wheels.at(stamp_ns), self._mounting_at(stamp_ns))
+        return PosesAtScan(self.wheels.at(stamp_ns), self._mounting_at(stamp_ns))
 
     def _take_joints(self, transforms: list[StampedPose]) -> None:
         for each in transforms:
@@ -87,3 +91,34 @@ class ToldPoses:
             f"{counted(count, 'malformed message')} of {topic} left out (the first: {self.reasons[topic]})"
             for topic, count in self.malformed.items()
         ]
+
+
+class PoseTrack:
+    """The latest poses of a moving frame, by stamp, interpolated between them."""
+
+    def __init__(self) -> None:
+        self.stamps_ns: list[int] = []
+        self.poses: dict[int, Pose] = {}
+
+    def add(self, stamp_ns: int, T_odom_base: Pose) -> None:
+        """Remember a reading; the oldest are forgotten."""
+        if stamp_ns not in self.poses:
+            insort(self.stamps_ns, stamp_ns)
+        self.poses[stamp_ns] = T_odom_base
+        if len(self.stamps_ns) > _REMEMBERED:
+            del self.poses[self.stamps_ns.pop(0)]
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether there is a reading at the instant, or one after it."""
+        return stamp_ns in self.poses or bool(self.stamps_ns and self.stamps_ns[-1] >= stamp_ns)
+
+    def at(self, stamp_ns: int) -> Pose | None:
+        """The reading at the instant, or between its neighbors, or the nearest within half a second."""
+        if stamp_ns in self.poses:
+            return self.poses[stamp_ns]
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        near = [s for s in self.stamps_ns[max(after - 1, 0) : after + 1] if abs(s - stamp_ns) <= _NEAREST_NS]
+        if len(near) == 2:
+            share = (stamp_ns - near[0]) / (near[1] - near[0])
+            return lie.interpolate(self.poses[near[0]], self.poses[near[1]], share)
+        return self.poses[near[0]] if near else None

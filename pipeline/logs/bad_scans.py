@@ -1,0 +1,113 @@
+"""Scans of a log that cannot be used: what is wrong with them, how many are allowed, and the counts reported."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from scanchain.checks import LONGEST_SWEEP_S
+from scanchain.config import LogConfig, PreprocessConfig
+from scanchain.data import RawPoints, Scan
+from scanchain.errors import InputError
+from scanchain.logs.mcap.stream import Decoded
+from scanchain.logs.messages.returns import Returns
+from scanchain.words import counted
+
+_SAMPLE = 64  # every so-many-th point is looked at first: as a rule one of them is in range
+
+
+def most_bad_scans(scans: int, config: LogConfig) -> float:
+    """Number of scans that may be left out; unlimited at 100 %, as damaged logs may hold more than they say."""
+    share = 0.01 * config.max_bad_scans_percent
+    return math.ceil(share * scans) if share < 1.0 else math.inf
+
+
+def check_count(bad: int, scans: int, config: LogConfig, complaint: str) -> None:
+    """Refuse more bad scans than are allowed; ``complaint`` is about the last one. Raises InputError."""
+    if bad > most_bad_scans(scans, config):
+        raise InputError(
+            f"{complaint}; with it {bad} of {counted(scans, 'scan')} cannot be used, more than "
+            f"log.max_bad_scans_percent ({config.max_bad_scans_percent:g}) allows; raise it, or choose "
+            "another --topic"
+        )
+
+
+def defect(message: Decoded, where: str, preprocess: PreprocessConfig | None) -> str:
+    """What makes a scan unusable, empty where it is usable; ``where`` names the scan."""
+    returns = message.value
+    if not isinstance(returns, Returns):
+        return f"{where} is malformed: {returns}"
+    if message.log_time_ns >= 1 << 63:
+        return f"{where} has the log time {message.log_time_ns} ns, which no clock shows"
+    farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
+    if farthest_s > LONGEST_SWEEP_S:
+        return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
+    if not len(returns.points):
+        return f"{where} has no valid point ({returns.why})"
+    outside = "" if preprocess is None else _none_retained(returns.points, preprocess)
+    return outside and f"{where} has {outside}"
+
+
+def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
+    """What is wrong with points (N, d) of which preprocessing retains none; empty where it retains one."""
+    low_m, high_m = config.min_range_m, config.max_range_m
+    squares = np.empty(0)
+    for part in (points[::_SAMPLE], points):
+        squares = np.einsum("ij,ij->i", part, part, dtype=np.float64)
+        if ((low_m * low_m <= squares) & (squares <= high_m * high_m)).any():
+            return ""
+    near_m, far_m = np.sqrt([squares.min(), squares.max()])
+    limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
+    seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"
+    return f"no point between {limits} ({seen}: widen these limits)"
+
+
+class ScanCounts:
+    """Counts of scans left out, with stamps out of order, and without wheel odometry, for the report of a log."""
+
+    def __init__(self, topic: str, odometry_topic: str) -> None:
+        self.topic = topic
+        self.odometry_topic = odometry_topic
+        self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = 0
+        self.first_complaint = ""
+        self.last_stamp_ns: int | None = None
+
+    def skip(self, complaint: str) -> None:
+        """Count a scan that is left out."""
+        self.scans += 1
+        self.bad += 1
+        self.first_complaint = self.first_complaint or complaint
+
+    def take(self, scan: Scan) -> None:
+        """Count a scan that is passed on."""
+        self.scans += 1
+        self.without_wheels += scan.T_odom_base is None
+        if self.last_stamp_ns is not None:
+            self.backwards += scan.stamp_ns < self.last_stamp_ns
+            self.repeated += scan.stamp_ns == self.last_stamp_ns
+        self.last_stamp_ns = scan.stamp_ns
+
+    def losses(self) -> list[str]:
+        """A line on the scans that were left out, none where there are none."""
+        if not self.bad:
+            return []
+        share = f"{self.bad} of {counted(self.scans, 'scan')} of {self.topic} {'was' if self.bad == 1 else 'were'}"
+        return [f"{share} left out (the first: {self.first_complaint})"]
+
+    def notes(self) -> list[str]:
+        """Lines on stamps out of order and missing wheel odometry."""
+        lines = []
+        if self.backwards:
+            steps = counted(self.backwards, "step")
+            lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")
+        if self.repeated:
+            lines.append(
+                f"{counted(self.repeated, 'scan')} of {self.topic} with the header stamp of the one before"
+            )
+        if self.odometry_topic and self.without_wheels:
+            lines.append(
+                f"{self.without_wheels} of {counted(self.scans, 'scan')} without a reading of "
+                f"{self.odometry_topic} near the stamp; their motion is predicted from the scans"
+            )
+        return lines

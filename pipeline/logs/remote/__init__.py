@@ -1,1 +1,0 @@
-"""Logs that are read over the network."""
