@@ -9,6 +9,7 @@ from msgspec.structs import fields, force_setattr
 
 from scanchain.config_keys import section_keys
 from scanchain.errors import InputError, shown
+from scanchain.registry import MATCHERS
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -17,6 +18,7 @@ Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
+Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
@@ -93,7 +95,7 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
     normals alone would feign.
     """
 
-    matcher: Literal["plicp", "svd"] = "plicp"
+    matcher: Matcher = "plicp"
     optimizer: Optimizer = "levenberg-marquardt"
     max_iterations: Count = 50
     reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
@@ -11,7 +10,7 @@ import msgspec
 from scanchain.baselines import BASELINES, Baseline, InPlane
 from scanchain.comparison.methods import Method
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import InputError
+from scanchain.registry import load_class
 
 
 class Runner(Protocol):
@@ -59,16 +58,7 @@ class _Others:
 
 def _baseline(method: Method, dimension: int) -> Baseline:
     if method.base not in BASELINES:
-        return _brought(method)
+        return load_class(method.base, "track")(**method.settings)
     entry = BASELINES[method.base]
     baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
     return baseline if dimension == 3 else InPlane(baseline, is_raised=entry.is_raised)
-
-
-def _brought(method: Method) -> Baseline:
-    """An object of the user's own class, made with the settings as keywords."""
-    module, _, name = method.base.partition(":")
-    try:
-        return getattr(import_module(module), name)(**method.settings)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"{method.base} cannot be had ({error}); check PYTHONPATH") from error
