@@ -20,6 +20,11 @@ Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
+MATCHERS = {
+    "plicp": "scanchain.matching.matcher:PointToShapeMatcher",
+    "svd": "scanchain.matching.svd_icp:SvdMatcher",
+}
+Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
@@ -141,7 +146,7 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
         noise being what errors of the map's normals alone would induce
     """
 
-    matcher: Literal["plicp", "svd"] = "plicp"
+    matcher: Matcher = "plicp"
     optimizer: Optimizer = "levenberg-marquardt"
     max_iterations: Count = 50
     reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1

@@ -12,6 +12,7 @@ from typing import Literal
 from msgspec import inspect
 
 from scanchain.errors import InputError, shown
+from scanchain.plugins import is_class_name
 
 Value = bool | int | float | str
 Kind = Literal["bool", "int", "float", "choice", "str"]
@@ -34,7 +35,7 @@ class ConfigKey:
     kind : what it holds
     default : before presets, files and flags
     low, high : limits of a number; ``low_is_allowed`` is False where it must be exceeded
-    choices : what a choice offers
+    choices : what a choice offers; ``is_open`` where a user's class, MODULE:CLASS, may stand instead
     description : what it sets, from the docstring of its section
     """
 
@@ -45,6 +46,7 @@ class ConfigKey:
     high: float
     low_is_allowed: bool
     choices: tuple[str, ...]
+    is_open: bool
     description: str
 
     @property
@@ -56,7 +58,7 @@ class ConfigKey:
     def range(self) -> str:
         """What it may hold, in words."""
         if self.kind == "choice":
-            return " | ".join(self.choices)
+            return " | ".join((*self.choices, "MODULE:CLASS") if self.is_open else self.choices)
         if self.kind in ("bool", "str"):
             return "true | false" if self.kind == "bool" else "text"
         whole = "whole number" if self.kind == "int" else "number"
@@ -92,7 +94,8 @@ class ConfigKey:
     def _demand(self) -> str:
         match self.kind:
             case "choice":
-                return "one of " + ", ".join(self.choices)
+                own = " or a class of yours, MODULE:CLASS" if self.is_open else ""
+                return f"one of {', '.join(self.choices)}{own}"
             case "bool":
                 return "true or false"
             case "str":
@@ -103,7 +106,10 @@ class ConfigKey:
     def _word(self, value: object) -> Value | None:
         if self.kind == "bool":
             return value if isinstance(value, bool) else None
-        return value if isinstance(value, str) and (self.kind == "str" or value in self.choices) else None
+        if not isinstance(value, str):
+            return None
+        is_known = self.kind == "str" or value in self.choices or (self.is_open and is_class_name(value))
+        return value if is_known else None
 
     @property
     def _may_be_infinite(self) -> bool:
@@ -148,6 +154,7 @@ def _descriptions(docstring: str) -> dict[str, str]:
 def _leaf(name: str, kind: inspect.Type, default: Value, description: str) -> ConfigKey:
     low, high, low_is_allowed = -math.inf, math.inf, True
     choices: tuple[str, ...] = ()
+    is_open = isinstance(kind, inspect.Metadata)
     match kind:
         case inspect.BoolType():
             word: Kind = "bool"
@@ -155,6 +162,8 @@ def _leaf(name: str, kind: inspect.Type, default: Value, description: str) -> Co
             word = "str"
         case inspect.LiteralType():
             word, choices = "choice", tuple(str(value) for value in kind.values)
+        case inspect.Metadata():
+            word, choices = "choice", (kind.extra or {})["choices"]
         case inspect.IntType() | inspect.FloatType():
             word = "int" if isinstance(kind, inspect.IntType) else "float"
             low_is_allowed = kind.gt is None
@@ -162,4 +171,4 @@ def _leaf(name: str, kind: inspect.Type, default: Value, description: str) -> Co
             high = float(kind.le) if kind.le is not None else high
         case _:
             raise TypeError(f"{name}: configuration keys are bool, int, float, str or a choice, not {kind}")
-    return ConfigKey(name, word, default, low, high, low_is_allowed, choices, description)
+    return ConfigKey(name, word, default, low, high, low_is_allowed, choices, is_open, description)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -10,11 +11,17 @@ from types import ModuleType
 from scanchain.errors import InputError
 
 
-def load(name: str) -> type:
+def is_class_name(text: str) -> bool:
+    """Whether a text has the form ``package.module:Class``."""
+    return re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", text) is not None
+
+
+def load(name: str, verb: str = "") -> type:
     """The class that ``module:Class`` names: installed, on PYTHONPATH or else in the working directory.
 
     The working directory joins the search path only for a module found nowhere else: until then nothing that
-    happens to lie there is imported. Raises InputError where there is no such module or class.
+    happens to lie there is imported. Raises InputError where there is no such module or class, or the class lacks
+    the method ``verb``.
     """
     module_name, _, class_name = name.partition(":")
     if not module_name or not class_name:
@@ -26,6 +33,8 @@ def load(name: str) -> type:
         classes = [key for key in own if isinstance(vars(module)[key], type)]
         there = f"there are {', '.join(classes)}" if classes else "it defines none"
         raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
+    if verb and not callable(getattr(found, verb, None)):
+        raise InputError(f"{name}: the class has no method {verb}; see the documentation, Extending")
     return found
 
 

@@ -32,7 +32,11 @@ _DAY_S = 86_400.0
 )
 @click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
 @click.option("--every", metavar="N", help="Take every N-th scan.")
-@click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
+@click.option(
+    "--matcher",
+    metavar="plicp|svd|MODULE:CLASS",
+    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.matching.Matcher).",
+)
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Logs at a time. [default: one a core]")

@@ -17,6 +17,12 @@ _PATH = click.Path(path_type=Path)
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option("--methods", metavar="LIST", help="Names with commas. [default: all that make sense for the log]")
+@click.option(
+    "--matcher",
+    metavar="MODULE:CLASS",
+    default="",
+    help="Compare odometry by a matcher of yours as well, row CLASS.",
+)
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to make. [default: runs/compare-LOG]")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
@@ -33,6 +39,7 @@ def compare(
     ctx: click.Context,
     logs: tuple[Source, ...],
     methods: str | None,
+    matcher: str,
     out: Path | None,
     gt: str | None,
     relations: Path | None,
@@ -53,6 +60,7 @@ def compare(
     Methods:
       plicp, svd               ours, odometry alone
       plicp+loops, svd+loops   ours, loops closed
+      CLASS, CLASS+loops       ours with the matcher of --matcher MODULE:CLASS
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
     A table of --settings sets a method, or makes a variant of one, or of a class of yours with the verb of
@@ -72,6 +80,7 @@ def compare(
       scanchain compare log.mcap
       scanchain compare log.mcap --methods plicp,svd,kiss-icp --repeat 5 --out runs/three
       scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
+      scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --log.end_s 600
     """
     from scanchain.api import present_comparison
@@ -85,6 +94,7 @@ def compare(
         logs=logs,
         out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
+        matcher=matcher,
         settings_file=settings,
         overrides=overrides(ctx, [*alias("log.topic", topic, "--topic"), *truth_topic]),
         ground_truth=truth_file,

@@ -40,7 +40,11 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 )
 @click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
 @click.option("--every", metavar="N", help="Take every N-th scan.")
-@click.option("--matcher", metavar="plicp|svd", help="LM-PLICP (the default) or SVD-ICP.")
+@click.option(
+    "--matcher",
+    metavar="plicp|svd|MODULE:CLASS",
+    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.matching.Matcher).",
+)
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @max_gap_option

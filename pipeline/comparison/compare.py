@@ -38,7 +38,7 @@ class Contest:
     ----------
     logs : the files of one log
     out : the directory to make
-    methods : names; none are all that make sense
+    methods : names; none are all that make sense; matcher : one of the configuration's, compared as well
     settings_file : a table a method; overrides : keys of the configuration, for the log and all of ours
     ground_truth : a TUM or KITTI file; None where the log's own is good
     relations : a file of relations
@@ -51,6 +51,7 @@ class Contest:
     logs: tuple[Source, ...]
     out: Path
     methods: tuple[str, ...] = ()
+    matcher: str = ""
     settings_file: Path | None = None
     overrides: tuple[Override, ...] = ()
     ground_truth: Path | None = None
@@ -83,12 +84,17 @@ def compare(contest: Contest, present: Callable[[Path], None], progress: Progres
     began = perf_counter()
     log = open_log(contest.logs, load_settings(overrides=contest.overrides).config.log)
     settings = load_settings(log.dimension, overrides=contest.overrides, idle=log.idle_keys())
-    names = contest.methods or default_names(log.dimension)
-    methods = resolve(names, log.dimension, file=contest.settings_file, overrides=contest.overrides)
+    methods = resolve(
+        contest.methods or default_names(log.dimension),
+        log.dimension,
+        file=contest.settings_file,
+        overrides=contest.overrides,
+        matcher=contest.matcher,
+    )
     for line in settings.without_effect:
         progress.tell(line)
     directory = RunDirectory(contest.out, force=contest.force)
-    provenance = describe_start(contest.command, contest.logs, ", ".join(names))
+    provenance = describe_start(contest.command, contest.logs, ", ".join(method.name for method in methods))
     with directory, Hashing(contest.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
         scans = store(decoded, log.T_base_lidar, Path(shared))

@@ -11,11 +11,23 @@ import msgspec
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
+from scanchain.config import MATCHERS
 from scanchain.errors import InputError
+from scanchain.matching import create_matcher
+from scanchain.plugins import is_class_name
 from scanchain.settings import Override, load_settings
 
-OURS = ("plicp", "svd", "plicp+loops", "svd+loops")
-_ON_REQUEST = ("svd+loops", "genz-icp-indoor", "genz-icp-kitti")
+_ANY = "matcher"  # ours with the matcher that the settings name
+OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
+_ON_REQUEST = (
+    *(
+        name
+        for name in OURS
+        if name.partition("+")[0] == _ANY or (name.endswith("+loops") and name != "plicp+loops")
+    ),
+    "genz-icp-indoor",
+    "genz-icp-kitti",
+)
 _BASE = "method"  # the key of a table that says what it is a variant of
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
@@ -53,15 +65,30 @@ def default_names(dimension: int) -> tuple[str, ...]:
 
 
 def resolve(
-    names: Sequence[str], dimension: int, *, file: Path | None, overrides: Sequence[Override] = ()
+    names: Sequence[str],
+    dimension: int,
+    *,
+    file: Path | None,
+    overrides: Sequence[Override] = (),
+    matcher: str = "",
 ) -> tuple[Method, ...]:
     """The methods of these names, settings checked.
 
     file : TOML, one table a method; a table of another name is a variant and says of what by ``method``
     overrides : keys of the configuration, for all of ours
+    matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS and CLASS+loops
     Raises InputError for a name or a key that there is not.
     """
     tables = {} if file is None else _tables(file)
+    if matcher:
+        is_class = is_class_name(matcher)
+        own = matcher.rpartition(":")[2] if is_class else matcher
+        if not {own, f"{own}+loops"} & set(names):
+            names = (*names, own)
+        for base in (_ANY, f"{_ANY}+loops") if is_class else ():
+            name = base.replace(_ANY, own)
+            if name in names:
+                tables[name] = {_BASE: base, "matching": {"matcher": matcher}} | tables.get(name, {})
     unused = [name for name in tables if name not in names]
     if unused:
         raise InputError(
@@ -71,7 +98,9 @@ def resolve(
         raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --settings instead")
     for override in overrides:
         if override.key in ("matching.matcher", "loops.enabled"):
-            raise InputError(f"{override.flag} is what tells plicp, svd and +loops apart; choose by --methods")
+            raise InputError(
+                f"{override.flag} is what tells plicp, svd and +loops apart; choose by --methods or --matcher"
+            )
     return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
 
 
@@ -86,7 +115,7 @@ def _method(
         return Method(name, base, _our_settings(base, own, dimension, where, overrides))
     if base in BASELINES:
         return Method(name, base, _their_settings(name, base, own, dimension, where))
-    if base.count(":") == 1:
+    if is_class_name(base):
         return Method(name, base, own)
     known = ", ".join((*OURS, *BASELINES))
     raise InputError(
@@ -111,7 +140,9 @@ def _our_settings(
 ) -> dict[str, Any]:
     """The configuration of one of ours; no wheels unless they are asked for, since nobody else has them."""
     wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")
-    kind = {"matching.matcher": base.partition("+")[0], "loops.enabled": str("+" in base).lower()}
+    kind = {"loops.enabled": str("+" in base).lower()}
+    if base.partition("+")[0] != _ANY:
+        kind["matching.matcher"] = base.partition("+")[0]
     table = [
         Override(key, str(value), f"{where} {key}")
         for section, keys in own.items()
@@ -124,6 +155,7 @@ def _our_settings(
             raise InputError(f"{each.flag} is {each.text}, but {base} has {kind[each.key]}; choose another method")
     fixed = [Override(key, text, "scanchain compare") for key, text in kind.items()]
     config = load_settings(dimension, overrides=(wheels, *table, *overrides, *fixed)).config
+    create_matcher(config.matching)  # raises InputError where a user's class cannot be loaded
     return {name: keys for name, keys in msgspec.to_builtins(config).items() if name not in _SHARED}
 
 

@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Iterable
 from contextlib import nullcontext, suppress
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
@@ -19,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.lib.format import open_memmap
 
+from scanchain import plugins
 from scanchain.baselines import BASELINES, Baseline, InPlane
 from scanchain.clock import announcing_compilation
 from scanchain.comparison.methods import Method
@@ -33,7 +33,7 @@ from scanchain.comparison.outcome import (
 )
 from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import InputError, MissingExtraError, ScanchainError
+from scanchain.errors import MissingExtraError, ScanchainError
 from scanchain.processes import die_first, peak_mib
 from scanchain.runs.job import Unwatched
 
@@ -83,19 +83,10 @@ class _Others:
 
 def _baseline(method: Method, dimension: int) -> Baseline:
     if method.base not in BASELINES:
-        return _brought(method)
+        return plugins.load(method.base, "track")(**method.settings)
     entry = BASELINES[method.base]
     baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
     return baseline if dimension == 3 else InPlane(baseline, is_raised=entry.is_raised)
-
-
-def _brought(method: Method) -> Baseline:
-    """An object of the user's own class, made with the settings as keywords."""
-    module, _, name = method.base.partition(":")
-    try:
-        return getattr(import_module(module), name)(**method.settings)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"{method.base} cannot be had ({error}); check PYTHONPATH") from error
 
 
 METHOD_FILE = "method.msgpack"

@@ -38,12 +38,12 @@ class MotionFilter:
         """(k, k) of the next pose; noise (k,): variances of the motion's change."""
         return self._predicted(noise)[0]
 
-    def correct(self, surprise: NDArray[np.float64], information: Matrix, noise: NDArray[np.float64]) -> None:
+    def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: NDArray[np.float64]) -> None:
         """Take a pose that was measured (k,) away from the predicted one, with this information (k, k)."""
         pose, covariance, motion = self._predicted(noise)
         known = np.linalg.inv(np.linalg.inv(pose) + information)
         gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
-        self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ surprise))
+        self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
         self.pose_covariance = known
         self.covariance = known @ gain.T
         self.motion_covariance = motion - gain @ (pose - known) @ gain.T

@@ -1,4 +1,4 @@
-"""A scan with its place, and the matches of those that have nothing to be matched with."""
+"""A scan with its pose, and the matches that stand where there was nothing to align with."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scanchain.odometry.prediction import Prediction
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """A scan with its place in the odometry frame.
+    """A scan with its pose in the odometry frame.
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
     from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.

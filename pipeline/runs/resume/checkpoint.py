@@ -25,12 +25,14 @@ from scanchain.loops.planar_search import PlanarSearch
 from scanchain.loops.recognition import Recognition
 from scanchain.loops.submaps import Submaps
 from scanchain.loops.verification import Verifier
-from scanchain.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
+from scanchain.matching import PointToShapeMatcher, VoxelMap, create_matcher
 from scanchain.odometry import FrontEnd, Odometry
-from scanchain.odometry.experience import Experience
+from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
+from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.motion_filter import MotionFilter
 from scanchain.odometry.prediction import Predictor
+from scanchain.odometry.recovery import Recovery
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.runs.directory import CHECKPOINT_FILE
@@ -65,18 +67,19 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep,
-        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch,
-        Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray, PointStore, StoredPoints,
-        Pieces, AnywhereCloser,
+        Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, ErrorStatistics, Recovery,
+        MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser,
+        NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph,
+        GrowingArray, PointStore, StoredPoints, Pieces, AnywhereCloser,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
-        (PoseGraph, "_problem"): None,
-        (PoseGraph, "_factor_is_now"): False,
-        (Submaps, "held"): OrderedDict(),
-        (PointStore, "file"): None,
+        (PoseGraph, "_problem"): lambda graph: None,
+        (PoseGraph, "_factor_is_now"): lambda graph: False,
+        (Submaps, "held"): lambda submaps: OrderedDict(),
+        (PointStore, "file"): lambda store: None,
+        (Odometry, "matcher"): lambda odometry: create_matcher(odometry.config.matching),
     },
     _version(),
 )  # fmt: skip

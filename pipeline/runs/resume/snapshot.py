@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,15 +22,17 @@ _END = 16  # bytes: length of the tree, CRC-32 of all before
 
 
 class Classes:
-    """The classes that may stand in a snapshot, by name, and the caches in them that are left out.
+    """The classes that may stand in a snapshot, by name, and the attributes in them that are left out.
 
-    caches : attributes with what they are set to instead
+    made_anew : what makes these attributes from the object when it is read, its other attributes being there
     version : a line that tells which code the classes belong to; that of another is not read
     """
 
-    def __init__(self, kinds: Iterable[type], caches: Mapping[tuple[type, str], Any], version: str) -> None:
+    def __init__(
+        self, kinds: Iterable[type], made_anew: Mapping[tuple[type, str], Callable[[Any], Any]], version: str
+    ) -> None:
         self.by_name = {kind.__name__: kind for kind in kinds}
-        self.caches = caches
+        self.made_anew = made_anew
         self.version = version
 
     def of(self, name: str) -> type:
@@ -114,8 +116,9 @@ class _Packer:
         if self.classes.by_name.get(kind.__name__) is not kind:
             raise TypeError(f"{kind.__module__}.{kind.__name__} is not listed for snapshots")
         fields = [
-            [name, self.pack(self.classes.caches.get((kind, name), getattr(value, name)))]
+            [name, self.pack(getattr(value, name))]
             for name in _field_names(value)
+            if (kind, name) not in self.classes.made_anew
         ]
         return ["object", number, kind.__name__, fields]
 
@@ -176,6 +179,9 @@ class _Unpacker:
         self.seen[number] = made = object.__new__(kind)
         for name, value in fields:
             object.__setattr__(made, name, self.unpack(value))
+        for (owner, name), make in self.classes.made_anew.items():
+            if owner is kind:
+                object.__setattr__(made, name, make(made))
         return made
 
 

@@ -1,4 +1,4 @@
-"""How well predictions have done so far, which tells how far off the next one may be."""
+"""Prediction error statistics: how far off the next prediction may be, from the errors of those before."""
 
 from __future__ import annotations
 
@@ -7,28 +7,25 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 
-_MEMORY = 0.9  # of the squared errors, per scan
-_SUDDEN = 0.25  # share of the last squared error that counts at once
-_KNOWN = 5  # errors, before which they tell too little
-_CAUTION = 2.0  # standard deviations
-_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # no prediction is trusted more than this
+_MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
+_SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
+_KNOWN = 5  # errors needed before the mean is used
+_CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
+_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
 
 
-class Experience:
+class ErrorStatistics:
     """A running mean of squared errors, one for every component of a twist."""
 
     def __init__(self, first_sigma: NDArray[np.float64]) -> None:
-        """first_sigma : (k,) standard deviations to go by until errors are known, and the most there may be."""
+        """first_sigma : (k,) standard deviations until errors are known, and the largest that are given."""
         self.first_sigma = first_sigma
         self.least = lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2
         self.squares = np.zeros(len(first_sigma))
         self.count = 0
 
-    def learn(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
-        """Take the error (k,) of a prediction, as far as it is more than that of the match it is seen from.
-
-        variance : (k,) of the match
-        """
+    def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+        """Take the error (k,) of a prediction against a match of this variance (k,), which is subtracted."""
         self.count += 1
         gain = max(1.0 - _MEMORY, 1.0 / self.count)
         square = np.maximum(error * error - variance, 0.0)
@@ -36,7 +33,7 @@ class Experience:
 
     @property
     def variances(self) -> NDArray[np.float64]:
-        """(k,) of the next prediction, on the side of caution."""
+        """(k,) of the next prediction, rather too large than too small."""
         if self.count < _KNOWN:
             return self.first_sigma**2
         return np.minimum(np.maximum(_CAUTION**2 * self.squares, self.least), self.first_sigma**2)

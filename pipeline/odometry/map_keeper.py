@@ -1,0 +1,56 @@
+"""The local map of odometry as scans come in: extended where they bring something new, remade, forgotten."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.data import Points, Pose
+from scanchain.matching import VoxelMap
+
+_RECENT = 20  # scans that a map with other voxels is made of
+
+
+class MapKeeper:
+    """Keeps the voxel map ``surfaces``, and the last scans in it, of which it can be made anew."""
+
+    def __init__(self, dimension: int, config: LocalMapConfig) -> None:
+        self.config = config
+        self.surfaces = VoxelMap(dimension, config)
+        self.recent: deque[tuple[Points, Pose]] = deque(maxlen=_RECENT)
+        self.T_odom_inserted = lie.identity(dimension)
+
+    def extend(self, points: Points, T_odom_lidar: Pose) -> None:
+        """Insert a scan (N, d) that moved far enough from the last one inserted."""
+        distance_m, angle_rad = lie.apart(self.T_odom_inserted, T_odom_lidar)
+        is_far = distance_m >= self.config.insert_distance_m or angle_rad >= self.config.insert_angle_rad
+        if is_far or not len(self.surfaces):
+            self.insert(points, T_odom_lidar)
+
+    def insert(self, points: Points, T_odom_lidar: Pose) -> None:
+        """Insert a scan (N, d) wherever it is."""
+        self.surfaces.insert(points, T_odom_lidar)
+        self.recent.append((points, T_odom_lidar))
+        self.T_odom_inserted = T_odom_lidar
+
+    def resize(self, scale: float) -> None:
+        """Make the map anew of the last scans, with voxels of this scale, where it is another one."""
+        if scale != self.surfaces.scale:
+            self._remake(scale)
+
+    def restart(self, points: Points) -> None:
+        """Make the map anew of a single scan (N, d), odom frame."""
+        self.recent.clear()
+        self.recent.append((points, lie.identity(self.surfaces.dimension)))
+        self._remake(self.surfaces.scale)
+
+    def forget(self) -> None:
+        """Empty the map."""
+        self.recent.clear()
+        self._remake(self.surfaces.scale)
+
+    def _remake(self, scale: float) -> None:
+        self.surfaces = VoxelMap(self.surfaces.dimension, self.config, scale)
+        for points, T_odom_lidar in self.recent:
+            self.surfaces.insert(points, T_odom_lidar)

@@ -1,0 +1,94 @@
+"""Recovery: other initial poses where a match is doubtful, wide searches after a loss, and when to give up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.config import MatchingConfig
+from scanchain.data import Match, Points, Pose, State
+from scanchain.matching import CorrelativeMap, Matcher, VoxelMap
+from scanchain.odometry.prediction import Prediction
+
+_WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
+_PATIENCE = 5  # lost scans in a row, from which on the map is extended at the predicted pose
+_DOUBTFUL = 2.0  # cost per point over its running mean, from which on other initial poses are tried
+_ELSEWHERE = 3.0  # the same, from which on a scan after a long silence does not belong to the map
+_ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is doubtful
+_MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
+
+
+class Recovery:
+    """Aligns scans, also such as are not where they are predicted; knows the usual cost of a point."""
+
+    def __init__(self, config: MatchingConfig) -> None:
+        self.config = config
+        self.usual_cost = 0.0
+        self.wide_scans = _WIDE_SCANS
+        self.lost_scans = 0
+
+    def align(self, matcher: Matcher, points: Points, surfaces: VoxelMap, prediction: Prediction) -> Match:
+        """The alignment from the predicted pose or, where that one is doubtful, the best of several."""
+        wide = self.wide_scans > 0 or prediction.is_guess
+        best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
+        if self._is_doubtful(best.cost / len(points), prediction):
+            for guess in _guesses(points, surfaces, prediction):
+                other = matcher.align(points, surfaces, guess, wide=True)
+                if self._cost(other, prediction) < self._cost(best, prediction):
+                    best = other
+        cost = best.cost / len(points)
+        self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
+        return best
+
+    def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
+        """Whether a scan that may be anywhere is not where it was found.
+
+        usual_cost : before this scan
+        """
+        least = _ROUGH * 0.5 * self.config.kernel_scale_m**2
+        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, least)
+
+    def take(self, state: State) -> None:
+        """Count lost scans and those to search wide."""
+        is_lost = state is State.LOST
+        self.lost_scans = self.lost_scans + 1 if is_lost else 0
+        self.wide_scans = _WIDE_SCANS if is_lost else max(self.wide_scans - 1, 0)
+
+    def forget(self) -> None:
+        """Start with another map, in which the usual cost is unknown."""
+        self.usual_cost = 0.0
+
+    @property
+    def has_given_up(self) -> bool:
+        """Whether so many scans were lost that the map has to go on from the prediction."""
+        return self.lost_scans >= _PATIENCE
+
+    def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
+        """Whether the cost per point is far above the usual one, and a share of the most it could be."""
+        if not self.usual_cost:
+            return False
+        if prediction.is_guess:
+            return cost > self.usual_cost
+        return cost > max(_DOUBTFUL * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+
+    def _cost(self, match: Match, prediction: Prediction) -> float:
+        """Cost of a match and of its distance from the predicted pose, m²."""
+        prior = prediction.prior
+        away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
+        return match.cost + 0.5 * self.config.sensor_noise_m**2 * float(away @ away)
+
+
+def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tuple[Pose, ...]:
+    """Other initial poses; in the plane also the best of a window around the predicted one."""
+    alternatives = prediction.alternatives()
+    if surfaces.dimension == 3:
+        return alternatives
+    half_width_m, half_width_rad = prediction.window()
+    reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
+    T_predicted = prediction.T_odom_lidar
+    seed = CorrelativeMap(surfaces, T_predicted, reach_m).best(
+        points, T_predicted, half_width_m=half_width_m, half_width_rad=half_width_rad
+    )
+    return (*alternatives, seed.T_target_source)
