@@ -10,8 +10,8 @@ from importlib import import_module
 from scanchain.errors import InputError
 
 MATCHERS = {
-    "plicp": "scanchain.matching.matcher:PointToShapeMatcher",
-    "svd": "scanchain.matching.svd_icp:SvdMatcher",
+    "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
+    "svd": "scanchain.registration.svd_icp:SvdMatcher",
 }
 
 

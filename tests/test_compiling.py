@@ -9,7 +9,7 @@ from numba import njit
 
 from scanchain.api import open_recorder
 from scanchain.clock import compiled_s, working_s
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 from scanchain.runs import results
 from scanchain.runs.compiling import telling_of_compilation
 from scanchain.runs.job import Job

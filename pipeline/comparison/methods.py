@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from scanchain.baselines import BASELINES
 from scanchain.errors import InputError
-from scanchain.matching import create_matcher
+from scanchain.registration import create_matcher
 from scanchain.registry import MATCHERS, is_class_name
 from scanchain.settings import Override, load_settings
 

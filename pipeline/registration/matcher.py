@@ -7,7 +7,7 @@ from typing import Protocol
 from scanchain import checks
 from scanchain.config import MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
-from scanchain.matching.voxel_map import VoxelMap
+from scanchain.registration.voxel_map import VoxelMap
 from scanchain.registry import MATCHERS, load_class
 
 
