@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from scanchain.graph.files.g2o_write import write_g2o
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.logs import open_log
-    from scanchain.matching import VoxelMap, align, create_matcher, rigid_transform
     from scanchain.odometry import Odometry
+    from scanchain.registration import VoxelMap, align, create_matcher, rigid_transform
     from scanchain.settings import load_settings
     from scanchain.simulation import simulate
     from scanchain.slam import Slam, SlamResult
@@ -35,17 +35,17 @@ _HOMES = {
     "State": "data",
     "Step": "data",
     "Trajectory": "data",
-    "VoxelMap": "matching",
-    "align": "matching",
+    "VoxelMap": "registration",
+    "align": "registration",
     "compare": "api",
-    "create_matcher": "matching",
+    "create_matcher": "registration",
     "downsample": "api",
     "load_settings": "settings",
     "open_log": "logs",
     "optimize": "api",
     "read_g2o": "graph.files.g2o",
     "read_tum": "trajectory",
-    "rigid_transform": "matching",
+    "rigid_transform": "registration",
     "run": "api",
     "simulate": "simulation",
     "write_g2o": "graph.files.g2o_write",

@@ -21,8 +21,8 @@ Count = Annotated[int, Meta(ge=1)]
 
 
 MATCHERS = {
-    "plicp": "scanchain.matching.matcher:PointToShapeMatcher",
-    "svd": "scanchain.matching.svd_icp:SvdMatcher",
+    "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
+    "svd": "scanchain.registration.svd_icp:SvdMatcher",
 }
 Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]

@@ -9,7 +9,7 @@ from numba import njit
 
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 from scanchain.runs import results
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import run

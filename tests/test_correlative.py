@@ -7,7 +7,7 @@ import pytest
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.search.branch_and_bound import draw_hits, fill_pyramid, search
-from scanchain.matching import CorrelativeMap, VoxelMap
+from scanchain.registration import CorrelativeMap, VoxelMap
 
 
 def walls(rng, count, side_m):

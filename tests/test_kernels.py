@@ -14,7 +14,7 @@ from scanchain.kernels.registration.residuals import normal_equations
 from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels import downsample, hashing
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 
 SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}
 

@@ -12,8 +12,8 @@ from scanchain.kernels.geometry import poses
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.registration import observability
 from scanchain.kernels.registration.match import root_mean_square_range
-from scanchain.matching import VoxelMap
-from scanchain.matching.matcher import terms_of
+from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import terms_of
 
 
 def definite(k, spread=1.0, seed=0):

@@ -8,8 +8,8 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
 from scanchain.kernels.registration import icp, signal_to_noise
-from scanchain.matching import VoxelMap, create_matcher
-from scanchain.matching.matcher import terms_of
+from scanchain.registration import VoxelMap, create_matcher
+from scanchain.registration.plicp import terms_of
 
 LIMITS = MatchingConfig(max_distance_m=1.0, sensor_noise_m=0.02)
 BEFORE = 12  # scans

@@ -9,9 +9,9 @@ from scanchain import lie
 from scanchain.data import Keyframe
 from scanchain.kernels.registration.refinement import refine
 from scanchain.loops import refined
-from scanchain.matching import VoxelMap
-from scanchain.matching.matcher import terms_of
 from scanchain.point_store import PointStore
+from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import terms_of
 
 ANGLES = np.linspace(-3.0, 3.0, 240)
 

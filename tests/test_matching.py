@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
-from scanchain.matching import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
-from scanchain.matching.matcher import OPTIMIZERS
+from scanchain.registration import DegeneratePairsError, VoxelMap, create_matcher, rigid_transform
+from scanchain.registration.plicp import OPTIMIZERS
 
 
 def room(dimension, seed=0, unit=1.0):

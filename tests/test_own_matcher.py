@@ -13,7 +13,7 @@ from scanchain.comparison.outcome import Status
 from scanchain.comparison.table import read_table
 from scanchain.config import MatchingConfig
 from scanchain.errors import InputError
-from scanchain.matching import create_matcher
+from scanchain.registration import create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.simulation import simulate
 

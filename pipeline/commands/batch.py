@@ -35,7 +35,7 @@ _DAY_S = 86_400.0
 @click.option(
     "--matcher",
     metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.matching.Matcher).",
+    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.registration.Matcher).",
 )
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")

@@ -43,7 +43,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 @click.option(
     "--matcher",
     metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.matching.Matcher).",
+    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.registration.Matcher).",
 )
 @click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")

@@ -13,8 +13,8 @@ from msgspec import Struct
 from scanchain.baselines import BASELINES
 from scanchain.config import MATCHERS
 from scanchain.errors import InputError
-from scanchain.matching import create_matcher
 from scanchain.plugins import is_class_name
+from scanchain.registration import create_matcher
 from scanchain.settings import Override, load_settings
 
 _ANY = "matcher"  # ours with the matcher that the settings name

@@ -9,7 +9,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.matching.svd import DegeneratePairsError, rigid_transform
+from scanchain.registration.svd import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 

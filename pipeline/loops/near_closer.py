@@ -17,8 +17,8 @@ from scanchain.loops.pieces import Pieces
 from scanchain.loops.planar_search import PlanarSearch
 from scanchain.loops.submaps import Submaps
 from scanchain.loops.verification import overlap as overlap_of
-from scanchain.matching import PointToShapeMatcher
 from scanchain.preprocess import downsample
+from scanchain.registration import PointToShapeMatcher
 
 _SURE_OVERLAP = 0.8  # asked of a match for which nothing else speaks
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Keyframe, Matrix, Points, Pose
 from scanchain.loops.submaps import Submaps
-from scanchain.matching import CorrelativeMap, Seed, VoxelMap
+from scanchain.registration import CorrelativeMap, Seed, VoxelMap
 
 _BASIN_M = 0.5  # of doubt, up to which matching needs no search
 _SHARE_OF_DOUBT = 0.2  # that is traveled between two searches: wide windows cost most and run out last

@@ -14,9 +14,9 @@ from scanchain import lie
 from scanchain.config import Config, MatchingConfig
 from scanchain.data import Keyframe, Matrix, Points
 from scanchain.kernels.registration.refinement import refine
-from scanchain.matching import VoxelMap
-from scanchain.matching.matcher import terms_of
 from scanchain.point_store import PointStore
+from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import terms_of
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
 _THREADS = 2

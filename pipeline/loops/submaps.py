@@ -9,7 +9,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe
 from scanchain.loops.pieces import Pieces
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 
 _HELD = 64  # submaps in memory; the one unused for longest goes first
 

@@ -9,7 +9,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Pose
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, PLANE, SHAPE
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
 _ENOUGH = 10  # voxels with such a normal

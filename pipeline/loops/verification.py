@@ -12,8 +12,8 @@ from scanchain.data import Match, Points, Pose
 from scanchain.kernels.registration.association import associate
 from scanchain.loops.agreement import free_space_agreement
 from scanchain.loops.local_map import LocalMap
-from scanchain.matching import PointToShapeMatcher, VoxelMap
 from scanchain.preprocess import downsample
+from scanchain.registration import PointToShapeMatcher, VoxelMap
 
 _COARSE = 2.0  # times the usual voxels, for the first alignment
 

@@ -7,7 +7,7 @@ from collections import deque
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Points, Pose
-from scanchain.matching import VoxelMap
+from scanchain.registration import VoxelMap
 
 _RECENT = 20  # scans that a map with other voxels is made of
 

@@ -14,12 +14,12 @@ from scanchain.config import Config
 from scanchain.data import Match, Points, Pose, Prior, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.matching import VoxelMap, create_matcher
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from scanchain.preprocess import Resolution, Sweep
+from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_order, load_settings
 
 

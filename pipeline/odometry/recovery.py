@@ -9,8 +9,8 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import MatchingConfig
 from scanchain.data import Match, Points, Pose, State
-from scanchain.matching import CorrelativeMap, Matcher, VoxelMap
 from scanchain.odometry.prediction import Prediction
+from scanchain.registration import CorrelativeMap, Matcher, VoxelMap
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row, from which on the map is extended at the predicted pose

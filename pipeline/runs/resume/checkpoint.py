@@ -25,7 +25,6 @@ from scanchain.loops.planar_search import PlanarSearch
 from scanchain.loops.recognition import Recognition
 from scanchain.loops.submaps import Submaps
 from scanchain.loops.verification import Verifier
-from scanchain.matching import PointToShapeMatcher, VoxelMap, create_matcher
 from scanchain.odometry import FrontEnd, Odometry
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
@@ -35,6 +34,7 @@ from scanchain.odometry.prediction import Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
+from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.runs.provenance import package_version
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot

@@ -14,7 +14,7 @@ from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.descent import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from scanchain.kernels.registration.linearization import Terms
 from scanchain.kernels.registration.match import Answer, Expectation, match
-from scanchain.matching.voxel_map import VoxelMap
+from scanchain.registration.voxel_map import VoxelMap
 from scanchain.words import counted
 
 OPTIMIZERS = {

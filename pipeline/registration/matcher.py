@@ -7,7 +7,7 @@ from typing import Protocol
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
-from scanchain.matching.voxel_map import VoxelMap
+from scanchain.registration.voxel_map import VoxelMap
 
 
 class Matcher(Protocol):

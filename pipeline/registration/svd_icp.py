@@ -13,9 +13,9 @@ from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.cross_covariance import weighted_pairs
 from scanchain.kernels.registration.icp import SHRINK, Outcome
 from scanchain.kernels.registration.match import judge
-from scanchain.matching.matcher import aligned, match_of, terms_of
-from scanchain.matching.svd import DegeneratePairsError, rigid_transform
-from scanchain.matching.voxel_map import VoxelMap
+from scanchain.registration.plicp import aligned, match_of, terms_of
+from scanchain.registration.svd import DegeneratePairsError, rigid_transform
+from scanchain.registration.voxel_map import VoxelMap
 
 
 class SvdMatcher:

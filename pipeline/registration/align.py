@@ -11,10 +11,10 @@ from scanchain import checks, lie
 from scanchain.config import Config, PreprocessConfig
 from scanchain.data import Match, Points, Pose
 from scanchain.errors import InputError
-from scanchain.matching.correlative import CorrelativeMap
-from scanchain.matching.create import create_matcher
-from scanchain.matching.voxel_map import VoxelMap
 from scanchain.preprocess import downsample
+from scanchain.registration.correlative import CorrelativeMap
+from scanchain.registration.matcher import create_matcher
+from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
 _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most

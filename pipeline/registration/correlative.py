@@ -10,8 +10,8 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Points, Pose
 from scanchain.kernels.search.branch_and_bound import draw_hits, fill_pyramid, search
-from scanchain.matching.voxel_map import VoxelMap
 from scanchain.preprocess.sweep import downsample
+from scanchain.registration.voxel_map import VoxelMap
 
 _POINTS = 120  # of the scan that are scored, one a voxel, evenly spread
 _TOP = 5  # levels of the pyramid above the grid itself; windows start with 2⁵ cells
