@@ -14,7 +14,7 @@ from scanchain.errors import InputError, MissingExtraError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.simulation import plan
 from scanchain.simulation.motion import Motion
-from scanchain.simulation.sweep import take_sweep
+from scanchain.simulation.sensors import take_sweep
 from scanchain.trajectory import read_tum
 
 PACKAGES = {

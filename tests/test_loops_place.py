@@ -21,7 +21,7 @@ from scanchain.loops.submaps import Submaps
 from scanchain.loops.upright import level_frame
 from scanchain.loops.verification import Verifier
 from scanchain.simulation import plan
-from scanchain.simulation.sweep import take_sweep
+from scanchain.simulation.sensors import take_sweep
 
 RADIUS_M = 32.0
 

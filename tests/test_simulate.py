@@ -13,10 +13,10 @@ from mcap_ros2.decoder import DecoderFactory
 from scanchain import catalog, lie
 from scanchain.errors import InputError
 from scanchain.simulation import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
-from scanchain.simulation.normals import surface_normals
+from scanchain.simulation.information import surface_normals
+from scanchain.simulation.motion import wheel_odometry
+from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.sweep import take_sweep
-from scanchain.simulation.wheels import wheel_odometry
 from scanchain.simulation.worlds.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]

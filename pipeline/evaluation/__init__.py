@@ -2,23 +2,15 @@
 
 from scanchain.evaluation.absolute import (
     AbsoluteError,
+    Alignment,
     absolute_error,
     absolute_error_on_any_course,
+    align,
     far_off,
     on_the_estimate,
 )
-from scanchain.evaluation.alignment import Alignment, align
-from scanchain.evaluation.consistency import motion_nees
-from scanchain.evaluation.disagreement import disagreement
-from scanchain.evaluation.kitti import (
-    KITTI_LENGTHS_M,
-    SHORT_LENGTHS_M,
-    KittiError,
-    LengthError,
-    kitti_error,
-    kitti_error_on_any_course,
-)
-from scanchain.evaluation.pairing import Pairs, during, pair
+from scanchain.evaluation.consistency import disagreement, motion_nees
+from scanchain.evaluation.pairing import Pairs, Statistics, during, pair
 from scanchain.evaluation.reference import TruthFile, check_overlap, read_truth
 from scanchain.evaluation.relations import (
     RELATION_LIMIT_S,
@@ -28,13 +20,18 @@ from scanchain.evaluation.relations import (
     relation_error,
 )
 from scanchain.evaluation.relative import (
+    KITTI_LENGTHS_M,
+    SHORT_LENGTHS_M,
+    KittiError,
+    LengthError,
     RelativeError,
+    kitti_error,
+    kitti_error_on_any_course,
     relative_error_over_distance,
     relative_error_over_frames,
     relative_error_over_time,
 )
 from scanchain.evaluation.sharpness import Sharpness, sampled_map, sampling_step, sharpness
-from scanchain.evaluation.statistics import Statistics
 
 __all__ = [
     "KITTI_LENGTHS_M",

@@ -1,6 +1,8 @@
-"""Whether an odometry's covariances say how far off it is: the normalized squared error of its motions."""
+"""Consistency of odometries: NEES of their motions, and disagreement of methods without ground truth."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,4 +27,20 @@ def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArra
     known = np.isfinite(covariance).all(axis=(1, 2))
     weighted = np.linalg.pinv(covariance[known], hermitian=True) @ error[known, :, None]
     result[known] = np.einsum("ni,ni->n", error[known], weighted[..., 0]) / error.shape[1]
+    return result
+
+
+def disagreement(trajectories: Sequence[Matrix]) -> NDArray[np.float64]:
+    """(M, M) meters: median over the scans of the distance between the motions that two methods find for a scan.
+
+    trajectories : M times poses (N, d+1, d+1) of the same scans, (0, d+1, d+1) of a method that has failed
+    NaN where one of the two has failed.
+    """
+    motions = [lie.between(poses[:-1], poses[1:]) for poses in trajectories]
+    result = np.full((len(motions), len(motions)), np.nan)
+    for row, first in enumerate(motions):
+        for column, second in enumerate(motions):
+            if len(first) and len(second):
+                error = lie.between(first, second)
+                result[row, column] = float(np.median(np.linalg.norm(error[:, :-1, -1], axis=1)))
     return result

@@ -1,4 +1,4 @@
-"""An estimated trajectory and the truth at the same stamps, interpolated where it has others."""
+"""Pairs of estimated and true poses at the same stamps, interpolated in between, and statistics of errors."""
 
 from __future__ import annotations
 
@@ -210,3 +210,44 @@ def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
     if here.max() < there.min() or there.max() < here.min():
         return f"{spans}; check that both keep the same clock"
     return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Figures of a set of absolute errors, in the errors' own unit.
+
+    ``std`` is that of the errors at hand (divided by their count, not by count − 1); all are 0 for no errors.
+    """
+
+    count: int
+    mean: float
+    std: float
+    rmse: float
+    median: float
+    minimum: float
+    maximum: float
+
+    @classmethod
+    def of(cls, errors: NDArray[np.float64]) -> Statistics:
+        """The figures of (N,) errors."""
+        if not len(errors):
+            return cls(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return cls(
+            count=len(errors),
+            mean=float(errors.mean()),
+            std=float(errors.std()),
+            rmse=float(np.sqrt(np.mean(errors * errors))),
+            median=float(np.median(errors)),
+            minimum=float(errors.min()),
+            maximum=float(errors.max()),
+        )
+
+    def scaled(self, factor: float) -> Statistics:
+        """The same errors in another unit, for print."""
+        return Statistics(
+            self.count,
+            *(
+                value * factor
+                for value in (self.mean, self.std, self.rmse, self.median, self.minimum, self.maximum)
+            ),
+        )

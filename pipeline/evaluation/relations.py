@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import nearest
-from scanchain.evaluation.statistics import Statistics
+from scanchain.evaluation.pairing import Statistics, nearest
 from scanchain.trajectory import numbers, parse_stamp_ns, text_lines
 from scanchain.words import counted
 

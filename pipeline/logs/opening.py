@@ -20,7 +20,7 @@ from scanchain.logs.formats.kitti import (
     index_kitti_odometry,
     index_kitti_raw,
 )
-from scanchain.logs.formats.made import UnknownFormatError, left_out, natural_order
+from scanchain.logs.formats.on_demand import UnknownFormatError, left_out, natural_order
 from scanchain.logs.formats.ros1_bag import claims_ros1_bag, index_ros1_bag
 from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans, load_format

@@ -13,10 +13,8 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
-from scanchain.simulation.motion import Motion
-from scanchain.simulation.sensors import Sensor
-from scanchain.simulation.sweep import Sweep, take_sweep
-from scanchain.simulation.wheels import wheel_odometry
+from scanchain.simulation.motion import Motion, wheel_odometry
+from scanchain.simulation.sensors import Sensor, Sweep, take_sweep
 
 ODOMETRY_PERIOD_NS = 20_000_000
 

@@ -18,7 +18,7 @@ from typing import IO, NamedTuple, Protocol
 import numpy as np
 
 from scanchain.errors import InputError
-from scanchain.logs.formats.made import UnknownFormatError, made_block, made_channel, made_index
+from scanchain.logs.formats.on_demand import UnknownFormatError, add_block, add_channel, on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 from scanchain.source import Source
@@ -49,7 +49,7 @@ def claims_carmen(_: Path, head: bytes) -> bool:
 def index_carmen(path: Path, number: int) -> FileIndex:
     """Index the lines of a log. Raises UnknownFormatError where the file has none of a known kind."""
     text, damage = read_text(path)
-    index = made_index(path, number)
+    index = on_demand_index(path, number)
     index.damage += [damage] if damage else []
     if not _Carmen(index, text).lines:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
@@ -68,10 +68,10 @@ class _Carmen:
         self.malformed: list[int] = []
         self.lines = list(self._find())
         self.first_scan = next((place for place, line in enumerate(self.lines) if line.kind in SCANS), -1)
-        self.scan = made_channel(index, "/scan", "sensor_msgs/msg/LaserScan")
-        self.odometry = made_channel(index, "/odom", "nav_msgs/msg/Odometry")
-        self.mounting = made_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
-        self.truth = made_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
+        self.scan = add_channel(index, "/scan", "sensor_msgs/msg/LaserScan")
+        self.odometry = add_channel(index, "/odom", "nav_msgs/msg/Odometry")
+        self.mounting = add_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
+        self.truth = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
         for begin in range(0, len(self.lines), _LINES_A_BLOCK):
             self._block(begin)
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
@@ -148,7 +148,7 @@ class _Carmen:
             self.truth: kinds[b"TRUEPOS"],
         }
         size = lines[-1].end - lines[0].begin
-        made_block(self.index, begin, size, [line.log_time_ns for line in lines], counts)
+        add_block(self.index, begin, size, [line.log_time_ns for line in lines], counts)
 
     def _tell(self) -> None:
         if self.malformed:

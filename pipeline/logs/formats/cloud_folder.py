@@ -19,7 +19,7 @@ from scanchain.logs.formats.cloud_file import (
     point_of_columns,
     read_cloud_file,
 )
-from scanchain.logs.formats.made import left_out, made_block, made_channel, made_index, natural_order
+from scanchain.logs.formats.on_demand import add_block, add_channel, left_out, natural_order, on_demand_index
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud
 from scanchain.words import counted
@@ -48,13 +48,13 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0) -> FileIndex:
     """
     files = _files(folder)
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
-    index = made_index(folder, number)
+    index = on_demand_index(folder, number)
     index.takes_rate = True
     raw = _raw_point(folder, files)
     index.notes += [*_found(folder, files, raw), *left_out(folder, files[0].suffix.lower(), SUFFIXES)]
-    channel = made_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
+    channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
-        made_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
+        add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
 
     def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
         file, stamp_ns = files[block.offset], stamps_ns[block.offset]

@@ -17,14 +17,14 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import CloudFileError, read_xyzi
-from scanchain.logs.formats.made import made_block, made_channel, made_index, natural_order
+from scanchain.logs.formats.on_demand import add_block, add_channel, natural_order, on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
 _TRUTH = -1  # the block of the ground truth
 _POSE_BYTES = 720
-Told = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
+Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
@@ -45,19 +45,19 @@ def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     files = _sweeps(folder / "velodyne_points" / "data")
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    index = made_index(folder, number)
-    return _index(index, files, times_ns, _told(index, lambda: _raw_truth(index, folder)))
+    index = on_demand_index(folder, number)
+    return _index(index, files, times_ns, _truth_or_none(index, lambda: _raw_truth(index, folder)))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
     files = _sweeps(folder / "velodyne")
     times_ns = read_seconds(folder / "times.txt")
-    index = made_index(folder, number)
-    return _index(index, files, times_ns, _told(index, lambda: _benchmark_truth(index, folder, times_ns)))
+    index = on_demand_index(folder, number)
+    return _index(index, files, times_ns, _truth_or_none(index, lambda: _benchmark_truth(index, folder, times_ns)))
 
 
-def _raw_truth(index: FileIndex, folder: Path) -> Told:
+def _raw_truth(index: FileIndex, folder: Path) -> Truth:
     calibration = folder.parent / "calib_imu_to_velo.txt"
     if not (folder / "oxts").is_dir():
         index.notes.append(f"{folder}: has no oxts folder, so no ground truth")
@@ -77,7 +77,7 @@ def _raw_truth(index: FileIndex, folder: Path) -> Told:
     return list(zip(times_ns, poses, strict=True))
 
 
-def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) -> Told:
+def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) -> Truth:
     name = folder.resolve().name
     file = folder.resolve().parent.parent / "poses" / f"{name}.txt"
     if not file.is_file():
@@ -86,7 +86,7 @@ def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) ->
     return list(zip(times_ns, read_camera_poses(file, folder / "calib.txt"), strict=False))
 
 
-def _told(index: FileIndex, read: Callable[[], Told]) -> Told:
+def _truth_or_none(index: FileIndex, read: Callable[[], Truth]) -> Truth:
     """The ground truth; none where its files are damaged, which the sweeps do not suffer from."""
     try:
         return read()
@@ -102,26 +102,28 @@ def _sweeps(folder: Path) -> list[Path]:
     return files
 
 
-def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], told: Told) -> FileIndex:
+def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], truth: Truth) -> FileIndex:
     """/velodyne_points from the files, whose names count the times, and /ground_truth."""
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
         raise InputError(
             f"{files[-1]}: does not fit the {counted(len(times_ns), 'timestamp')}; names must be numbers from 0 up"
         )
-    lidar = made_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
+    lidar = add_channel(index, "/velodyne_points", "sensor_msgs/msg/PointCloud2")
     for entry, file in enumerate(files):
-        made_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
-    if told:
-        poses = made_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-        made_block(index, _TRUTH, _POSE_BYTES * len(told), [stamp_ns for stamp_ns, _ in told], {poses: len(told)})
+        add_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
+    if truth:
+        poses = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
+        add_block(
+            index, _TRUTH, _POSE_BYTES * len(truth), [stamp_ns for stamp_ns, _ in truth], {poses: len(truth)}
+        )
 
     def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
         channel = index.channels[block.entries[0].channel]
         if wanted is not None and channel.key[1] not in wanted:
             return Contents([], "")
         if block.offset == _TRUTH:
-            return _truth_messages(channel, told)
+            return _truth_messages(channel, truth)
         return _sweep(channel, files[block.offset], block.start_ns)
 
     index.make = make
@@ -136,9 +138,9 @@ def _sweep(channel: Channel, file: Path, stamp_ns: int) -> Contents:
     return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
 
-def _truth_messages(channel: Channel, told: Told) -> Contents:
+def _truth_messages(channel: Channel, truth: Truth) -> Contents:
     messages = []
-    for stamp_ns, T_world_lidar in told:
+    for stamp_ns, T_world_lidar in truth:
         data = pack_odometry(stamp_ns, "world", "velodyne", place(T_world_lidar))
         messages.append(Message(channel, stamp_ns, memoryview(data)))
     return Contents(messages, "")
@@ -159,11 +161,11 @@ def read_seconds(file: Path) -> list[int]:
 
 def read_calibration(file: Path) -> Pose:
     """The (4, 4) transform of a ``calib_*_to_*.txt`` with its lines ``R:`` and ``T:``."""
-    told = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
+    entries = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
     try:
         T = np.eye(4)
-        T[:3, :3] = np.array(told["R"].split(), np.float64).reshape(3, 3)
-        T[:3, 3] = np.array(told["T"].split(), np.float64)
+        T[:3, :3] = np.array(entries["R"].split(), np.float64).reshape(3, 3)
+        T[:3, 3] = np.array(entries["T"].split(), np.float64)
     except (KeyError, ValueError) as error:
         raise InputError(f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); fetch it again") from error
     return T
@@ -196,9 +198,11 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
     rows = _table(file, 12)
     T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
     T_world_camera[:, :3] = rows.reshape(-1, 3, 4)
-    told = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
+    entries = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
     try:
-        T_camera_lidar = np.vstack([np.array(told["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+        T_camera_lidar = np.vstack(
+            [np.array(entries["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]
+        )
     except (KeyError, ValueError) as error:
         raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); fetch it again") from error
     T_world_lidar = T_world_camera @ T_camera_lidar

@@ -13,7 +13,7 @@ from ruamel.yaml.error import YAMLError
 
 from scanchain.errors import InputError
 from scanchain.logs.files import size_of
-from scanchain.logs.formats.made import made_index
+from scanchain.logs.formats.on_demand import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import schema_text
 from scanchain.words import counted
@@ -31,7 +31,7 @@ def claims_ros2_bag(path: Path, head: bytes) -> bool:
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
-    index, reader = made_index(path, number), _open(path)
+    index, reader = on_demand_index(path, number), _open(path)
     if not all(_is_sound(connection) for connection in reader.connections):
         raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
     bag = _Bag(index, reader)

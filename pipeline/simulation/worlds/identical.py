@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain.data import Matrix
 from scanchain.simulation.solids import Scenery, Solids
-from scanchain.simulation.worlds.walls import CEILING_M, Wall, build_wall
+from scanchain.simulation.worlds.interior import CEILING_M, Wall, build_wall
 
 _ROOMS, _ROOM_M, _DEPTH_M = 8, 5.0, 6.0  # on each side of a corridor, along it and across it
 _LENGTH_M = _ROOMS * _ROOM_M

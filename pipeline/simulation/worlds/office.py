@@ -7,8 +7,7 @@ import numpy as np
 from scanchain.data import Matrix
 from scanchain.simulation.motion import Vehicle
 from scanchain.simulation.solids import Scenery, Solids
-from scanchain.simulation.worlds.furniture import Furnisher, Room
-from scanchain.simulation.worlds.walls import CEILING_M, Wall, build_wall
+from scanchain.simulation.worlds.interior import CEILING_M, Furnisher, Room, Wall, build_wall
 
 _WIDTH_M, _DEPTH_M = 26.0, 18.0
 ROBOT = Vehicle(

@@ -10,22 +10,9 @@ import numpy as np
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.simulation.motion import Motion, Vehicle
+from scanchain.simulation.routes import Laps, Pivot, Pivots
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds import (
-    corridor,
-    field,
-    forest,
-    hall,
-    highway,
-    identical,
-    office,
-    rounds,
-    staircase,
-    town,
-    yard,
-)
-from scanchain.simulation.worlds.laps import Laps
-from scanchain.simulation.worlds.pivots import Pivot, Pivots
+from scanchain.simulation.worlds import corridor, forest, highway, identical, office, sparse, staircase, town
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +47,15 @@ _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle o
 WORLDS: dict[str, World] = {
     "office": World(office.office, office.ROUTE, office.ROBOT, "lms-270", 240.0),
     "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0),
-    "rounds": World(rounds.rounds, rounds.ROUTE, rounds.CAR, "hdl-64", 160.0),
+    "rounds": World(town.rounds, town.ROUNDS_ROUTE, town.ROUNDS_CAR, "hdl-64", 160.0),
     "identical": World(identical.identical, identical.ROUTE, office.ROBOT, "lms-270", 300.0),
     "highway": World(highway.highway, highway.ROUTE, highway.CAR, "hdl-64", 30.0),
     "corridor": World(corridor.corridor, corridor.ROUTE, corridor.ROBOT, "os1-32", 40.0, corridor.SIGHT_M),
-    "field": World(field.field, field.ROUTE, field.TRACTOR, "hdl-64", 40.0, field.SIGHT_M),
+    "field": World(sparse.field, sparse.FIELD_ROUTE, sparse.TRACTOR, "hdl-64", 40.0, sparse.FIELD_SIGHT_M),
     "forest": World(forest.forest, forest.ROUTE, forest.MULE, "os1-32", 30.0),
     "staircase": World(staircase.staircase, staircase.ROUTE, staircase.WALKER, "os1-32", 40.0),
-    "hall": World(hall.hall, hall.ROUTE, hall.TRUCK, "vlp-16", 25.0),
-    "turns": World(yard.yard, yard.STEPS, yard.ROBOT, "os1-32", 40.0),
+    "hall": World(sparse.hall, sparse.HALL_ROUTE, sparse.TRUCK, "vlp-16", 25.0),
+    "turns": World(sparse.yard, sparse.YARD_STEPS, sparse.YARD_ROBOT, "os1-32", 40.0),
     "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, holes=_GAPS),
 }
 

@@ -1,6 +1,8 @@
-"""A smooth drive round a closed route, lap after lap."""
+"""Motions of a vehicle: laps round a closed route, and turns on the spot with short moves between them."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,13 @@ _HOLD_S = 1.0  # before it sets off, as long as the easing reaches
 _STEP_S = 0.02  # spacing of the speed profile
 _EASE_S = 0.25  # standard deviation of the smoothing that makes the acceleration continuous
 _MARGIN_S = 2.0  # the profile begins and ends that much beyond the drive
+
+TURN_RAD_S = np.deg2rad(120.0)
+_TURN_RAD_S2 = np.deg2rad(400.0)
+_PIVOT_STEP_S = 0.005  # spacing of the profiles
+_PIVOT_EASE_S = 0.05  # standard deviation of the smoothing that makes the accelerations continuous
+_PAUSE_S = 0.4  # between a turn and a move, as long as the easing reaches on both sides
+_FIRST_PAUSE_S = 1.0  # standstill at the beginning
 
 
 class Laps:
@@ -100,3 +109,76 @@ def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, dura
     eased = gaussian_filter1d(np.interp(begun_s, taken_s, speed), _EASE_S / _STEP_S)
     reached_m = cumulative_trapezoid(eased, dx=_STEP_S, initial=0.0)
     return make_interp_spline(times_s, reached_m, k=3)
+
+
+class Pivot(NamedTuple):
+    """A turn on the spot, then a straight move."""
+
+    turn_deg: float
+    ahead_m: float
+
+
+class Pivots:
+    """A dance from the origin, heading along x: ``steps`` that end as they began, over and over again."""
+
+    def __init__(
+        self,
+        steps: tuple[Pivot, ...],
+        vehicle: Vehicle,
+        solids: Solids,
+        *,
+        duration_s: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._vehicle = vehicle
+        self._solids = solids
+        self._phases = rng.uniform(0.0, 2.0 * np.pi, 5)
+        lap = np.vstack([_rates(step, vehicle) for step in steps])
+        laps = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
+        rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * laps])
+        eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
+        turning, moving = eased[:, 0], eased[:, 1]
+        times_s = np.arange(len(rates)) * _PIVOT_STEP_S
+        heading = cumulative_trapezoid(turning, dx=_PIVOT_STEP_S, initial=0.0)
+        velocity = moving[:, np.newaxis] * np.column_stack([np.cos(heading), np.sin(heading)])
+        place = cumulative_trapezoid(velocity, dx=_PIVOT_STEP_S, axis=0, initial=0.0)
+        self._heading = make_interp_spline(times_s, heading, k=3)
+        self._place = make_interp_spline(times_s, place, k=3)
+
+    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Speed along the path at (N,) instants; 0 while it turns."""
+        return np.linalg.norm(self._place(times_s, 1), axis=1)
+
+    def base(self, times_s: NDArray[np.floating]) -> Matrix:
+        """T_world_base at (N,) instants, (N, 4, 4): z normal to the ground."""
+        heading = self._heading(times_s)
+        forward = np.column_stack([np.cos(heading), np.sin(heading)])
+        poses = stand_on_ground(self._place(times_s), forward, self._solids)
+        share = self.speed_m_s(times_s) / self._vehicle.speed_m_s
+        return poses @ lie.exp(sway(self._vehicle, self._phases, times_s, share))
+
+    def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
+        """T_world_lidar at (N,) instants, (N, 4, 4)."""
+        return self.base(times_s) @ self._vehicle.T_base_lidar
+
+
+def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
+    """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
+    turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
+    ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
+    rates = np.zeros((len(turn) + len(ahead), 2))
+    rates[: len(turn), 0] = turn
+    rates[len(turn) :, 1] = ahead
+    return rates
+
+
+def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:
+    """Speeds, ``_PIVOT_STEP_S`` apart, that cover the distance within both limits; then a pause."""
+    peak = min(limit, np.sqrt(abs(distance) * acceleration))
+    if peak == 0.0:
+        return np.zeros(0)
+    taken_s = abs(distance) / peak + peak / acceleration
+    times_s = np.arange(0.0, taken_s, _PIVOT_STEP_S)
+    speed = np.minimum(peak, acceleration * np.minimum(times_s, taken_s - times_s))
+    speed *= distance / (np.sum(speed) * _PIVOT_STEP_S)
+    return np.concatenate([speed, np.zeros(round(_PAUSE_S / _PIVOT_STEP_S))])

@@ -1,4 +1,4 @@
-"""An index of a log that is no MCAP: its channels, and blocks of messages in ROS 2's CDR."""
+"""Index of a log that is not MCAP: its messages are converted to ROS 2's CDR on demand, block by block."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
 from scanchain.logs.writing.pack import schema_text
 
 
-def made_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
+def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
     """A new channel of the index, its messages in CDR; ``type_name`` is package/msg/Type."""
     number = len(index.channels) + 1
     definition = schema_text(type_name)
@@ -20,10 +20,10 @@ def made_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
     return channel
 
 
-def made_block(
+def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
-    """Append a block: ``offset`` is whatever its maker finds it by, ``size`` about the bytes it will take."""
+    """Append a block: ``offset`` is whatever ``index.make`` finds it by, ``size`` about the bytes it will take."""
     entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
     index.blocks.append(
         Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
@@ -32,13 +32,13 @@ def made_block(
         index.counts[entry.channel] = index.counts.get(entry.channel, 0) + entry.messages
 
 
-def made_index(path: Path, number: int) -> FileIndex:
-    """An index without channels or blocks; whoever makes it sets ``make``."""
+def on_demand_index(path: Path, number: int) -> FileIndex:
+    """An index without channels or blocks; the format sets ``index.make``, which converts a block."""
     return FileIndex(path, number, b"", is_counted=True, profile="ros2")
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
-    """Sorts log_2 before log_10."""
+    """Sort key by which log_2 comes before log_10."""
     return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name
 
 

@@ -1,4 +1,4 @@
-"""Furniture for the rooms of an office, put where nothing is in its way."""
+"""Interiors: walls with doorways, and furniture put where nothing is in its way."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 from scanchain.data import Matrix
 from scanchain.simulation.solids import Scenery
 
-_ROUTE_M = 0.5  # kept free beside the robot's route
-_DOOR_M = 1.0  # kept free around a doorway
-_TRIES = 12
+CEILING_M = 2.8
+_WALL_M, _DOOR_M = 0.12, 1.0
 
+_ROUTE_M = 0.5  # kept free beside the robot's route
+_DOORWAY_M = 1.0  # kept free around a doorway
+_TRIES = 12
 Kind = Literal["shelf", "desk", "bin", "plant"]
 _SIZES_M: dict[Kind, tuple[float, float]] = {
     "shelf": (1.2, 0.35),
@@ -20,6 +22,53 @@ _SIZES_M: dict[Kind, tuple[float, float]] = {
     "bin": (0.3, 0.3),
     "plant": (0.4, 0.4),
 }
+
+
+class Wall(NamedTuple):
+    """A wall with doorways ``doors`` meters along it; the leaves open to its left (1), right (−1) or are off."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+    doors: tuple[float, ...] = ()
+    leaves: int = 0
+
+    def at(self, along_m: float, left_m: float = 0.0) -> tuple[float, float]:
+        """The place so far along the wall and to its left."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return float(self.x0 + c * along_m - s * left_m), float(self.y0 + s * along_m + c * left_m)
+
+    @property
+    def length_m(self) -> float:
+        """From end to end."""
+        return float(np.hypot(self.x1 - self.x0, self.y1 - self.y0))
+
+    @property
+    def yaw_rad(self) -> float:
+        """Which way it runs."""
+        return float(np.arctan2(self.y1 - self.y0, self.x1 - self.x0))
+
+
+def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
+    """The pieces of a wall between its doorways, a lintel over each, and the leaves, open at 90 to 110 degrees."""
+    edges = [
+        0.0,
+        *(e for place in wall.doors for e in (place - 0.5 * _DOOR_M, place + 0.5 * _DOOR_M)),
+        wall.length_m,
+    ]
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        size = (last - first + _WALL_M * (first == 0.0 or last == wall.length_m), _WALL_M)
+        scenery.box(wall.at(0.5 * (first + last)), size, (0.0, CEILING_M), wall.yaw_rad)
+    for place in wall.doors:
+        scenery.box(wall.at(place), (_DOOR_M, _WALL_M), (2.1, CEILING_M), wall.yaw_rad)
+        if wall.leaves:
+            turn_rad = np.deg2rad(rng.uniform(90.0, 110.0))  # 0 is shut, hinged at the far jamb
+            half = 0.5 * (_DOOR_M - 0.05)
+            middle = wall.at(
+                place + 0.53 * _DOOR_M - half * np.cos(turn_rad), wall.leaves * half * np.sin(turn_rad)
+            )
+            scenery.box(middle, (2.0 * half, 0.04), (0.01, 2.1), wall.yaw_rad - wall.leaves * turn_rad)
 
 
 class Room(NamedTuple):
@@ -68,7 +117,7 @@ class Furnisher:
     def _is_free(self, center: Matrix, half: Matrix) -> bool:
         if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in self._taken):
             return False
-        free = ((self._route, _ROUTE_M), (self._doors, _DOOR_M))
+        free = ((self._route, _ROUTE_M), (self._doors, _DOORWAY_M))
         return all(_distance_m(places, center, half) >= limit for places, limit in free)
 
     def _put(self, kind: Kind, x: float, y: float, yaw_rad: float) -> None:
