@@ -18,8 +18,10 @@ _KEYS = tuple(f"log.{name}" for name in ("rate_hz", "topic", "start_s", "end_s",
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
-@click.option("--rate", metavar="HZ", help="Short for --log.rate_hz.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic, to keep one of several lidars.")
+@click.option(
+    "--rate", metavar="HZ", help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz."
+)
+@click.option("--topic", metavar="TOPIC", help="Lidar topic to keep, of several lidars.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
@@ -32,7 +34,7 @@ def convert(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Write a log of another format as MCAP. The other commands take all of these as they are, too.
+    """Convert a log of another format to MCAP. The other commands read all of these formats directly, too.
 
     \b
     SRC is one of
@@ -46,8 +48,8 @@ def convert(
       a folder of clouds  PCD, PLY, .npy or .bin of rows x y z (intensity ...), named by their stamps, or with
                           --log.rate_hz
 
-    Messages stay as they are. Keys that choose some: --topic (one of several lidars), --log.start_s,
-    --log.end_s, --log.every.
+    Messages are copied unchanged. A part of them is selected by --topic (one of several lidars), --log.start_s,
+    --log.end_s and --log.every.
 
     \b
     Examples:
