@@ -81,12 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _unforeseen(error: Exception) -> int:
-    """What nobody raised on purpose: a remedy where the system refused something, else the way to the place."""
+    """Exit code of an unexpected error: the remedy of a system error, else how to get the traceback."""
     if os.environ.get("SCANCHAIN_DEBUG"):
         raise error
     if isinstance(error, OSError) and told(error):
         return _fail(told(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
-    return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows where it happened", 1)
+    return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows the traceback", 1)
 
 
 def _with_near_options(error: click.NoSuchOption) -> click.NoSuchOption:

@@ -1,4 +1,4 @@
-"""What scripts call to do what the commands do: process a log, compare methods on it."""
+"""The commands for scripts: process a log, compare methods on it, optimize a graph, downsample points."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def run(
     """Process a log into a run directory, as ``scanchain run`` does; nothing is printed.
 
     log : a file, a folder, an address, or the files of one log
-    out : the directory to make; with ``force`` an earlier run there is replaced
+    out : the directory to create; with ``force`` an earlier run there is replaced
     config : a TOML file on top of the preset
     ground_truth : a TUM or KITTI file of true poses
     recording : whether a rerun recording is written
     overrides : keys of the configuration, two underscores for the dot: ``loops__drift=0.02``
-    Returns where it lies, with metrics, summary and warnings; ``metrics.unreliable`` says why not to trust it.
+    Returns path, metrics, summary and warnings; ``metrics.unreliable`` is the reason not to use it, if any.
     Raises InputError for bad input.
     """
     job = Job(
@@ -70,14 +70,14 @@ def compare(
 ) -> Compared:
     """Run several methods over the same scans, as ``scanchain compare`` does; nothing is printed.
 
-    methods : names such as "plicp", "kiss-icp" or "module:Class"; all that make sense for the log where left out
-    repeat : runs of each method, in turn
-    Other arguments as in ``run``. Returns where it lies, and the table. Raises InputError for bad input.
+    methods : names such as "plicp", "kiss-icp" or "module:Class"; by default all that apply to the log
+    repeat : runs of each method, interleaved
+    Other arguments as in ``run``. Returns path and table. Raises InputError for bad input.
     """
-    from scanchain.comparison.compare import Contest
-    from scanchain.comparison.compare import compare as run_contest
+    from scanchain.comparison.compare import Comparison
+    from scanchain.comparison.compare import compare as run_comparison
 
-    contest = Contest(
+    comparison = Comparison(
         logs=_sources(log),
         out=Path(out),
         methods=tuple(methods),
@@ -86,15 +86,15 @@ def compare(
         repeat=repeat,
         force=force,
     )
-    return run_contest(contest, present_comparison, Unwatched())
+    return run_comparison(comparison, present_comparison, Unwatched())
 
 
 def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     """Move the poses of a graph to the minimum of χ², as ``scanchain optimize`` does.
 
     overrides : keys of ``[graph]``, such as robust="truncated" where loops may be wrong; by default none is
-    Returns what was done: state, χ² before and after, iterations, ``converged`` and ``reason``.
-    Raises InputError where the edges do not hold the poses together.
+    Returns state, χ² before and after, iterations, ``converged`` and ``reason``.
+    Raises InputError if the graph is disconnected.
     """
     changes = _overrides({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)

@@ -1,4 +1,4 @@
-"""The catalog of sequences: what each folder under sequences/ says, and how the log is made."""
+"""The catalog of sequences: the folders under sequences/, and how a log is made from each."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Local(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", t
 
 
 class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a sequence is, where it comes from, how it becomes MCAP and what it is judged by."""
+    """A sequence: description, source, conversion to MCAP, ground truth."""
 
     title: str
     description: str
@@ -81,14 +81,14 @@ def names() -> tuple[str, ...]:
 
 
 def load(name: str) -> Sequence:
-    """What the catalog says about a sequence."""
+    """Entry of a sequence."""
     if name not in names():
         raise InputError(f"sequence {name!r} is not in the catalog; choose one of {', '.join(names())}")
     return read(_folder() / name / _FILE)
 
 
 def read(file: Path) -> Sequence:
-    """What a sequence.toml says."""
+    """Contents of a sequence.toml."""
     try:
         return msgspec.toml.decode(file.read_bytes(), type=Sequence)
     except (msgspec.DecodeError, UnicodeDecodeError, OSError) as error:
@@ -123,7 +123,9 @@ def prepare(
         case Download():
             convert([_download(name, source, folder, progress)], destination, force=True)
         case Page():
-            raise InputError(f"{destination}: {name} cannot be fetched by itself; {source.page}: {source.steps}")
+            raise InputError(
+                f"{destination}: {name} cannot be downloaded automatically; {source.page}: {source.steps}"
+            )
         case Local():
             raise InputError(f"{destination}: absent; put {source.path} there as MCAP")
     return destination

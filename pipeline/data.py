@@ -97,7 +97,7 @@ class Scan:
 
 
 class State(StrEnum):
-    """How far a pose can be trusted."""
+    """Reliability of a pose."""
 
     OK = "ok"
     DEGENERATE = "degenerate"
@@ -106,7 +106,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is believed of a pose before it is matched.
+    """Prior of a pose before it is matched.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class Match:
     T_target_source : (d+1, d+1) pose of the source in the target's frame
     information : (k, k) inverse covariance of a twist ξ in the source's own frame, T exp(ξ), as a pose-graph
         edge takes it; m⁻², rad⁻¹m⁻¹, rad⁻²
-    cost : robust cost in m², every point without a partner at the kernel's limit; compares two alignments of
+    cost : robust cost in m², each point without correspondence at the kernel's limit; compares two alignments of
         the same scan to the same map
     inliers : source points with a correspondence within ``matching.max_distance_m``, also after a wide search
     points : source points that were tried
@@ -180,7 +180,7 @@ class Match:
 
     @property
     def is_fit(self) -> bool:
-        """Whether the pose is a minimum that the correspondences agree with, in every direction or not."""
+        """True if the pose is a minimum that the correspondences agree with, in every direction or not."""
         return self.at_minimum and not self.is_contradicted
 
 
@@ -194,7 +194,7 @@ class Keyframe:
     scan_index, stamp_ns : the scan it was made of
     stored : its points, which ``points`` reads
     T_odom_lidar : pose in the odometry frame
-    traveled_m : length of the way up to it, by odometry
+    traveled_m : length of the path up to it, by odometry
     scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
@@ -208,19 +208,19 @@ class Keyframe:
 
     @property
     def points(self) -> Points:
-        """(M, d) deskewed points, lidar frame; read anew each time."""
+        """(M, d) deskewed points, lidar frame; read from disk each time."""
         return self.stored.read()
 
 
 class Verdict(StrEnum):
-    """What became of a proposed loop closure."""
+    """Verdict on a proposed loop closure."""
 
     ACCEPTED = "accepted"
     REJECTED = "rejected"
 
 
 class Proposal(StrEnum):
-    """What a loop closure was tried for."""
+    """Reason why a loop closure was tried."""
 
     POSITION = "position"
     PLACE = "place"
@@ -280,7 +280,7 @@ class GraphState:
 
 
 def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: bool) -> str:
-    """How well the edges in force agree, in words: χ², its degrees of freedom, how many edges do not count.
+    """Fit of the edges in force as text: χ², its degrees of freedom, how many edges do not count.
 
     rejected : how many edges are not in force, in words; empty for none
     Loops that measure too little to leave degrees of freedom have a χ² all the same: ``has_loops`` tells of them.
@@ -294,7 +294,7 @@ def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Where the time of one scan went, seconds."""
+    """Time of one scan by stage, seconds."""
 
     read_s: float
     preprocess_s: float
@@ -310,7 +310,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What became of one scan.
+    """Result of one scan.
 
     Attributes
     ----------
@@ -319,7 +319,7 @@ class Step:
     T_odom_lidar : pose before optimization: smooth, drifts
     T_world_lidar : best pose known now: jumps at closures
     match : the registration against the local map
-    state, reason : how far the pose can be trusted, and why not
+    state, reason : reliability of the pose, and the reason if it is not ok
     keyframe : index of the keyframe made of this scan, -1 if none was
     local_map : (L, d) float64 points of the local map in the odom frame; filled on keyframes, else (0, d)
     closures : loop closures tried at this scan

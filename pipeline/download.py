@@ -1,4 +1,4 @@
-"""Fetching a file by HTTP: goes on where it was broken off, and is complete and verified or absent."""
+"""Download of a file by HTTP: resumed where it was interrupted; the file is complete and verified, or absent."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class DownloadError(ScanchainError):
 
 
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> str:
-    """Fetch a file unless it is there; its SHA-256. What is there of an earlier try is gone on with.
+    """Download a file unless it exists, resuming an earlier try; returns its SHA-256.
 
     sha256 : what it must be, empty where nobody knows. Raises InputError where it is not, and for what is no
         HTTP address; DownloadError where the server does not answer as it should.
@@ -77,7 +77,7 @@ class _Part:
                 reason = str(getattr(error, "reason", error)) or type(error).__name__
             if attempt == _ATTEMPTS:
                 have = self.path.stat().st_size if self.path.exists() else 0
-                raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to go on")
+                raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
     def _more(self, progress: Progress | None) -> bool:
         """One request from the first missing byte on; whether the file is complete."""

@@ -1,4 +1,4 @@
-"""Where the command ``scanchain`` begins: until the rest is imported, Ctrl-C ends it with one line, too."""
+"""Entry point of the command ``scanchain``: Ctrl-C during the imports ends it with one line, too."""
 
 import sys
 

@@ -38,6 +38,6 @@ _REMEDIES = {
 
 
 def told(error: OSError) -> str:
-    """What the system refused and what to do, on one line; empty where it is not known what to do."""
+    """Remedy of a system error on one line; empty if none is known."""
     remedy = _REMEDIES.get(error.errno or 0, "")
     return f"{error.filename}: {remedy}" if error.filename and remedy else remedy

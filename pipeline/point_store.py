@@ -55,7 +55,7 @@ class PointStore:
         return result
 
     def reopen(self, path: Path) -> None:
-        """Go on with the file that another process wrote; what it added since this state was kept is cut off."""
+        """Reopen the file that another process wrote, truncated to the rows of this state."""
         size = self.rows * self._row_bytes
         if not path.is_file() or path.stat().st_size < size:
             raise InputError(f"{path}: is missing or too short; run without --resume")
@@ -67,7 +67,7 @@ class PointStore:
         self.file.close()
 
     def _take(self, file: FileIO) -> None:
-        """Go on with a file, which is closed with the store that nobody uses any more."""
+        """Use a file, which is closed when the store is garbage-collected."""
         self.file = file
         weakref.finalize(self, file.close)
 

@@ -20,7 +20,7 @@ _MIB = 1024.0**2
 
 
 def peak_mib() -> float:
-    """The most that this process ever had in memory, interpreter and packages included."""
+    """Peak resident memory of this process, interpreter and packages included."""
     status = Path("/proc/self/status")
     if status.exists():  # getrusage would also count the parent before this program was started
         for line in status.read_text().splitlines():
@@ -34,7 +34,7 @@ def peak_mib() -> float:
 
 
 def resident_mib(pid: int) -> float:
-    """What a process and its children have in memory now; 0 once it is gone."""
+    """Resident memory of a process and its children; 0 once it is gone."""
     total = 0
     for each in _family(pid):
         with suppress(psutil.Error):
@@ -57,26 +57,26 @@ def _family(pid: int) -> list[int]:
 
 
 def available_mib() -> float:
-    """What the machine can give without swapping."""
+    """Memory that the machine can give without swapping."""
     return psutil.virtual_memory().available / _MIB
 
 
 def die_first() -> None:
-    """Where the machine runs out of memory, let the kernel end this process and not the one that watches it."""
+    """Make the kernel kill this process, not the one that watches it, when memory runs out."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a process and its children may take."""
+    """Limits of a process and its children."""
 
     time_s: float
     memory_mib: float
 
 
 class KilledFor(Enum):
-    """Why a process did not come to its own end."""
+    """Reason why a process was killed."""
 
     NOTHING = auto()
     TIME = auto()
@@ -86,7 +86,7 @@ class KilledFor(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a process ended.
+    """End of a process.
 
     ``code`` is its exit code, negative for a signal; ``peak_mib`` the most that was seen of it in memory, its
     children included.
@@ -99,7 +99,7 @@ class Ending:
 
     @property
     def how(self) -> str:
-        """In words, for one that ended by itself."""
+        """Signal or exit code as text, if it was not killed here."""
         return signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
 
 
@@ -116,7 +116,7 @@ def run_within(
 ) -> Ending:
     """Run a command to its end, or kill it and its children when it takes too much or ``stop`` is set.
 
-    output, errors : files for what it says; without ``errors`` both go into one
+    output, errors : files for stdout and stderr; without ``errors`` both go into one
     look_s : seconds between two looks at its memory
     is_own_session : whether a Ctrl-C on the terminal does not reach it
     """

@@ -1,4 +1,4 @@
-"""Where a log lies: a path on this machine, or an address."""
+"""Source of a log: a path on this machine, or an address."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def without_keys(words: Sequence[str]) -> list[str]:
 
 
 def source_of(named: Source | str) -> Source:
-    """What a text names: an address where it begins with ``s3://`` or the like, else a path."""
+    """Source that a text names: an address if it begins with ``s3://`` or the like, else a path."""
     if not isinstance(named, str):
         return named
     if not _SCHEME.match(named):

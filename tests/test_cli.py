@@ -390,7 +390,7 @@ def test_an_error_of_ours_is_one_line_with_exit_code_1_too(call, monkeypatch, of
     monkeypatch.delenv("SCANCHAIN_DEBUG", raising=False)
     code, output, errors = call("info", office)
     assert (code, output) == (1, "")
-    assert errors == "error: RuntimeError: two lines; SCANCHAIN_DEBUG=1 shows where it happened\n"
+    assert errors == "error: RuntimeError: two lines; SCANCHAIN_DEBUG=1 shows the traceback\n"
     monkeypatch.setenv("SCANCHAIN_DEBUG", "1")
     with pytest.raises(RuntimeError):
         call("info", office)
@@ -546,10 +546,10 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     says(
         call("run", office, *out)[1].splitlines()[0],
-        "(wheels /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
+        "(wheel odometry /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
     )
     _, output, _ = call("run", office, *out, "--odometry.prior", "constant-velocity")
-    says(output.splitlines()[0], "wheels /odom, not used: odometry.prior is constant-velocity;")
+    says(output.splitlines()[0], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
 
 
 @pytest.mark.parametrize(
@@ -1003,7 +1003,7 @@ def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path
     assert trusting["suspected"] == 0 and trusting["rejected"] == [] and trusting["chi2_after"] > 1000.0
     code, output, _ = call("optimize", ring, "--robust", "truncated")
     assert code == 0
-    says(output, "rejected       1 of 3 suspected edges")
+    says(output, "rejected       1 of 3 loop edges")
     tree = json.loads(call("optimize", ring, "--graph.robust", "truncated", "--json")[1])
     assert tree["rejected"] == [[1, 3]] and tree["certificate"]["chi2"] < 1.0
     assert tree["chi2_after"] == pytest.approx(tree["certificate"]["chi2"]) and tree["degrees_of_freedom"] == 6
@@ -1028,11 +1028,11 @@ def test_the_picture_names_the_fit_of_the_edges_in_force_at_either_time(call, mo
 
 
 @pytest.mark.parametrize("robust", ["truncated", "huber"])
-def test_an_answer_that_rests_on_a_minority_of_the_suspected_edges_says_so_first(call, ring, robust):
+def test_an_answer_that_rests_on_a_minority_of_the_loop_edges_says_so_first(call, ring, robust):
     ring.write_text(ring.read_text() + "".join(f"EDGE_SE2 {i} 3 9 {i} 1 100 0 0 100 0 1000\n" for i in (0, 1, 1)))
     output = call("optimize", ring, "--robust", robust)[1]
-    assert re.match(r"warning        \d of 5 suspected edges are rejected or count less than half", output)
-    says(output, "not for the choice of them", "certificate    globally optimal")
+    assert re.match(r"warning        \d of 5 loop edges are rejected or have a weight below ½", output)
+    says(output, "not their selection", "certificate    globally optimal")
 
 
 def test_optimize_writes_graphs_of_the_known_formats_alone(call, refused, tmp_path, ring):

@@ -13,12 +13,12 @@ from scenes import shared_data
 
 from scanchain import lie
 from scanchain.__main__ import main
-from scanchain.comparison.compare import Contest, compare
+from scanchain.comparison.compare import Comparison, compare
 from scanchain.comparison.figures import COLUMNS, Figures
-from scanchain.comparison.judging import doubt
+from scanchain.comparison.judging import unreliable_by_itself
 from scanchain.comparison.methods import OURS, default_names, resolve
 from scanchain.comparison.outcome import EndReport, Outcome, Status
-from scanchain.comparison.processes import race
+from scanchain.comparison.processes import run_all
 from scanchain.comparison.results import method_folder
 from scanchain.comparison.scan_store import store
 from scanchain.comparison.table import Row, Table, markdown, read_table, text
@@ -59,8 +59,8 @@ def toml(path, text_):
 
 def run(office, folder, *methods, **changes):
     """The table of a comparison without report and recording."""
-    contest = Contest(logs=(office,), out=folder / "out", methods=methods, **changes)
-    return compare(contest, lambda _: None, Unwatched()).table
+    comparison = Comparison(logs=(office,), out=folder / "out", methods=methods, **changes)
+    return compare(comparison, lambda _: None, Unwatched()).table
 
 
 def row(table, name):
@@ -195,7 +195,7 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
 
     monkeypatch.setattr("scanchain.comparison.processes._run", fake)
     methods = resolve(("plicp",), 2, file=None)
-    outcomes = race(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
+    outcomes = run_all(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
     assert len(ran) == len(set(ran)) == 3
     assert [outcome.seconds[0] for outcome in outcomes["plicp"]] == [2.0, 3.0]
 
@@ -212,8 +212,8 @@ class StopsAtOnce(Unwatched):
 
 def test_a_reading_that_the_user_stopped_is_told(office, tmp_path):
     settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
-    contest = Contest(logs=(office,), out=tmp_path / "out", methods=("mine",), settings_file=settings)
-    table = compare(contest, lambda _: None, StopsAtOnce()).table
+    comparison = Comparison(logs=(office,), out=tmp_path / "out", methods=("mine",), settings_file=settings)
+    table = compare(comparison, lambda _: None, StopsAtOnce()).table
     assert table.scans == 5 and "the user stopped the reading: 5 scans compared" in text(table)
 
 
@@ -507,4 +507,4 @@ def test_a_method_most_of_whose_scans_are_degenerate_is_called_unreliable(tmp_pa
     pq.write_table(pa.table({"state": states, "scan_points": [300] * 10}), tmp_path / "steps.parquet")
     still = Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1)))
     outcome = Outcome(EndReport(Status.OK, ""), still.poses, still, np.ones(2), np.ones(2), tmp_path)
-    assert doubt(outcome).startswith(told) and bool(doubt(outcome)) == bool(told)
+    assert unreliable_by_itself(outcome).startswith(told) and bool(unreliable_by_itself(outcome)) == bool(told)

@@ -299,7 +299,7 @@ def test_the_metrics_agree_with_the_files(drive):
     assert metrics["times_real_time"] == pytest.approx(span_s / metrics["run_s"])
     assert metrics["scans_per_s"] == pytest.approx(metrics["scans"] / metrics["run_s"])
     assert metrics["map_points"] == len(read_ply(drive.folder / "map.ply"))
-    left_out = f"{metrics['moving_points_removed']:,} more left out as having moved"
+    left_out = f"{metrics['moving_points_removed']:,} more removed as moving"
     assert left_out in (drive.folder / "summary.txt").read_text(encoding="utf-8")
     assert metrics["moving_points_removed"] < 0.01 * metrics["map_points"]  # nothing moves there
     assert metrics["traveled_m"] == pytest.approx(length_m(drive.tum()), abs=1e-5)

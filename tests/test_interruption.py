@@ -81,7 +81,7 @@ def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(undi
     assert start(log, out, *LIVELY, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
     same_result(out, whole)
-    assert "went on after" in (out / "summary.txt").read_text()
+    assert "resumed after" in (out / "summary.txt").read_text()
     assert not list(out.glob("*.journal")) and not list(out.glob("*.checkpoint"))
 
 
@@ -117,7 +117,7 @@ def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was
 @pytest.mark.parametrize(
     "module, kind, method",
     [
-        ("scanchain.viz.recording.recording", "Recording", "go_on"),
+        ("scanchain.viz.recording.recording", "Recording", "resume"),
         ("scanchain.runs.resume.checkpoint", "Checkpoints", "write"),
     ],
 )
@@ -235,7 +235,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path
     stopped_after = len(read_tum(partial(out) / "trajectory.tum"))
     child = start(office, out, *LIVELY, "--resume", stderr=subprocess.PIPE)
     errors = child.communicate()[1].decode()
-    assert child.returncode == 0 and f"going on after {stopped_after} scans" in errors
+    assert child.returncode == 0 and f"resuming after {stopped_after} scans" in errors
     same_result(out, whole)
 
 
@@ -257,7 +257,7 @@ def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_pat
     errors = child.communicate(timeout=20)[1]
     assert child.returncode == 1 and errors.count("\n") == 1
     assert "interrupted; 100 scans until then are in" in errors
-    assert f"to go on with it: scanchain {' '.join(words)} --resume\n" in errors
+    assert f"to resume: scanchain {' '.join(words)} --resume\n" in errors
     assert assert_readable(partial(out)) == 100
     assert start(office, out, *LIVELY, "--resume").wait() == 0
     same_result(out, whole)

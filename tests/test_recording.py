@@ -362,7 +362,7 @@ from pathlib import Path
 from uuid import uuid4
 from test_recording import drive, free_port
 from scanchain.config import RecordingConfig
-from scanchain.viz import sinks, viewer
+from scanchain.viz.recording import sinks, viewer
 from scanchain.viz.recording.blueprint import blueprint
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.recording import Recording
@@ -399,7 +399,7 @@ def test_view_web_prints_one_address_and_takes_its_server_along(tmp_path, number
     script = f"""
 import sys
 from scanchain.__main__ import main
-from scanchain.viz import viewer
+from scanchain.viz.recording import viewer
 viewer.PORT, viewer.WEB_PORT = {port}, {web_port}
 sys.exit(main(["view", "--web", sys.argv[1]]))
 """
@@ -477,7 +477,7 @@ import resource, signal, sys
 from pathlib import Path
 from uuid import uuid4
 from test_recording import drive, record
-from scanchain.viz import sinks
+from scanchain.viz.recording import sinks
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 sinks._FILE_PATIENCE_S = 1.0
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
@@ -548,7 +548,7 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     try:
         with Recording(again, sinks=frozenset({"save", "connect"}), port=port, **options) as recording:
             known = [closure for step in steps[: len(rows)] for closure in step.closures]
-            recording.go_on(begun, rows, known, last.graph)
+            recording.resume(begun, rows, known, last.graph)
             finish(recording, steps[len(rows) :])
     finally:
         viewer.stop(server)
@@ -570,7 +570,7 @@ def test_what_lacks_something_is_not_secured(tmp_path):
         recording.log(steps[0])
         assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
         (tmp_path / "b.rrd").write_bytes(b"no recording")
-        recording.go_on(tmp_path / "b.rrd", rows_of_steps(steps), [], steps[20].graph)
+        recording.resume(tmp_path / "b.rrd", rows_of_steps(steps), [], steps[20].graph)
         assert recording.secure() == 0
     assert "a.rrd is incomplete, the run goes on without it" in recording.warnings[0]
 

@@ -23,9 +23,9 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.simulation import simulate
 from scanchain.viz.pictures.map_figures import surroundings
-from scanchain.viz.pictures.trajectory_figures import Course, PathLine, plan
-from scanchain.viz.report.page import Chip, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
-from scanchain.viz.report.trajectory_map import SCRIPT, Told, map_scene, trajectory_section
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
+from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
 
 EVIL = "<script>alert(1)</script>"
 TESTS = Path(__file__).parent
@@ -100,7 +100,7 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
     for title in (
         "Summary", "More on accuracy", "More on time",
         "Trajectories", "Plan", "Error", "Over the distance", "Distribution", "Time per scan", "Along the log",
-        "Covariance consistency", "Observability along the way", "Maps", "Loop closures of plicp+loops",
+        "Covariance consistency", "Observability", "Maps", "Loop closures of plicp+loops",
         "Disagreement", "Command", "Versions", "Settings",
     ):  # fmt: skip
         assert title in seen["text"], title
@@ -132,8 +132,8 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     page = (one_run / "report.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
-        "Accuracy", "Trajectory and map", "Loop closures", "Trajectories", "Error", "Certainty", "Time of a scan",
-        "Time per scan", "How it was made",
+        "Accuracy", "Trajectory and map", "Loop closures", "Trajectories", "Error", "Uncertainty",
+        "Time of a scan", "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
     assert facts[:2] == ["trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
@@ -267,7 +267,7 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
     )  # fmt: skip
     positions = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
-    section = trajectory_section(course(positions), Told(steps, closures), positions + 0.1, points, 0.2)
+    section = trajectory_section(course(positions), Tables(steps, closures), positions + 0.1, points, 0.2)
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
@@ -333,7 +333,7 @@ def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
 def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparison):
     entities = {str(chunk.entity_path) for chunk in RrdReader(comparison / "compare.rrd").stream()}
     for method in ("plicp", "plicp\\+loops"):
-        for part in ("world/{}/way", "world/{}/lidar", "world/{}/map", "plots/error/{}", "plots/time/{}"):
+        for part in ("world/{}/trajectory", "world/{}/lidar", "world/{}/map", "plots/error/{}", "plots/time/{}"):
             assert "/" + part.format(method) in entities
     assert "/world/ground_truth" in entities
 
@@ -342,7 +342,7 @@ def course(positions, **known):
     count = len(positions)
     unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "observability")}
     unknown["relation_error_m"] = np.empty(0)
-    return Course("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
+    return DrawnTrajectory("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
 
 
 def test_a_drawing_takes_the_colors_of_its_page():
@@ -356,6 +356,6 @@ def test_every_text_of_a_page_is_escaped(tmp_path):
     chip, drawing = Chip(EVIL, "red"), Drawing(EVIL, EVIL, svg="<svg></svg>")
     grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),), (EVIL,))
     section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
-    fold = Fold(EVIL, EVIL)
+    fold = Collapsible(EVIL, EVIL)
     write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), (EVIL,), (section,), (fold,)))
     assert "<script" not in (tmp_path / "a.html").read_text()

@@ -243,7 +243,7 @@ def test_a_run_that_the_user_stops_tells_of_the_scans_that_it_left_out(tmp_path)
 
 def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office):
     text = run(job(office, tmp_path / "a"), open_recorder, Watcher(20)).summary
-    assert "(wheels /odom; lidar at" in text and "not used" not in text
+    assert "(wheel odometry /odom; lidar at" in text and "not used" not in text
 
 
 def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_path, office):
@@ -326,13 +326,15 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_
         tmp_path / f"a.partial-{_NO_PROCESS}"
     )
     with pytest.raises(
-        InputError, match=rf"{left.name}: exists; .*: --out {tmp_path / 'a'} --resume goes on with it"
+        InputError, match=rf"{left.name}: exists; .*: --out {tmp_path / 'a'} --resume continues it"
     ):
         RunDirectory(left, force=False)
     told = Telling()
     run(job(office, tmp_path / "a"), open_recorder, told)
-    assert f"{left.name} is of a run that was stopped; --resume would go on with it" in "\n".join(told.lines)
-    with pytest.raises(InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume goes on"):
+    assert f"{left.name} is of a run that was stopped; --resume would continue it" in "\n".join(told.lines)
+    with pytest.raises(
+        InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume continues"
+    ):
         RunDirectory(tmp_path / "a", force=False)
     resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Unwatched())
     assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
@@ -394,7 +396,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(tmp_path, office):
     assert child.returncode == 1
     assert errors.startswith("error: stopped by the user after ") and errors.count("\n") == 1
     assert str(folder) in errors and "PARTIAL" in output
-    assert errors.endswith(f"to go on with it: scanchain run {office} --out {tmp_path / 'a'} --resume\n")
+    assert errors.endswith(f"to resume: scanchain run {office} --out {tmp_path / 'a'} --resume\n")
     assert 40 <= len(np.loadtxt(folder / "trajectory.tum")) < 60
     assert list(RrdReader(str(folder / "recording.rrd")).stream())
 

@@ -1,4 +1,9 @@
-"""Odometries made by others, behind one verb, by name."""
+"""Odometries by others behind one protocol, by name.
+
+A new one is a file with a class as ``Baseline`` describes it and a line in ``BASELINES``. Outside the
+package, ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --settings as
+keywords.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +26,16 @@ __all__ = ["BASELINES", "Baseline", "Entry", "InPlane", "create", "find", "names
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A baseline that can be had.
+    """A registered baseline.
 
     Attributes
     ----------
-    make : of its settings; the package is imported there and not before
-    package : what versions are known by
+    make : constructor, given the settings; the package is imported there and not before
+    package : distribution whose version is reported
     settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing tells point-to-
         plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
     is_raised : whether a 2D scan must be given height, because surfaces are looked for
-    forgets : whether a second instance in a process knows nothing of the first
+    forgets : whether a second instance in a process is independent of the first
     """
 
     make: Callable[[Any], Baseline]
@@ -59,12 +64,12 @@ BASELINES: dict[str, Entry] = {
 
 
 def names() -> tuple[str, ...]:
-    """The baselines there are."""
+    """Names of all baselines."""
     return tuple(BASELINES)
 
 
 def find(name: str) -> Entry:
-    """What is known of a baseline. Raises InputError where there is none of that name."""
+    """Entry of a baseline. Raises InputError for an unknown name."""
     if name not in BASELINES:
         raise InputError(f"there is no baseline {name!r}; choose among {', '.join(BASELINES)}")
     return BASELINES[name]

@@ -12,11 +12,11 @@ from scanchain.data import Pose, RawPoints
 
 
 class Baseline(Protocol):
-    """An odometry made by others, fed with the scans that ours is fed with."""
+    """An odometry by others, run on the same scans as ours; any class with these two members can be compared."""
 
     @property
     def description(self) -> str:
-        """What it does and with which parameters, for a table's footnote."""
+        """Method and parameters, for the footnote of a table."""
         ...
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -30,7 +30,7 @@ class Baseline(Protocol):
 def finite(points: RawPoints, times_s: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points without NaN and inf as float64, and the times of those that stay.
 
-    Times that say nothing, because all are equal, are left out: KISS-ICP divides by their span.
+    Times that are all equal are dropped: KISS-ICP divides by their span.
     """
     times = times_s.astype(np.float64) if len(times_s) == len(points) else np.empty(0)
     if not (np.isfinite(points).all() and np.isfinite(times).all()):
@@ -91,7 +91,7 @@ class InPlane:
 
     @property
     def description(self) -> str:
-        """What it does, and how the scans were made fit for it."""
+        """Method and parameters, and how 2D scans are given to it."""
         levels = len(self.heights_m)
         how = f"{levels} copies {_STEP_M:g} m above each other" if levels > 1 else "at z = 0"
         return f"{self.baseline.description}; 2D scans {how}"

@@ -12,7 +12,7 @@ from scanchain.baselines.baseline import AtStamp, finite, middle
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import MissingExtraError
 
-Place = Literal["outdoor", "indoor", "kitti"]
+Preset = Literal["outdoor", "indoor", "kitti"]
 
 # What its outdoor.yaml, indoor.yaml and kitti.yaml say beside its defaults.
 _DATA = {"outdoor": {"min_range": 0.5}, "indoor": {"min_range": 0.3}, "kitti": {"min_range": 5.0}}
@@ -21,33 +21,33 @@ _MAPPING = {"outdoor": _OUTDOOR, "indoor": {}, "kitti": _OUTDOOR | {"planarity_t
 
 
 class GenzSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The kind of place that its authors tuned it for."""
+    """Preset of its authors, by kind of environment."""
 
-    place: Place = "outdoor"
+    preset: Preset = "outdoor"
 
 
 GENZ = GenzSettings()
 
 
 class GenzIcp:
-    """GenZ-ICP as its authors tuned it for a kind of place.
+    """GenZ-ICP with a preset of its authors.
 
-    It lets its voxels grow and shrink until a scan has the wished number of points, and keeps their size in a
-    static variable: a second odometry in the same process goes on with the voxels of the first.
+    It lets its voxels grow and shrink until a scan has the desired number of points, and keeps their size in a
+    static variable: a second odometry in the same process starts with the voxel size of the first.
     """
 
     def __init__(self, settings: GenzSettings = GENZ) -> None:
-        place = settings.place
+        preset = settings.preset
         try:
             from genz_icp.config import load_config
             from genz_icp.genz_icp import GenZICP
         except ImportError:
             raise MissingExtraError("genz-icp", "baselines") from None
         config = load_config(None)
-        config.data = config.data.model_copy(update={"deskew": True} | _DATA[place])
-        config.mapping = config.mapping.model_copy(update=_MAPPING[place])
+        config.data = config.data.model_copy(update={"deskew": True} | _DATA[preset])
+        config.mapping = config.mapping.model_copy(update=_MAPPING[preset])
         self.description = (
-            f"GenZ-ICP, planes and points, scan to map, its {place}.yaml: {config.data.min_range:g} to "
+            f"GenZ-ICP, planes and points, scan to map, its {preset}.yaml: {config.data.min_range:g} to "
             f"{config.data.max_range:g} m, voxels of {config.mapping.voxel_size:g} m, about "
             f"{config.mapping.desired_num_voxelized_points} points a scan, all threads; its own deskewing, off in "
             "that file, on where the log has times"

@@ -21,26 +21,26 @@ _CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults b
 
 
 class GicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Of the scan-to-scan odometry. Threads: 0 are all."""
+    """Settings of the scan-to-scan odometry; 0 threads are all."""
 
-    thinning_m: Positive = 0.25
+    downsampling_m: Positive = 0.25
     max_distance_m: Positive = 1.0
     neighbors: Count = 20
     threads: Annotated[int, Meta(ge=0)] = 0
 
 
 class VgicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Of the scan-to-map odometry; voxels not seen for ``horizon`` scans are forgotten. Threads: 0 are all."""
+    """Settings of the scan-to-map odometry; 0 threads are all. Voxels unseen for ``horizon`` scans go."""
 
-    thinning_m: Positive = 0.25
+    downsampling_m: Positive = 0.25
     voxel_size_m: Positive = 1.0
     horizon: Count = 100
     neighbors: Count = 20
     threads: Annotated[int, Meta(ge=0)] = 0
 
 
-GICP, PLANAR_GICP = GicpSettings(), GicpSettings(thinning_m=0.05, max_distance_m=0.5)
-VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(thinning_m=0.05, voxel_size_m=0.3)
+GICP, PLANAR_GICP = GicpSettings(), GicpSettings(downsampling_m=0.05, max_distance_m=0.5)
+VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(downsampling_m=0.05, voxel_size_m=0.3)
 
 
 class SmallGicpModel:
@@ -59,9 +59,9 @@ class SmallGicpModel:
 
     @property
     def description(self) -> str:
-        """What it does and with which parameters."""
+        """Method and parameters."""
         return (
-            f"small_gicp VGICP, scan to map, thinned to {self.settings.thinning_m:g} m, voxels of "
+            f"small_gicp VGICP, scan to map, downsampled to {self.settings.downsampling_m:g} m, voxels of "
             f"{self.settings.voxel_size_m:g} m, "
             f"{self.threads} threads, constant velocity, no deskewing"
         )
@@ -71,7 +71,7 @@ class SmallGicpModel:
         frame, times = finite(points, times_s)
         cloud, _ = self.library.preprocess_points(
             frame,
-            downsampling_resolution=self.settings.thinning_m,
+            downsampling_resolution=self.settings.downsampling_m,
             num_neighbors=self.settings.neighbors,
             num_threads=self.threads,
         )
@@ -100,9 +100,10 @@ class SmallGicpPairs:
 
     @property
     def description(self) -> str:
-        """What it does and with which parameters."""
+        """Method and parameters."""
         return (
-            f"small_gicp GICP, scan to scan, thinned to {self.settings.thinning_m:g} m, pairs within "
+            f"small_gicp GICP, scan to scan, downsampled to {self.settings.downsampling_m:g} m, "
+            "correspondences within "
             f"{self.settings.max_distance_m:g} m, {self.threads} threads, constant velocity, no deskewing"
         )
 
@@ -111,7 +112,7 @@ class SmallGicpPairs:
         frame, times = finite(points, times_s)
         cloud, tree = self.library.preprocess_points(
             frame,
-            downsampling_resolution=self.settings.thinning_m,
+            downsampling_resolution=self.settings.downsampling_m,
             num_neighbors=self.settings.neighbors,
             num_threads=self.threads,
         )

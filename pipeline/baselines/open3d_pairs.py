@@ -22,7 +22,7 @@ Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
 
 
 class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """Voxels that scans are thinned out with, how far partners may lie apart, and where normals come from."""
+    """Voxels for downsampling, largest distance of correspondences, and neighborhood of normals."""
 
     voxel_size_m: Positive = 0.5
     max_distance_m: Positive = 1.0
@@ -36,14 +36,14 @@ PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_rad
 
 
 class Open3dPairs:
-    """Scan-to-scan ICP on thinned clouds, started at constant velocity."""
+    """Scan-to-scan ICP on downsampled clouds, started at constant velocity."""
 
     def __init__(self, residual: Residual, settings: Open3dSettings = OPEN3D) -> None:
         self.open3d = _import_open3d()
         self.residual = residual
         self.settings = settings
         registration = self.open3d.pipelines.registration
-        self.register, self.estimation = _means(registration, residual)
+        self.register, self.estimation = _registration(registration, residual)
         self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
         self.previous: Any = None
         self.T_odom_lidar = np.eye(4)
@@ -52,10 +52,10 @@ class Open3dPairs:
 
     @property
     def description(self) -> str:
-        """What it does and with which parameters."""
+        """Method and parameters."""
         return (
             f"Open3D {self.register.__name__}, {self.residual}, scan to scan, voxels of "
-            f"{self.settings.voxel_size_m:g} m, pairs within {self.settings.max_distance_m:g} m, "
+            f"{self.settings.voxel_size_m:g} m, correspondences within {self.settings.max_distance_m:g} m, "
             f"{self.settings.max_iterations} iterations, constant velocity, no deskewing"
         )
 
@@ -89,8 +89,8 @@ class Open3dPairs:
         return cloud
 
 
-def _means(registration: Any, residual: Residual) -> tuple[Callable[..., Any], Any]:
-    """Open3D's function for a residual, and the estimation that it takes."""
+def _registration(registration: Any, residual: Residual) -> tuple[Callable[..., Any], Any]:
+    """Open3D's registration function for a residual, and its estimation object."""
     if residual == "plane-to-plane":
         return (
             registration.registration_generalized_icp,

@@ -31,10 +31,10 @@ Work = Callable[[Sequence[Task]], Iterator[Row]]
 
 
 class BatchProgress(Protocol):
-    """Whoever watches a batch."""
+    """Progress of a batch."""
 
     def say(self, line: str) -> None:
-        """Tell something that happens."""
+        """Show a line."""
         ...
 
     def count(self, done: int, total: int) -> None:
@@ -44,12 +44,12 @@ class BatchProgress(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What is to be run.
+    """Logs to run, and how.
 
     Attributes
     ----------
     logs : a file, folder or address each
-    out : the batch's directory, made or gone on with
+    out : the batch's directory, created or resumed
     config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
     workers : processes at a time on this machine
     time_s : what a log may take; memory_mib : as well, None for a fair share of what is free
@@ -77,7 +77,7 @@ class Batched:
 
     @property
     def failures(self) -> str:
-        """How many logs have no result, or one that is not reliable; empty where there are none."""
+        """Number of logs without a result or with an unreliable one, as text; empty if there are none."""
         absent = sum(not row.state.has_result for row in self.rows)
         unreliable = sum(row.state is State.UNRELIABLE for row in self.rows)
         parts = [f"{absent:,} of {len(self.rows):,} logs have no result"] if absent else []

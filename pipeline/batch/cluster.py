@@ -12,7 +12,7 @@ _NODE_LOSSES = 10  # of a task, before it counts as lost
 
 
 def on_cluster(address: str) -> Callable[[Sequence[Task]], Iterator[Row]]:
-    """Where tasks are run on a Ray cluster, one core each; those of a machine that dies are run on another.
+    """Worker that runs tasks on a Ray cluster, one core each; those of a machine that dies move to another.
 
     address : of the cluster's head, or "auto" for the one that this machine belongs to
     Raises MissingExtraError without Ray, InputError where no cluster answers.

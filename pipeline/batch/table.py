@@ -1,4 +1,4 @@
-"""batch.parquet: one row a log; summary.txt: how they ended, and why not."""
+"""batch.parquet, one row a log, and summary.txt."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
         + [(name, pa.float64()) for name in (*_FIGURES, *_ERRORS, "odometry_ate_rmse_m")]
     )
     notes = {
-        "warnings": "lines in the run's metrics.json on what was lost, left out or is wrong",
+        "warnings": "warnings in the run's metrics.json: data lost, skipped or wrong",
         "run": "directory of the result, beside this file; empty where there is none",
         "duration_s, peak_mib": "of the whole process of the last try",
         "ate_*, kitti_*": "against the ground truth in the log, after optimization; null without any",
@@ -63,7 +63,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """How many ended how, what all results amount to, each log without one, and each with warnings."""
+    """Totals, each log without a result and its reason, each log with warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
     lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
     lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
@@ -71,7 +71,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    """How many ended how, and what all results amount to: name and text."""
+    """Totals of a batch as pairs of name and text: states of the logs, scans, speed, ATE."""
     counts = Counter(row.state for row in rows)
     ended = ", ".join(f"{counts[state]:,} {state}" for state in State if counts[state])
     results = [row.metrics for row in rows if row.metrics is not None]
@@ -89,10 +89,10 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     scans, degenerate, lost = (
         sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
     )
-    way = _distance(sum(each.traveled_m for each in results))
+    path = _distance(sum(each.traveled_m for each in results))
     time = _duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
-    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {way} and {time}"
+    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {path} and {time}"
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimized.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:

@@ -24,7 +24,7 @@ ROWS_FOLDER = "rows"  # of a batch's directory: what became of each log
 
 
 class State(StrEnum):
-    """How a log ended."""
+    """End state of a log."""
 
     DONE = "done"
     UNRELIABLE = "unreliable"
@@ -36,7 +36,7 @@ class State(StrEnum):
 
     @property
     def has_result(self) -> bool:
-        """Whether there is a run directory, even if most of its scans are degenerate or lost."""
+        """True if there is a run directory, even if most of its scans are degenerate or lost."""
         return self in (State.DONE, State.UNRELIABLE)
 
 
@@ -75,17 +75,17 @@ class Task(Struct, frozen=True):
 
     @property
     def row_file(self) -> Path:
-        """What became of it, kept beside the run directory."""
+        """File of its row, beside the run directory."""
         return Path(self.out) / ROWS_FOLDER / f"{self.key}.json"
 
     @property
-    def said_file(self) -> Path:
-        """All that the last try said."""
-        return said_file(Path(self.out), self.key)
+    def output_file(self) -> Path:
+        """Output of the last try."""
+        return output_file(Path(self.out), self.key)
 
 
 class Row(Struct, frozen=True):
-    """What became of a log; ``peak_mib`` and ``duration_s`` are those of the last try's process."""
+    """Result of a log; ``peak_mib`` and ``duration_s`` are those of the last try's process."""
 
     log: str
     sha256: str
@@ -100,7 +100,7 @@ class Row(Struct, frozen=True):
 
     @property
     def warnings(self) -> int:
-        """How many lines its run says of what was lost, left out or is wrong."""
+        """Number of warnings of its run."""
         return 0 if self.metrics is None else len(self.metrics.warnings)
 
     def write(self, path: Path) -> None:
@@ -111,8 +111,8 @@ class Row(Struct, frozen=True):
         new.replace(path)
 
 
-def said_file(out: Path, key: str) -> Path:
-    """Where a batch keeps all that the last try of a log said."""
+def output_file(out: Path, key: str) -> Path:
+    """File with the output of the last try of a log."""
     return out / ROWS_FOLDER / f"{key}.txt"
 
 
@@ -127,7 +127,7 @@ def finished_row(task: Task) -> Row | None:
 
 
 def unfinished_row(task: Task, state: State, reason: str) -> Row:
-    """The row of a task without a process to tell of."""
+    """Row of a task that was not run."""
     return Row(task.name, task.sha256, task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
@@ -140,7 +140,7 @@ def key_of(sha256: str, config_file: Path | None, overrides: Sequence[Override])
 
 _LOOK_S = 0.1
 _SYSTEM_KILL = -9
-_WORDS = 300  # of what a process said last
+_LAST_CHARACTERS = 300  # of the output of a process that crashed
 _THREADS = tuple(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON"))
 
 
@@ -154,12 +154,12 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 def _tried(task: Task, stop: Event | None) -> Row:
     command = [sys.executable, "-P", "-m", "scanchain", "run", "--out", str(task.run), "--force", *task.arguments]
-    task.said_file.parent.mkdir(parents=True, exist_ok=True)
+    task.output_file.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
         [*command, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
-        output=task.said_file,
+        output=task.output_file,
         look_s=_LOOK_S,
         is_own_session=True,
         stop=stop,
@@ -177,7 +177,7 @@ def _metrics(task: Task) -> Metrics:
 
 
 def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
-    """How it ended, and why in words where it did not end well."""
+    """End state, and the reason if it failed."""
     match ending.killed_for:
         case KilledFor.MEMORY:
             gib = task.memory_mib / 1024.0
@@ -191,10 +191,10 @@ def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
 
 
 def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
-    """What the exit code and what it said mean."""
+    """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    said = task.said_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(said) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         unreliable = _metrics(task).unreliable
@@ -204,5 +204,5 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:
         return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(said).split())[-_WORDS:]
+    last = " ".join(" ".join(said).split())[-_LAST_CHARACTERS:]
     return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")

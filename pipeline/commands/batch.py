@@ -21,35 +21,41 @@ _DAY_S = 86_400.0
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to make, or to go on with.")
+@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create, or to resume.")
 @click.option(
-    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="A list of logs, one a line."
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
 )
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic of every log; found where only one fits.")
-@click.option(
-    "--start", metavar="SECONDS", help="Leave out what comes before, counted from a log's first message."
-)
-@click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic of every log. [default: the only one that fits]")
+@click.option("--start", metavar="SECONDS", help="Skip each log up to this time, counted from its first message.")
+@click.option("--end", metavar="SECONDS", help="Skip each log after this time.")
 @click.option("--every", metavar="N", help="Take every N-th scan.")
 @click.option(
     "--matcher",
     metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.registration.Matcher).",
+    help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
-@click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
+@click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
 @click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
-@click.option("--workers", type=click.IntRange(1), metavar="N", help="Logs at a time. [default: one a core]")
+@click.option(
+    "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
+)
 @click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
-@limit_options("a log", time_default="a day", memory_default="its share of three quarters of what is free")
+@limit_options("a log", time_default="a day", memory_default="an equal share of three quarters of the free memory")
 @click.option(
     "--retries",
     type=click.IntRange(0),
     default=1,
     show_default=True,
-    help="Further tries of a log that crashed its process.",
+    help="Retries of a log whose process crashed.",
 )
-@click.option("--rerun", type=click.Choice(["save", "off"]), default="off", show_default=True, help="Recordings.")
+@click.option(
+    "--rerun",
+    type=click.Choice(["save", "off"]),
+    default="off",
+    show_default=True,
+    help="Whether runs write a recording.",
+)
 @click.pass_context
 def batch(
     ctx: click.Context,
@@ -66,13 +72,14 @@ def batch(
     gt: str | None,
     **shortcuts: str | bool | None,
 ) -> None:
-    """Run many logs, each in a process of its own.
+    """Run many logs, each in its own process.
 
-    LOG is a file, folder or address that scanchain run takes, or a pattern in quotes. A log that crashes its
-    process, hangs or takes all memory is a row that says so; the others finish, and the exit code is 1. Called
-    again, only what has no result is run: a result belongs to the log's contents (of a remote log: its address,
-    size and version) and the configuration in effect. DIR gets a run directory a log, batch.parquet with a row a
-    log, report.html and summary.txt. Logs whose topics differ go into calls of their own, each with its --topic.
+    LOG is a file, folder or address that scanchain run takes, or a quoted glob pattern. A log whose process
+    crashes, hangs or runs out of memory becomes a row that says so; the others finish, and the exit code is 1.
+    Called again, batch runs only the logs that have no result yet. A result belongs to the contents of the log (of
+    a remote one: its address, size and version) and the effective configuration. DIR gets a run directory per log,
+    batch.parquet with a row per log, report.html and summary.txt. Logs with different lidar topics need separate
+    calls, each with its --topic.
 
     \b
     Examples:

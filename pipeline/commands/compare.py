@@ -16,22 +16,24 @@ _PATH = click.Path(path_type=Path)
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--methods", metavar="LIST", help="Names with commas. [default: all that make sense for the log]")
+@click.option("--methods", metavar="LIST", help="Comma-separated names. [default: all that apply to the log]")
 @click.option(
     "--matcher",
     metavar="MODULE:CLASS",
     default="",
-    help="Compare odometry by a matcher of yours as well, row CLASS.",
+    help="Compare odometry with your own matcher as well, row CLASS.",
 )
-@click.option("--out", metavar="DIR", type=_PATH, help="Directory to make. [default: runs/compare-LOG]")
+@click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
-@click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
-@click.option("--settings", metavar="FILE", type=_PATH, help="TOML: a table of settings a method.")
 @click.option(
-    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, in turn."
+    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
-@limit_options("a run", time_default="300 and one a scan", memory_default="three quarters of what is free")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--settings", metavar="FILE", type=_PATH, help="TOML file with a table of settings per method.")
+@click.option(
+    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
+)
+@limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
 @click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
 @click.pass_context
@@ -51,20 +53,21 @@ def compare(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Run several odometries over the same decoded scans: accuracy, speed, memory, a report, a recording.
+    """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
-    Every method has a process of its own; one that crashes, hangs or takes all memory is a row that says so, and
-    the exit code is 1. Ours get no wheel odometry unless --odometry.prior auto says so, since no other has it.
+    Writes tables, report.html and a rerun recording. Every method runs in its own process; one that crashes, hangs
+    or runs out of memory becomes a row that says so, and the exit code is 1. Our methods use no wheel odometry
+    unless --odometry.prior is auto, since the others have none.
 
     \b
     Methods:
-      plicp, svd               ours, odometry alone
-      plicp+loops, svd+loops   ours, loops closed
+      plicp, svd               ours, odometry only
+      plicp+loops, svd+loops   ours, with loop closures
       CLASS, CLASS+loops       ours with the matcher of --matcher MODULE:CLASS
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
-    A table of --settings sets a method, or makes a variant of one, or of a class of yours with the verb of
-    scanchain.baselines.Baseline:
+      my_module:MyOdometry     your own class, with the methods of scanchain.baselines.Baseline
+    A table of --settings changes the settings of a method, or defines a variant of one under another name:
 
     \b
       [kiss-icp]
@@ -85,12 +88,12 @@ def compare(
     """
     from scanchain.api import present_comparison
     from scanchain.commands.terminal import Terminal
-    from scanchain.comparison.compare import Contest
-    from scanchain.comparison.compare import compare as run_contest
+    from scanchain.comparison.compare import Comparison
+    from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.table import TABLE_FILE, text
 
     truth_file, truth_topic = ground_truth(gt)
-    contest = Contest(
+    comparison = Comparison(
         logs=logs,
         out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
@@ -106,9 +109,9 @@ def compare(
         command=tuple(sys.argv),
     )
     with Terminal("scans") as terminal:
-        compared = run_contest(contest, present_comparison, terminal)
+        compared = run_comparison(comparison, present_comparison, terminal)
     click.echo((compared.path / TABLE_FILE).read_text() if as_json else text(compared.table), nl=False)
     if not as_json:
-        click.echo(f"written {contest.out}: report.html, compare.rrd, tables")
+        click.echo(f"written {comparison.out}: report.html, compare.rrd, tables")
     if compared.failures:
-        raise ScanchainError(f"did not come to their end: {', '.join(compared.failures)}; the table says how")
+        raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; the table says why")

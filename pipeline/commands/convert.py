@@ -20,8 +20,10 @@ _KEYS = tuple(
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
-@click.option("--rate", metavar="HZ", help="Short for --log.rate_hz.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic, to keep one of several lidars.")
+@click.option(
+    "--rate", metavar="HZ", help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz."
+)
+@click.option("--topic", metavar="TOPIC", help="Lidar topic to keep, of several lidars.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
@@ -34,7 +36,7 @@ def convert(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Write a log of another format as MCAP. The other commands take all of these as they are, too.
+    """Convert a log of another format to MCAP. The other commands read all of these formats directly, too.
 
     \b
     SRC is one of
@@ -49,8 +51,8 @@ def convert(
                           --log.rate_hz
       a format of yours   read by a class of your own, --log.format my_module:MyFormat
 
-    Messages stay as they are. Keys that choose some: --topic (one of several lidars), --log.start_s,
-    --log.end_s, --log.every.
+    Messages are copied unchanged. A part of them is selected by --topic (one of several lidars), --log.start_s,
+    --log.end_s and --log.every.
 
     \b
     Examples:

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def doctor(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
-    """Look at every scan of a log: what is wrong, what it does to the result, and the flags that help.
+    """Check every scan of a log: problems, their effect on the result, and the flags that fix them.
 
-    Takes any key of the configuration as a run does, so that you can try whether a flag removes what was found.
+    Any configuration key is a flag, as for scanchain run, so that a fix can be tried.
 
     \b
     Examples:

@@ -28,13 +28,15 @@ _PATH = click.Path(path_type=Path)
 @click.command(cls=OnceCommand)
 @click.argument("estimate", metavar="EST.tum", type=_PATH)
 @click.argument("reference", metavar="[GT]", required=False, type=_PATH)
-@click.option("--relations", metavar="FILE", type=_PATH, help="Relative poses set by hand (Kümmerle et al. 2009).")
+@click.option(
+    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
+)
 @click.option(
     "--align",
     type=click.Choice(["rigid", "first", "none"]),
     default="rigid",
     show_default=True,
-    help="How the frames are brought together for the ATE.",
+    help="Alignment of the estimate to the ground truth for the ATE.",
 )
 @max_gap_option
 @click.option(
@@ -42,7 +44,7 @@ _PATH = click.Path(path_type=Path)
     default="1pose,1s,10m,100m",
     show_default=True,
     metavar="LIST",
-    help="Stretches of the RPE: poses, seconds or meters, with commas.",
+    help="Intervals of the RPE in poses, seconds or meters, comma-separated.",
 )
 @click.option("--kitti", is_flag=True, help="Both files are KITTI's, 12 numbers a line; poses pair line by line.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
@@ -56,7 +58,7 @@ def evaluate(
     kitti: bool,
     as_json: bool,
 ) -> None:
-    """Print ATE, RPE, the KITTI metric and the error over relations, each with its definition.
+    """Print ATE, RPE, KITTI metric and error over relations, each with its definition.
 
     Give the ground truth, or --relations, or both. GT is a TUM file, interpolated at the stamps of EST (positions
     linear, rotations by SLERP, nothing extrapolated), or a KITTI file with one row a pose of EST.
@@ -76,7 +78,7 @@ def evaluate(
     results = Results({}, {})
     if reference is not None:
         truth = read_kitti(reference) if kitti else read_truth(reference).at(trajectory.stamps_ns)
-        results = _against(trajectory, truth, align, max_gap, _stretches(rpe))
+        results = _against(trajectory, truth, align, max_gap, _intervals(rpe))
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     for warning in results.warnings:
@@ -86,7 +88,7 @@ def evaluate(
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """What was computed, by name, and what could not be, with the reason.
+    """Metrics by name: those computed, and the reason for each that could not be.
 
     ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
     """
@@ -98,19 +100,19 @@ class Results:
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """What an RPE is taken over: so many ``pose``, ``s`` or ``m``."""
+class Interval:
+    """Interval of an RPE in ``pose``, ``s`` or ``m``."""
 
     size: float
     unit: str
 
     @property
     def name(self) -> str:
-        """Of its figures."""
+        """Key of its figures."""
         return f"rpe_{self.size:g}_{self.unit}"
 
     def error(self, pairs: Pairs) -> RelativeError:
-        """Raises InputError where it does not fit."""
+        """The RPE over it. Raises InputError where the trajectory is too short."""
         from scanchain import evaluation as metrics
 
         if self.unit == "pose":
@@ -120,27 +122,27 @@ class Stretch:
         return metrics.relative_error_over_distance(pairs, self.size)
 
 
-_STRETCH = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
+_INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 
 
-def _stretches(text: str) -> list[Stretch]:
-    """Of ``1pose,0.5s,10m``."""
-    found = [(word, _STRETCH.fullmatch(word.strip())) for word in text.split(",")]
+def _intervals(text: str) -> list[Interval]:
+    """Intervals of a list such as ``1pose,0.5s,10m``."""
+    found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
     for word, match in found:
         if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
             raise InputError(f"--rpe has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
-    return [Stretch(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
+    return [Interval(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
 
 
 def _against(
-    trajectory: Trajectory, reference: Trajectory, align: str, gap_s: float | None, stretches: list[Stretch]
+    trajectory: Trajectory, reference: Trajectory, align: str, gap_s: float | None, intervals: list[Interval]
 ) -> Results:
     """Every metric that the trajectories allow."""
     from scanchain.evaluation import Alignment, absolute_error, kitti_error_on_any_course, pair
 
     pairs = pair(trajectory, reference, gap_s=gap_s)
     metrics: dict[str, Callable[[], Result]] = {
-        **{stretch.name: partial(stretch.error, pairs) for stretch in stretches},
+        **{interval.name: partial(interval.error, pairs) for interval in intervals},
         "kitti": partial(kitti_error_on_any_course, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
-    """Print what is in a log: topics, types, rates, and what a run with the same flags would use.
+    """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
     \b
     Examples:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     required=True,
     metavar="DIR",
     type=click.Path(path_type=Path),
-    help="Directory to write; must not exist.",
+    help="Directory to create.",
 )
 @click.option(
     "--methods",
@@ -36,33 +36,35 @@ if TYPE_CHECKING:
     default="schur",
     show_default=True,
     metavar="NAME,...",
-    help="Linear solvers: one to solve by, several (or all) to compare.",
+    help="Linear solvers: one to solve with, several (or all) to compare.",
 )
 @click.option(
-    "--repeat", type=click.IntRange(1, 1000), default=3, show_default=True, help="Timed rounds; medians are told."
+    "--repeat",
+    type=click.IntRange(1, 1000),
+    default=3,
+    show_default=True,
+    help="Timed repetitions; the median is reported.",
 )
-@click.option(
-    "--robot", type=click.IntRange(1), default=1, show_default=True, help="Whose log of an MRCLAM folder."
-)
+@click.option("--robot", type=click.IntRange(1), default=1, show_default=True, help="Robot of an MRCLAM folder.")
 @click.option(
     "--odometry-noise",
     "noise",
     metavar="FORWARD,SIDEWAYS,DRIFT,TURN",
-    help="Of an MRCLAM robot after a meter: m, m, rad; after a radian: rad. [default: estimated]",
+    help="Standard deviations of an MRCLAM robot: m, m, rad per meter; rad per radian. [default: estimated]",
 )
 @click.option(
     "--guess",
     type=click.Choice(["odometry", "disturbed", "origin"]),
     default="odometry",
     show_default=True,
-    help="Where a nonlinear file begins: disturbed by 1 m and 0.5 rad, or with all landmarks at the origin.",
+    help="Initial guess of a nonlinear file: odometry, disturbed by 1 m and 0.5 rad, or landmarks at the origin.",
 )
 @click.option(
     "--optimizer",
     type=click.Choice(["levenberg-marquardt", "gauss-newton", "dogleg", "gradient-descent"]),
     default="levenberg-marquardt",
     show_default=True,
-    help="Of a nonlinear file.",
+    help="Optimizer for a nonlinear file.",
 )
 @click.option(
     "--recording", metavar="FILE.rrd", type=click.Path(path_type=Path), help="Record before and after for rerun."
@@ -84,14 +86,14 @@ def landmarks(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Solve landmark problems and, where several are named, compare linear solvers on them.
+    """Solve landmark SLAM problems, and compare linear solvers on them.
 
-    DATA is an npz problem of the course (linear, or of bearings and ranges), or a folder of the UTIAS MRCLAM data
-    sets, of which one robot's log is used. The estimate goes to DIR with pictures, and report.html holds them all.
+    DATA is an npz file with a linear problem or with bearing and range measurements, or a folder of the UTIAS
+    MRCLAM data sets, of which the log of one robot is used. Estimates, pictures and report.html go to DIR.
 
     Methods: default, pinv (below 3,000 unknowns), lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them;
-    with the package sparseqr also spqr and spqr_colamd. A robot's log is always estimated by schur, the others are
-    compared on its linear system.
+    with the package sparseqr also spqr and spqr_colamd. The log of a robot is always estimated by schur; the
+    others are compared on its linear system.
 
     \b
     Examples:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from scanchain.commands.graph_answer import Answer
+from scanchain.commands.graph_report import GraphReport
 from scanchain.commands.options import OverrideCommand, alias, check_output, overrides
 from scanchain.errors import InputError, told
 from scanchain.settings import Override, load_settings
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scanchain.graph.initialize import Initialization
 
 _PATH = click.Path(path_type=Path)
-_WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
+_INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
@@ -33,30 +33,32 @@ _WAYS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 @click.option("--optimizer", metavar="NAME", help="Short for --graph.optimizer.")
 @click.option(
     "--initialize",
-    type=click.Choice(_WAYS),
+    type=click.Choice(_INITIALIZATIONS),
     default="auto",
     show_default=True,
-    help="First guess; auto takes the file's, or the chordal one where that is poor.",
+    help="Initial guess; auto takes the file's, or the chordal one if that is poor.",
 )
 @click.option(
     "--robust",
     metavar="KERNEL",
-    help="Suspect edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: trust all]",
+    help="Robust loss of edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: none]",
 )
 @click.option(
     "--indefinite",
     type=click.Choice(("project", "refuse")),
     default="project",
     show_default=True,
-    help="Information matrices that are not positive semidefinite: put the nearest one that is in place, or stop.",
+    help="Information matrices that are not positive semidefinite: project to the nearest that is, or refuse.",
 )
 @click.option(
     "--marginals",
     metavar="all|IDS",
-    help="Covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
+    help="Write marginal covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
 )
-@click.option("--png", metavar="FILE", type=_PATH, help="Draw the graph before and after to a picture.")
-@click.option("--recording", metavar="FILE.rrd", type=_PATH, help="Record the graph before and after for rerun.")
+@click.option("--png", metavar="FILE", type=_PATH, help="Draw the graph before and after optimization.")
+@click.option(
+    "--recording", metavar="FILE.rrd", type=_PATH, help="Record the graph before and after optimization."
+)
 @click.option("--force", is_flag=True, help="Replace files that exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
@@ -73,12 +75,12 @@ def optimize(
     as_json: bool,
     **shortcuts: str | None,
 ) -> None:
-    """Optimize a pose graph and say whether the minimum is the global one.
+    """Optimize a pose graph and certify whether the minimum is global.
 
-    GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO one. The certificate bounds the χ² of any other poses from
-    below. Edges that --robust rejects count in no χ²: --out FILE.g2o holds the edges in force, each with its
-    robust weight in its information matrix, and FILE_rejected.g2o the rejected ones, if there are any. Poses that
-    did not converge are written all the same, and the exit code is 1.
+    GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO file. The certificate is a lower bound of χ² over all poses.
+    Edges rejected by --robust count in no χ²: --out FILE.g2o holds the edges in force, with their robust weights
+    in their information matrices, and FILE_rejected.g2o the rejected ones, if any. Poses that did not converge are
+    written all the same, and the exit code is 1.
 
     \b
     Examples:
@@ -93,16 +95,16 @@ def optimize(
     config = _config(settings)
     is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     file = _read(source, cast("Indefinite", indefinite), is_suspicious)
-    answer = _solved(file, source.name, config, cast("Initialization", initialize))
-    written = outputs.write(answer)
-    click.echo(answer.json(written) if as_json else answer.text(written))
-    if not answer.optimization.converged:
+    report = _solved(file, source.name, config, cast("Initialization", initialize))
+    written = outputs.write(report)
+    click.echo(report.json(written) if as_json else report.text(written))
+    if not report.optimization.converged:
         ctx.exit(1)
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The files to write, and the poses whose covariances are wanted."""
+    """Files to write, and the poses whose covariances are requested."""
 
     graph: Path | None
     marginals: str | None
@@ -111,23 +113,23 @@ class Outputs:
 
     @property
     def table(self) -> Path | None:
-        """Where the covariances go."""
+        """File of the covariances."""
         return self.graph.with_suffix(".marginals.csv") if self.graph and self.marginals else None
 
     @property
     def paths(self) -> list[Path]:
-        """Every file that is wanted."""
+        """Every requested file."""
         return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
 
     @property
     def rejected(self) -> Path | None:
-        """Where the edges go that are not in force, if there are any."""
+        """File of the rejected edges, written if there are any."""
         from scanchain.graph.files.g2o_write import rejected_path
 
         return rejected_path(self.graph) if self.graph else None
 
     def check(self, force: bool) -> None:
-        """Refuse before the work what could not be written after it."""
+        """Refuse, before the work, files that could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
         from scanchain.graph.files.g2o_write import GRAPH_SUFFIXES
@@ -136,12 +138,12 @@ class Outputs:
         for path in (*self.paths, *filter(None, [self.rejected])):
             check_output(path, force=force, endings=endings.get(path, ()))
 
-    def write(self, answer: Answer) -> list[Path]:
-        """Write them all; which those are."""
+    def write(self, report: GraphReport) -> list[Path]:
+        """Write them all and return their paths."""
         from scanchain.graph.files.covariance_table import chosen_poses, write_covariances
         from scanchain.graph.files.g2o_write import write_graph
 
-        file = answer.file
+        file = report.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
         written = self.paths
         if self.graph is not None and self.rejected is not None:
@@ -151,7 +153,7 @@ class Outputs:
                 if file.graph.is_rejected.any():
                     write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
                     written.insert(1, self.rejected)
-                else:  # of an earlier answer, whose place --force gave away
+                else:  # of an earlier report, whose place --force gave away
                     self.rejected.unlink(missing_ok=True)
         if self.table is not None:
             with _written(self.table):
@@ -160,18 +162,18 @@ class Outputs:
             from scanchain.viz.pictures.graph import draw_graph
 
             with _written(self.picture):
-                draw_graph(answer.change, self.picture)
+                draw_graph(report.change, self.picture)
         if self.recording is not None:
             from scanchain.viz.recording.graph import record_graph
 
             with _written(self.recording):
-                record_graph(answer.change, self.recording)
+                record_graph(report.change, self.recording)
         return written
 
 
 @contextmanager
 def _written(path: Path) -> Generator[None]:
-    """Say which file could not be written, and what to do."""
+    """Name the file that could not be written, and the remedy."""
     try:
         yield
     except OSError as error:
@@ -181,7 +183,7 @@ def _written(path: Path) -> Generator[None]:
 
 
 def _aliases(options: dict[str, str | None]) -> list[Override]:
-    """The keys that the short options stand for."""
+    """Configuration keys set by the short options."""
     return [each for name, value in options.items() for each in alias(f"graph.{name}", value, f"--{name}")]
 
 
@@ -201,12 +203,12 @@ def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
         warnings.simplefilter("ignore")
         file = read_g2o(source, loops="suspect" if is_suspicious else "trusted", indefinite=indefinite)
     if file.projection is not None:
-        remedy = "mend what wrote them, or stop here with --indefinite refuse"
+        remedy = "fix the program that wrote them, or stop here with --indefinite refuse"
         click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)
     return file
 
 
-def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initialization) -> Answer:
+def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initialization) -> GraphReport:
     """Optimize and certify."""
     from scanchain.graph.optimization import GraphChange
 
@@ -214,4 +216,4 @@ def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initializ
     done = file.graph.optimize(config, initialize=initialize)
     change = GraphChange(name, before, done.state)
     free, weak = file.graph.free_poses(), file.graph.weakly_joined()
-    return Answer(file, change, done, free, weak, file.graph.certify())
+    return GraphReport(file, change, done, free, weak, file.graph.certify())

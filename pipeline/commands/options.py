@@ -16,7 +16,7 @@ from scanchain.source import Source, source_of
 
 
 class OnceCommand(click.Command):
-    """Refuses an option given twice that holds one value: the last would win without a word."""
+    """Command that refuses a single-valued option given twice; click would silently take the last."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments once for what is named twice, then as usual."""
@@ -32,7 +32,7 @@ def _holds_one_value(option: click.Option) -> bool:
 
 
 class OverrideCommand(OnceCommand):
-    """Takes any configuration key as ``--section.key value``.
+    """Command that takes any configuration key as ``--section.key value``.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
     """
@@ -78,7 +78,7 @@ def overrides(ctx: click.Context, aliases: Sequence[Override] = ()) -> tuple[Ove
 
 
 def alias(key: str, value: Any, flag: str) -> tuple[Override, ...]:
-    """The key that an option of its own sets, none where the option was not given."""
+    """Override of the key that an option sets; empty if the option was not given."""
     return () if value is None else (Override(key, str(value), flag),)
 
 
@@ -89,7 +89,7 @@ class _LogType(click.ParamType):
     name = "log"
 
     def convert(self, value: str | Source, param: click.Parameter | None, ctx: click.Context | None) -> Source:
-        """What a word names."""
+        """Path or address that a word stands for."""
         return source_of(value)
 
 
@@ -103,7 +103,7 @@ def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
-        help="Between true poses to interpolate. [default: five times their usual interval, at most 0.6]",
+        help="Longest gap between true poses to interpolate. [default: 5 times their usual interval, at most 0.6]",
     )(command)
 
 
@@ -139,7 +139,7 @@ class _MemoryType(click.ParamType):
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
     """``--time-limit`` as ``time_limit`` in seconds, ``--memory-limit`` as ``memory_mib``; None where not given.
 
-    what : that is limited; time_default, memory_default : what holds otherwise, in words
+    what : the thing limited, in words; time_default, memory_default : the defaults, in words
     """
 
     def decorate(command: Any) -> Any:
@@ -149,13 +149,13 @@ def limit_options(what: str, *, time_default: str, memory_default: str) -> Calla
                 "memory_mib",
                 type=_MemoryType(),
                 metavar="GIB",
-                help=f"What {what} may take. [default: {memory_default}]",
+                help=f"Memory limit of {what}. [default: {memory_default}]",
             ),
             click.option(
                 "--time-limit",
                 type=_ABOVE_ZERO,
                 metavar="SECONDS",
-                help=f"What {what} may take. [default: {time_default}]",
+                help=f"Time limit of {what}. [default: {time_default}]",
             ),
         ):
             command = option(command)

@@ -24,10 +24,10 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 @click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to make."
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to create."
 )
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic; found by itself where only one fits.")
+@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
 @click.option(
     "--rerun",
     default="save",
@@ -35,28 +35,26 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@click.option(
-    "--start", metavar="SECONDS", help="Leave out what comes before, counted from the log's first message."
-)
-@click.option("--end", metavar="SECONDS", help="Leave out what comes after.")
+@click.option("--start", metavar="SECONDS", help="Skip the log up to this time, counted from its first message.")
+@click.option("--end", metavar="SECONDS", help="Skip the log after this time.")
 @click.option("--every", metavar="N", help="Take every N-th scan.")
 @click.option(
     "--matcher",
     metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or a class of yours (scanchain.registration.Matcher).",
+    help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
-@click.option("--no-loops", is_flag=True, help="Odometry alone: no loop closures.")
+@click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
 @click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @max_gap_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
-@click.option("--resume", is_flag=True, help="Go on from the last checkpoint of a run that was killed or stopped.")
+@click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
     type=click.FloatRange(0.0),
     default=10.0,
     show_default=True,
     metavar="SECONDS",
-    help="Time between checkpoints; at most a twentieth of it goes into them.",
+    help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context
@@ -74,11 +72,11 @@ def run(
     as_json: bool,
     **shortcuts: str | bool | None,
 ) -> None:
-    """Make a trajectory, a map and a recording of a log.
+    """Compute the trajectory and the map of a log, with a rerun recording.
 
-    LOG is an MCAP file, anything that scanchain convert takes, or the address of such a file: of an MCAP at https://
-    or s3:// only the parts are fetched that are read. Several are read as one log. Any key of the configuration is
-    a flag, see scanchain config show.
+    LOG is an MCAP file, any other format that scanchain convert reads, or the address of one: of an MCAP at
+    https:// or s3:// only the parts that are read are downloaded. Several files are read as one log. Any
+    configuration key is a flag; scanchain config show lists them.
 
     \b
     Examples:
@@ -123,7 +121,7 @@ def run(
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
     if finished.stopped:
         again = how_to_resume(job.command)
-        raise ScanchainError(f"{finished.stopped}; what there is lies in {finished.path}; {again}")
+        raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
     if not as_json:
         click.echo(f"written        {out}")
     if unreliable:
@@ -134,7 +132,7 @@ _KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "ever
 
 
 def aliases(options: dict[str, str | bool | None]) -> list[Override]:
-    """The keys that the short options stand for."""
+    """Configuration keys set by the short options."""
     keys = _KEYS | {"matcher": "matching.matcher"}
     result = [each for name, key in keys.items() for each in alias(key, options.get(name), f"--{name}")]
     if options.get("no_loops"):
@@ -143,7 +141,7 @@ def aliases(options: dict[str, str | bool | None]) -> list[Override]:
 
 
 def _sinks(text: str) -> frozenset[SinkName]:
-    """Where the recording goes, from ``save,spawn``."""
+    """Destinations of the recording, from a list such as ``save,spawn``."""
     words = [word.strip() for word in text.split(",")]
     if words == ["off"]:
         return frozenset()

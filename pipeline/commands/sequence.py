@@ -12,7 +12,7 @@ from scanchain.commands.options import OnceCommand
 
 @click.group()
 def sequence() -> None:
-    """Logs that are known by name: simulated ones and published ones.
+    """Catalog of logs known by name, simulated and published.
 
     \b
     Examples:
@@ -53,14 +53,14 @@ def list_sequences(as_json: bool) -> None:
     show_default=True,
     metavar="DIR",
     type=click.Path(path_type=Path),
-    help="Where to.",
+    help="Folder of the log.",
 )
-@click.option("--force", is_flag=True, help="Make it again even if it is there.")
+@click.option("--force", is_flag=True, help="Make it again even if it exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
-    """Make a log of the catalog, or fetch and convert it, unless it is there, and print where it lies.
+    """Simulate a log of the catalog, or download and convert it, unless it exists, and print its path.
 
-    A download that was broken off goes on where it was. Of recordings that ask for an account it says what to do.
+    An interrupted download is resumed. For recordings that require an account, the steps are printed.
 
     \b
     Examples:

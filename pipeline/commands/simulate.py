@@ -14,12 +14,20 @@ from scanchain.words import counted
 @click.command(cls=OnceCommand)
 @click.argument("world", metavar="WORLD")
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
-@click.option("--seed", default=0, show_default=True, metavar="N", help="The same seed, the same bytes.")
-@click.option("--duration", type=float, metavar="SECONDS", help="How long to drive. [default: the world's]")
-@click.option("--sensor", metavar="NAME", help="lms-270, utm-30, hdl-64, os1-32, vlp-16, rosette.")
-@click.option("--drift", default=1.0, show_default=True, metavar="FACTOR", help="Errors of the wheel odometry.")
-@click.option("--noise", type=float, metavar="METERS", help="Standard deviation of a range.")
-@click.option("--dropout", type=float, metavar="SHARE", help="Share of returns that are lost.")
+@click.option(
+    "--seed", default=0, show_default=True, metavar="N", help="Random seed; the same seed gives the same bytes."
+)
+@click.option("--duration", type=float, metavar="SECONDS", help="Length of the drive. [default: the world's]")
+@click.option("--sensor", metavar="NAME", help="Lidar: lms-270, utm-30, hdl-64, os1-32, vlp-16 or rosette.")
+@click.option(
+    "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
+)
+@click.option(
+    "--noise", type=float, metavar="METERS", help="Standard deviation of the ranges. [default: the sensor's]"
+)
+@click.option(
+    "--dropout", type=float, metavar="SHARE", help="Share of returns that are lost. [default: the sensor's]"
+)
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
     world: str,
@@ -41,10 +49,10 @@ def simulate(
       rounds     the town without parked cars, its streets driven again both ways
       identical  corridors and rooms that all look alike, 2D laser scanner
       highway    guard rails and signs at 25 m/s, from the first scan on
-      corridor   80 m between bare walls: along it nothing is seen but at its ends
-      field      flat, a few poles far apart: between them nothing is seen but the ground
+      corridor   80 m between bare walls: motion along it is unobservable but at its ends
+      field      flat, a few poles far apart: between them only the ground is visible
       forest     trunks and crowns on rough ground
-      staircase  four storys, walked with the lidar in the hand
+      staircase  four stories, walked with a handheld lidar
       hall       flat floor, few pillars, from standstill to 5 m/s
       turns      turns on the spot at 120 deg/s and short moves in a yard
       gap        the town, but one second of scans is missing in a bend, and one on a straight

@@ -17,11 +17,11 @@ from scanchain.errors import InputError
     "--png",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Draw trajectory, ground truth and map to a picture.",
+    help="Draw trajectory, ground truth and map to a PNG instead.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing picture.")
 def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
-    """Open the recording of a run in the rerun viewer, or draw its map without one.
+    """Open the recording of a run in the rerun viewer, or draw its map to a picture.
 
     DIR is a run directory, or a .rrd file.
 

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 
 class Figures(Struct, frozen=True):
-    """What a row of the table holds; errors are None without ground truth or relations, or after a failure."""
+    """A row of the table; errors are None without ground truth or relations, or after a failure."""
 
     ate_m: float | None = None
     ate_share: float | None = None
@@ -50,7 +50,7 @@ class Shown(Struct, frozen=True):
 
 
 class Column(Struct, frozen=True):
-    """How a figure is shown.
+    """Presentation of a figure.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Column(Struct, frozen=True):
 
     @property
     def heading(self) -> str:
-        """What, and in which unit."""
+        """Head with its unit."""
         return f"{self.head} [{self.unit}]" if self.unit else self.head
 
     def of(self, figures: Figures) -> float | None:
@@ -148,7 +148,14 @@ COLUMNS = (
         "share of the scans that have a true pose, interpolated or not",
     ),
     Column(
-        "relations_m", "relations", "m", 1.0, 4, "low", "summary", "mean absolute error over relations set by hand"
+        "relations_m",
+        "relations",
+        "m",
+        1.0,
+        4,
+        "low",
+        "summary",
+        "mean absolute error over manually verified relations",
     ),
     Column("relations_rad", "relations", "deg", _DEGREES, 3, "low", "summary", "the same, of the angle"),
     Column(
@@ -162,9 +169,9 @@ COLUMNS = (
         2,
         "low",
         "summary",
-        "thickness of the map's surfaces; no ground truth",
+        "thickness of the map's surfaces; needs no ground truth",
     ),
-    Column("entropy", "entropy", "nats", 1.0, 3, "low", "accuracy", "mean map entropy; not ground truth either"),
+    Column("entropy", "entropy", "nats", 1.0, 3, "low", "accuracy", "mean map entropy; needs no ground truth"),
     Column(
         "disagreement_m",
         "to others",
@@ -173,7 +180,7 @@ COLUMNS = (
         1,
         "",
         "summary",
-        "median distance of a motion to that of the others",
+        "median distance of a motion to that of the other methods",
     ),
     Column("median_s", "time", "ms", 1e3, 2, "low", "summary", "median time of a scan, all but the first"),
     Column("p95_s", "p95", "ms", 1e3, 2, "low", "summary", "95th percentile of the same"),
@@ -184,13 +191,13 @@ COLUMNS = (
     Column("scans_per_s", "rate", "scans/s", 1.0, 1, "high", "time", "scans over the sum of their times"),
     Column(
         "preprocess_s",
-        "prepare",
+        "preprocess",
         "ms",
         1e3,
         2,
         "",
         "time",
-        "median of cropping and thinning out; ours alone tells",
+        "median of cropping and downsampling, reported by our methods only",
     ),
     Column("match_s", "match", "ms", 1e3, 2, "", "time", "median of matching"),
     Column("map_s", "map", "ms", 1e3, 2, "", "time", "median of extending the local map"),

@@ -1,4 +1,4 @@
-"""Figures of what methods did: against the truth, against relations, against each other, and by the clock."""
+"""Figures of methods: against ground truth and relations, and times."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Answer = TypeVar("Answer")
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A method against the truth, scan by scan.
+    """A method against the ground truth, scan by scan.
 
     Attributes
     ----------
-    figures : what it amounts to
+    figures : over all scans
     T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
         end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
@@ -85,15 +85,15 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def observability(outcome: Outcome) -> NDArray[np.float64]:
-    """(N,) as in ``Match``; empty where the method does not tell."""
+    """(N,) as in ``Match``; empty if the method does not report it."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return np.empty(0)
     return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
 
 
-def doubt(outcome: Outcome) -> str:
-    """Why a method of ours is not reliable by its own account; empty where it is, or where it does not tell."""
+def unreliable_by_itself(outcome: Outcome) -> str:
+    """Reason why a method of ours calls itself unreliable; empty if it does not, or reports no states."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return ""
@@ -105,7 +105,7 @@ def doubt(outcome: Outcome) -> str:
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
-    """Where a method that begins with the identity began."""
+    """True first pose of a method that begins with the identity."""
     if truth is None:
         return np.eye(4)
     try:
@@ -148,7 +148,7 @@ def _rmse_m(error: RelativeError | None) -> float | None:
 
 
 def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
-    """(N,) of the motion up to each scan; NaN where the method does not tell."""
+    """(N,) of the motion up to each scan; NaN if the method does not report covariances."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return np.full(len(outcome.seconds), np.nan)

@@ -1,4 +1,4 @@
-"""What can be compared: ours, the baselines, and whatever class a user brings; each with its settings."""
+"""Methods that can be compared: ours, the baselines, and classes of the user; each with its settings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Method(Struct, frozen=True):
     Attributes
     ----------
     name : what the tables call it
-    base : one of OURS or BASELINES, or MODULE:CLASS with the verb of a Baseline (in 2D of points (N, 2) and poses
+    base : one of OURS or BASELINES, or MODULE:CLASS with a Baseline's methods (in 2D of points (N, 2) and poses
         (3, 3)), which is given the settings as keywords
     settings : as TOML holds them; for ours the configuration but for what all methods share, by section
     """
@@ -49,12 +49,12 @@ class Method(Struct, frozen=True):
 
     @property
     def is_ours(self) -> bool:
-        """Whether it is this project's."""
+        """True for a method of this project."""
         return self.base in OURS
 
 
 def default_names(dimension: int) -> tuple[str, ...]:
-    """All that make sense for a log of this dimension."""
+    """Methods that apply to logs of this dimension."""
     ours = [name for name in OURS if name not in _ON_REQUEST]
     others = [
         name
@@ -124,7 +124,7 @@ def _method(
 
 
 def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
-    """Those of a baseline, by key."""
+    """Settings of a baseline, by key."""
     defaults = BASELINES[base].settings if dimension == 3 else BASELINES[base].planar
     if defaults is None:
         raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")

@@ -1,4 +1,4 @@
-"""What became of a method: its poses, its times, its memory, and how it ended."""
+"""Outcome of a method: its poses, times, memory, and how it ended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
 
 class Status(StrEnum):
-    """How a run of a method ended."""
+    """End state of a run of a method."""
 
     OK = "ok"
     MISSING = "not installed"
@@ -28,12 +28,12 @@ class Status(StrEnum):
 
     @property
     def is_failure(self) -> bool:
-        """Whether it began and did not end well."""
+        """True if it started and failed."""
         return self not in (Status.OK, Status.MISSING)
 
 
 class EndReport(Struct, frozen=True):
-    """What a method's process says of itself in the end.
+    """Report of a method's process.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Outcome:
     ----------
     report : how it ended
     odometry : (N, d+1, d+1) pose of each scan straight after it came; NaN from where it failed on
-    trajectory : the last word, equal to ``odometry`` but for loop closing; empty where it did not come to its end
+    trajectory : final poses, equal to ``odometry`` except with loop closures; empty if it did not finish
     seconds, cpu_seconds : (N,) tracking a scan, on the clock and spent by all threads; NaN like the poses
     folder : where its tables lie
     """
@@ -76,12 +76,12 @@ class Outcome:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every scan has a pose."""
+        """True if every scan has a pose."""
         return self.report.status is Status.OK
 
 
 def read_outcome(folder: Path, report: EndReport, stamps_ns: NDArray[np.int64], dimension: int) -> Outcome:
-    """What a run left in its folder, whole or not."""
+    """Outcome of a run from its folder, complete or not."""
     size = dimension + 1
     empty = np.full((len(stamps_ns), size, size), np.nan)
     odometry = np.load(folder / POSES_FILE) if (folder / POSES_FILE).exists() else empty

@@ -17,7 +17,7 @@ from scanchain.comparison.worker import METHOD_FILE
 from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # of the time limit
+_LEAST_S, _SCAN_S = 300.0, 1.0  # seconds of the default time limit: at least, and per scan
 _SHARE = 0.75  # of the memory that is free
 
 
@@ -29,7 +29,7 @@ def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Li
     )
 
 
-def race(
+def run_all(
     methods: Sequence[Method],
     scans: StoredScans,
     folder: Path,
@@ -47,7 +47,7 @@ def race(
                 continue
             outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
             if outcome.is_whole and outcome.report.has_compiled:
-                progress.say(f"{method.name}: compiled its kernels, once after the installation; run anew")
+                progress.say(f"{method.name}: compiled its kernels, once after the installation; run again")
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
             progress.say(_said(method.name, turn, repeat, outcome))
@@ -68,7 +68,7 @@ def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
 
 
 _LOOK_S = 0.02
-_WORDS = 300  # of what a process said last
+_LAST_CHARACTERS = 300  # of the output of a process that crashed
 _KILLED = -9
 
 
@@ -88,12 +88,12 @@ def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> En
         return _own_report(folder)
     if ending.code == _KILLED:
         return _ended(Status.OUT_OF_MEMORY, "killed, as the system does when memory runs out", ending, folder)
-    said = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_WORDS:]
+    said = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
     return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {said}" if said else ""), ending, folder)
 
 
 def _own_report(folder: Path) -> EndReport:
-    """What the process says of itself; of a failure also how far it came."""
+    """Report of the process itself, with the scan at which it failed."""
     report = msgspec.json.decode((folder / REPORT_FILE).read_bytes(), type=EndReport)
     if not report.status.is_failure:
         return report
@@ -101,12 +101,12 @@ def _own_report(folder: Path) -> EndReport:
 
 
 def _ended(status: Status, reason: str, ending: Ending, folder: Path) -> EndReport:
-    """What is said of a process that says nothing of itself."""
+    """Report of a process that left none."""
     return EndReport(status, f"{_where(folder)}: {reason}", peak_mib=ending.peak_mib)
 
 
 def _where(folder: Path) -> str:
-    """How far it came."""
+    """Stage at which it ended."""
     if not (folder / SECONDS_FILE).exists():
         return "while starting or warming up"
     seconds = np.load(folder / SECONDS_FILE)

@@ -32,7 +32,7 @@ METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tu
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What errors are against: poses, relations, both or nothing; ``note`` says what is missing."""
+    """Reference of the errors: poses, relations, both or none; ``note`` says what is missing."""
 
     truth: Trajectory | None
     relations: Relations | None
@@ -41,7 +41,7 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class Results:
     """All runs of all methods by name, what was found of each, and the map (M, d) of each that came to its end."""
 
     methods: Sequence[Method]
@@ -52,40 +52,40 @@ class Evidence:
     reference: Reference
 
 
-def write_evidence(folder: Path, evidence: Evidence) -> None:
+def write_results(folder: Path, results: Results) -> None:
     """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
-    write_scans(folder / SCANS_FILE, list(_runs(evidence)), evidence.scans.stamps_ns)
-    write_relations(folder / RELATIONS_FILE, evidence.judged)
-    if evidence.reference.truth is not None:
-        write_tum(folder / TRUTH_FILE, during(evidence.reference.truth, evidence.scans.stamps_ns))
-    settings = {method.name: {"method": method.base} | method.settings for method in evidence.methods}
+    write_scans(folder / SCANS_FILE, list(_runs(results)), results.scans.stamps_ns)
+    write_relations(folder / RELATIONS_FILE, results.judged)
+    if results.reference.truth is not None:
+        write_tum(folder / TRUTH_FILE, during(results.reference.truth, results.scans.stamps_ns))
+    settings = {method.name: {"method": method.base} | method.settings for method in results.methods}
     (folder / SETTINGS_FILE).write_text(tomli_w.dumps(settings), encoding="utf-8")
-    for method in evidence.methods:
-        _write_method(method_folder(folder, method.name), evidence, method.name)
+    for method in results.methods:
+        _write_method(method_folder(folder, method.name), results, method.name)
 
 
-def _runs(evidence: Evidence) -> Iterator[RunOfMethod]:
-    """Every run, judged by itself."""
-    stamps_ns, truth = evidence.scans.stamps_ns, evidence.reference.truth
-    for name, outcomes in evidence.outcomes.items():
+def _runs(results: Results) -> Iterator[RunOfMethod]:
+    """Every run with its own figures."""
+    stamps_ns, truth = results.scans.stamps_ns, results.reference.truth
+    for name, outcomes in results.outcomes.items():
         for repeat, outcome in enumerate(outcomes):
-            stands_for_all = outcome is representative(outcomes)
-            judged = evidence.judged[name] if stands_for_all else judge([outcome], stamps_ns, truth, None)
+            is_representative = outcome is representative(outcomes)
+            judged = results.judged[name] if is_representative else judge([outcome], stamps_ns, truth, None)
             yield RunOfMethod(name, repeat, outcome, judged)
 
 
 def method_folder(folder: Path, name: str) -> Path:
-    """Where the files of a method lie."""
+    """Folder of a method's files."""
     return folder / METHODS_FOLDER / quote(name, safe="+ ")
 
 
-def _write_method(own: Path, evidence: Evidence, name: str) -> None:
-    outcome, judged = representative(evidence.outcomes[name]), evidence.judged[name]
+def _write_method(own: Path, results: Results, name: str) -> None:
+    outcome, judged = representative(results.outcomes[name]), results.judged[name]
     own.mkdir(parents=True)
     if outcome.is_whole:
         write_tum(own / TRAJECTORY_FILE, outcome.trajectory)
-    if name in evidence.maps:
-        write_ply(own / MAP_FILE, picture_points(evidence.maps[name], judged))
+    if name in results.maps:
+        write_ply(own / MAP_FILE, picture_points(results.maps[name], judged))
     for file in (STEPS_FILE, CLOSURES_FILE, "output.txt"):
         source = outcome.folder / file
         if source.exists() and source.stat().st_size:
@@ -93,7 +93,7 @@ def _write_method(own: Path, evidence: Evidence, name: str) -> None:
 
 
 _NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar as the method has it in the end",
+    "x y z qx qy qz qw": "final T_world_lidar of the method",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
     "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
     "distance_m": "traveled up to the scan, by the method itself",
@@ -180,8 +180,8 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
 
 def picture_points(points: Points, judged: Judged) -> Points:
     """Some of a map's points (M, 3), in the frame of the ground truth where there is one."""
-    thinned = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
+    downsampled = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
     T = judged.T_reference_estimate
     if points.shape[1] == 2:
         T = lie.flatten(T)
-    return lie.transform(T, thinned)
+    return lie.transform(T, downsampled)

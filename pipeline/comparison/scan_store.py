@@ -88,7 +88,7 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScan
 
 
 def open_store(folder: Path) -> StoredScans:
-    """What ``store`` wrote."""
+    """The scans that ``store`` wrote."""
     with np.load(folder / _TABLE) as table:
         first_point, points, first_time, times, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
         return StoredScans(

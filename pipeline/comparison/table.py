@@ -14,10 +14,10 @@ from msgspec import Struct
 
 from scanchain.baselines import BASELINES
 from scanchain.comparison.figures import COLUMNS, Figures, columns_of
-from scanchain.comparison.judging import doubt, representative
+from scanchain.comparison.judging import representative, unreliable_by_itself
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import EndReport, Outcome, Status
-from scanchain.comparison.results import Evidence
+from scanchain.comparison.results import Results
 from scanchain.comparison.scan_store import StoredScans
 from scanchain.data import Points
 from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_step, sharpness
@@ -36,7 +36,7 @@ class Row(Struct, frozen=True):
     status, reason : of the first run that did not end well, else ok
     settings : whole, as a TOML file for --settings would hold them
     definitions : what its errors are, in words
-    doubt : why it is not reliable by its own account, as most of its scans are degenerate; empty else
+    unreliable : reason, by its own account, not to use the result, as most of its scans are degenerate; else empty
     """
 
     name: str
@@ -47,7 +47,7 @@ class Row(Struct, frozen=True):
     settings: dict[str, Any]
     figures: Figures
     definitions: list[str]
-    doubt: str = ""
+    unreliable: str = ""
 
 
 class Table(Struct, frozen=True):
@@ -56,7 +56,7 @@ class Table(Struct, frozen=True):
     Attributes
     ----------
     log, topic : what was read, for headings
-    truth : what errors are against; empty where there is no ground truth
+    truth : reference of the errors; empty without ground truth
     truth_note : how many scans have no true pose, or why a truth could not be used; else empty
     disagreement_m : row by row the median distance between two methods' motions; None where one has failed
     notes : what was chosen or assumed, a line each
@@ -79,17 +79,17 @@ class Table(Struct, frozen=True):
 
     @property
     def against(self) -> str:
-        """What errors are against, in a sentence."""
+        """Reference of the errors, in a sentence."""
         note = f" {self.truth_note}." if self.truth_note else ""
         if self.truth:
             return f"Errors are against {self.truth}.{note}"
         return (
-            f"There is no ground truth: surfaces and to others tell who is sharp or alone, not who is right.{note}"
+            f"There is no ground truth: surfaces and to others are sharpness and disagreement, not accuracy.{note}"
         )
 
     @property
     def figures(self) -> list[Figures]:
-        """What the rows are compared by; nothing of one that did not end well."""
+        """Figures of the rows, empty for a row that failed."""
         return [row.figures if row.status is Status.OK else Figures() for row in self.rows]
 
 
@@ -122,7 +122,7 @@ def markdown(table: Table) -> str:
 
 
 def text(table: Table) -> str:
-    """The summary, well set; the best of each column starred; then who failed and why."""
+    """The summary for a terminal, the best of each column starred; then failures with their reasons."""
     columns = columns_of(table.figures, "summary")
     shown = [column.cells(table.figures) for column in columns]
     names = [row.name if row.status is Status.OK else f"{row.name}: {row.status}" for row in table.rows]
@@ -132,7 +132,7 @@ def text(table: Table) -> str:
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
-    endings += [f"{row.name}: UNRELIABLE: {row.doubt}" for row in table.rows if row.doubt]
+    endings += [f"{row.name}: UNRELIABLE: {row.unreliable}" for row in table.rows if row.unreliable]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
@@ -149,25 +149,25 @@ def _csv(table: Table) -> str:
     return buffer.getvalue()
 
 
-def summarize(evidence: Evidence, log: Log, limits: Limits, provenance: Provenance) -> Table:
+def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
     """Every method's row, with what only all of them together tell: sharpness and disagreement."""
-    scans, sharp = evidence.scans, sharpness_of(evidence.maps)
-    finals = [representative(evidence.outcomes[method.name]).trajectory.poses for method in evidence.methods]
+    scans, sharp = results.scans, sharpness_of(results.maps)
+    finals = [representative(results.outcomes[method.name]).trajectory.poses for method in results.methods]
     apart_m = disagreement(finals)
     rows = [
-        _row(evidence, method, sharp.get(method.name), np.delete(apart_m[place], place))
-        for place, method in enumerate(evidence.methods)
+        _row(results, method, sharp.get(method.name), np.delete(apart_m[place], place))
+        for place, method in enumerate(results.methods)
     ]
-    packages = sorted({BASELINES[method.base].package for method in evidence.methods if method.base in BASELINES})
+    packages = sorted({BASELINES[method.base].package for method in results.methods if method.base in BASELINES})
     return Table(
         log=", ".join(str(path) for path in log.paths),
         topic=log.topic,
         dimension=scans.dimension,
         scans=len(scans),
         points_per_scan=float(scans.points.mean()),
-        repeats=max(len(runs) for runs in evidence.outcomes.values()),
-        truth=evidence.reference.source,
-        truth_note=evidence.reference.note,
+        repeats=max(len(runs) for runs in results.outcomes.values()),
+        truth=results.reference.source,
+        truth_note=results.reference.note,
         rows=rows,
         disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
         notes=[
@@ -180,8 +180,8 @@ def summarize(evidence: Evidence, log: Log, limits: Limits, provenance: Provenan
     )
 
 
-def _row(evidence: Evidence, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
-    outcomes, judged = evidence.outcomes[method.name], evidence.judged[method.name]
+def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
+    outcomes, judged = results.outcomes[method.name], results.judged[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
     figures: Figures = msgspec.structs.replace(
@@ -196,7 +196,7 @@ def _row(evidence: Evidence, method: Method, sharp: Sharpness | None, apart_m: n
         status=end.status,
         reason=end.reason,
         description=representative(outcomes).report.description,
-        doubt=doubt(representative(outcomes)),
+        unreliable=unreliable_by_itself(representative(outcomes)),
         settings=method.settings,
         figures=figures,
         definitions=list(judged.definitions),
@@ -204,12 +204,12 @@ def _row(evidence: Evidence, method: Method, sharp: Sharpness | None, apart_m: n
 
 
 def _end(reports: list[EndReport]) -> EndReport:
-    """How it ended: badly if one run did."""
+    """End report: that of the first run that failed, else of the first."""
     return next((report for report in reports if report.status is not Status.OK), reports[0])
 
 
 def _installed(package: str) -> str:
-    """Of a package, which may come under the name of its variant without CUDA."""
+    """Version of a package, which may be installed as its variant without CUDA."""
     return package_version(package) or package_version(f"{package}-cpu")
 
 
@@ -225,6 +225,6 @@ def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[s
 
 
 def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
-    """Of the maps that hold together."""
+    """Sharpness of each map that has one."""
     answers = sharpness(list(maps.values())) if maps else []
     return {name: answer for name, answer in zip(maps, answers, strict=True) if answer is not None}

@@ -43,7 +43,7 @@ class Runner(Protocol):
 
     @property
     def description(self) -> str:
-        """What it does, with its settings."""
+        """Method and settings."""
         ...
 
     def track(self, scan: Scan) -> Pose:
@@ -65,7 +65,7 @@ def start(method: Method, T_base_lidar: Pose) -> Runner:
 
 
 def can_start_again(method: Method) -> bool:
-    """Whether an instance knows nothing of those before it, so that one may be thrown away to get warm."""
+    """True if instances are independent, so that one may be discarded after warming up."""
     return method.base not in BASELINES or BASELINES[method.base].forgets
 
 
@@ -91,14 +91,14 @@ def _baseline(method: Method, dimension: int) -> Baseline:
 
 METHOD_FILE = "method.msgpack"
 _WARM_UP_SCANS = 4
-_LONGEST = 300  # characters of an error that others raise
+_MAX_CHARACTERS = 300  # of the message of an error raised by other code
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     """Track every scan, then finish."""
     began = perf_counter()
     warm_up(scans.scans(), method, scans.T_base_lidar)
-    racer = start(method, scans.T_base_lidar)
+    runner = start(method, scans.T_base_lidar)
     start_s = perf_counter() - began
     size = scans.dimension + 1
     poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
@@ -107,29 +107,29 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
     for scan in scans.scans():
         asked, cpu_asked = perf_counter(), process_time()
-        pose = racer.track(scan)
+        pose = runner.track(scan)
         took_s, cpu_took_s = perf_counter() - asked, process_time() - cpu_asked
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
         seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose
     ended = perf_counter()
-    trajectory = racer.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
+    trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
     np.save(folder / TRAJECTORY_FILE, trajectory.poses)
-    return EndReport(Status.OK, "", racer.description, start_s, perf_counter() - ended)
+    return EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
 
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
     if not can_start_again(method):
         return
-    racer = start(method, T_base_lidar)
+    runner = start(method, T_base_lidar)
     with suppress(Exception):
         for scan in islice(scans, _WARM_UP_SCANS):
-            racer.track(scan)
+            runner.track(scan)
 
 
 def main() -> None:
-    """Run, and say how it ended."""
+    """Run the method and write the report."""
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
     die_first()
     method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
@@ -141,7 +141,7 @@ def main() -> None:
 
 
 class _Compiler(Unwatched):
-    """Hears that something is compiled."""
+    """Notices compilation."""
 
     has_compiled = False
 
@@ -150,7 +150,7 @@ class _Compiler(Unwatched):
 
 
 def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
-    """Of the work, or of what came in between."""
+    """Report of the work, or of the error that ended it."""
     try:
         return work(scans, method, folder)
     except MissingExtraError as error:
@@ -165,8 +165,8 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def _words(error: Exception) -> str:
-    """What it says, on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:_LONGEST]}"
+    """Message of an error on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:_MAX_CHARACTERS]}"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closu
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
-    """A closure with its last word: by the matcher, or by the graph that it contradicts.
+    """A closure with its final verdict: by the matcher, or by the graph that it contradicts.
 
     ``weight`` and ``chi2_after`` are what the optimizer left to its edge: 0 and NaN if it never became one, 1 and
     NaN until it is optimized.
@@ -108,7 +108,7 @@ def write_closures(
     notes = {
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
         "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
-        "proposed_by": "position: near by odometry; place: looked alike wherever odometry has it",
+        "proposed_by": "position: close by odometry; place: by place recognition, independent of odometry",
         "rejected_by": "verification: by matching; back end: verified, but it contradicts the rest of the graph; "
         "empty where it is accepted",
         "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",

@@ -36,7 +36,7 @@ class RunDirectory:
     """
 
     def __init__(self, destination: Path, *, force: bool, left: Path | None = None) -> None:
-        """Left : a directory marked partial that is gone on with instead of an empty one."""
+        """Left : a directory marked partial to resume in, instead of an empty one."""
         _check(destination, force)
         self.left = left
         self.destination = destination.resolve()
@@ -111,7 +111,7 @@ def left_behind(destination: Path) -> Path | None:
 
 
 def resumable(destination: Path) -> Path | None:
-    """What a run into ``destination`` that was stopped left to go on with; None where there is nothing."""
+    """Directory of a stopped run into ``destination`` that can be resumed; None if there is none."""
     latest = _latest_left(destination)
     return latest if latest is None or not _writer(latest) else None
 
@@ -134,7 +134,7 @@ def _writer(partial: Path) -> int:
 
 
 def _is_written_by(pid: int, run_file: Path) -> bool:
-    """Whether that process was there when the file was written; a later one has the number by chance."""
+    """True if that process existed when the file was written; a later one has its number by chance."""
     try:
         process = psutil.Process(pid)
         return process.status() != psutil.STATUS_ZOMBIE and process.create_time() < run_file.stat().st_mtime
@@ -168,9 +168,9 @@ def _check(destination: Path, force: bool) -> None:
 
 
 def _how_to_resume(destination: Path) -> str:
-    """What else to do where the name that exists is, or belongs to, a run that was stopped."""
+    """Hint to resume if the existing name is, or belongs to, a run that was stopped."""
     whole, mark, _ = destination.name.rpartition(".partial-")
     if mark and (destination / CHECKPOINT_FILE).is_file():
-        return f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume goes on with it"
+        return f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume continues it"
     left = resumable(destination)
-    return "" if left is None else f"; {left.name} is of a run that was stopped: --force --resume goes on with it"
+    return "" if left is None else f"; {left.name} is of a run that was stopped: --force --resume continues it"

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What is to be run.
+    """A log to process, and how.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Job:
     ground_truth : a TUM or KITTI file; None where the log's own is good
     max_gap_s : between true poses to interpolate over; None for the default
     force : whether a run directory of that name is replaced
-    resume : whether to go on from the last checkpoint of a run that was killed, where there is one
+    resume : whether to resume from the last checkpoint of a run that was killed, if there is one
     checkpoint_s : seconds between two checkpoints, or more where they are large
     command : the command line, for run.json
     """
@@ -61,19 +61,19 @@ class Job:
 
 
 class Progress(Protocol):
-    """Whoever watches a run and may end it early."""
+    """Progress of a run, shown to a user who may end it early."""
 
     @property
     def stopped(self) -> bool:
-        """Whether the user ended the run early."""
+        """True once the user has ended the run early."""
         ...
 
     def say(self, line: str) -> None:
-        """Tell something that happens, to a person who looks on."""
+        """Show a line to a person who watches."""
         ...
 
     def tell(self, line: str) -> None:
-        """Tell something that must be known, to anyone."""
+        """Show a line to everyone, also into a pipe."""
         ...
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
@@ -82,15 +82,15 @@ class Progress(Protocol):
 
 
 class Unwatched:
-    """Nobody watches: for scripts."""
+    """Progress that shows nothing, for scripts."""
 
     stopped = False
 
     def say(self, line: str) -> None:
-        """Nothing is told."""
+        """Show nothing."""
 
     def tell(self, line: str) -> None:
-        """Nothing is told."""
+        """Show nothing."""
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
         """The scans as they come."""
@@ -105,7 +105,7 @@ class Recorder(Protocol):
 
     @property
     def warnings(self) -> list[str]:
-        """What went wrong so far, a line each; nothing that goes wrong ends a run."""
+        """Problems so far, a line each; none of them ends a run."""
         ...
 
     @property
@@ -119,10 +119,10 @@ class Recorder(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def go_on(
+    def resume(
         self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
     ) -> None:
-        """Go on after the steps of ``rows``, with all closures tried by then and the graph as it was.
+        """Resume after the steps of ``rows``, with all closures tried by then and the graph as it was.
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
@@ -139,7 +139,7 @@ class Recorder(Protocol):
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
     ) -> None:
-        """Record the optimized way: poses (N, d+1, d+1) of the scans ``indices``."""
+        """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         ...
 
     def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
@@ -147,7 +147,7 @@ class Recorder(Protocol):
         ...
 
     def log_ground_truth(self, poses: Matrix) -> None:
-        """Record true poses (N, 4, 4), moved onto the optimized way."""
+        """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
         ...
 
     def log_map(self, points: NDArray[np.floating]) -> None:

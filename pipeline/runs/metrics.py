@@ -1,4 +1,4 @@
-"""metrics.json and summary.txt: what a run amounts to in numbers."""
+"""metrics.json and summary.txt: the figures of a run."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from scanchain.slam import SlamResult
 from scanchain.words import counted
 
 _MOST_CONTRADICTED = 0.1  # share of the scans; on real logs that went well at most 0.025
-_FEW_POINTS = 100  # of a scan; lidars, planar ones included, have more
-_NOTICEABLE_S = 0.5  # of compiling; less is not told
+_FEW_POINTS = 100  # points; scans of lidars, planar ones included, have more
+_NOTICEABLE_S = 0.5  # compilation time below this is not reported
 
 
 class Accuracy(Struct, frozen=True):
@@ -45,7 +45,7 @@ class Accuracy(Struct, frozen=True):
 
 
 class GroundTruth(Struct, frozen=True):
-    """How good the run is: after optimization and before.
+    """Accuracy of a run against the ground truth, after and before optimization.
 
     ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
     """
@@ -58,21 +58,21 @@ class GroundTruth(Struct, frozen=True):
 
     @property
     def complaint(self) -> str:
-        """That the trajectory is far off, in words; empty where it is not."""
+        """Warning that the trajectory is far from the ground truth; empty if it is not."""
         error = self.optimized
         return far_off(error.ate_rmse_m, error.ate_share_of_path, self.path_length_m)
 
 
 class Metrics(Struct, frozen=True):
-    """A run in numbers; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
+    """Figures of a run; ``*_ms`` are over the scans, by stage; the residual is null where nothing was matched.
 
     No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
     Closures tried = rejected by verification + verified; verified = rejected by the back end + accepted.
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``stopped`` says why the run did not see the whole log, of which these are the numbers up to there; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
-    ``unreliable`` says why the result as a whole is not to be used, empty where it is.
-    ``warnings`` : what was lost, left out or is wrong, a line each
+    ``unreliable`` is the reason not to use the result as a whole, empty if there is none.
+    ``warnings`` : data lost, skipped or wrong, a line each
     """
 
     scans: int
@@ -111,19 +111,19 @@ class Metrics(Struct, frozen=True):
 
     @property
     def residual(self) -> str:
-        """Of matching, in words."""
+        """Median residual of matching as text."""
         return "–" if self.median_residual_m is None else f"{1e3 * self.median_residual_m:.1f} mm"
 
     @property
     def fit(self) -> str:
-        """Of the pose graph, in words."""
+        """χ² of the pose graph as text."""
         count = self.closures_rejected_by_back_end
         rejected = f"{counted(count, 'closure')} rejected by the back end" if count else ""
         return fit_text(self.chi2, self.degrees_of_freedom, rejected, has_loops=self.closures_accepted > 0)
 
     @property
     def closures(self) -> str:
-        """How many loop closures were tried, and what became of them, in words."""
+        """Loop closures tried, rejected and accepted, as text."""
         if not self.closures_tried:
             return "none tried"
         return (
@@ -133,7 +133,7 @@ class Metrics(Struct, frozen=True):
 
     @property
     def compiling(self) -> str:
-        """How long kernels were compiled besides, in words; empty where they came from the cache."""
+        """Compilation time as text; empty if kernels came from the cache."""
         if self.compile_s < _NOTICEABLE_S:
             return ""
         return f" (and {self.compile_s:.0f} s compiling, once after an installation)"
@@ -155,7 +155,7 @@ def measure(
     warnings: Sequence[str] = (),
     stopped: str = "",
 ) -> Metrics:
-    """The numbers of a finished run."""
+    """Metrics of a finished run."""
     matches = [row.match for row in steps.rows]
     residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
@@ -202,7 +202,7 @@ def measure(
 
 
 def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[int]) -> str:
-    """Why a run is not reliable; empty where it is: few scans contradict the map, most poses are measured."""
+    """Reason why a run is unreliable; empty if few scans contradict the map and most poses are measured."""
     degenerate, lost = states[State.DEGENERATE], states[State.LOST]
     if contradicted > _MOST_CONTRADICTED * len(points):
         return (
@@ -219,13 +219,13 @@ def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[
     if np.median(points) < _FEW_POINTS:
         few = f"scans have {np.median(points):.0f} valid points (median)"
         return f"{line}; {few}, as a radar's have: choose a lidar with --topic"
-    return f"{line}: the surroundings leave it open there, or the log is at fault (scanchain doctor)"
+    return f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
 
 
 def judge(
     result: SlamResult, reference: Trajectory, source: str, gap_s: float | None
 ) -> tuple[GroundTruth, list[str]]:
-    """Both trajectories of a result against the ground truth, and why that may mislead, a line each."""
+    """Accuracy of both trajectories of a result, and a line for each reason why it may mislead."""
     pairs = pair(result.trajectory, reference, gap_s=gap_s)
     optimized, length_m = _accuracy(pairs)
     odometry, _ = _accuracy(pair(result.odometry, reference, gap_s=gap_s))
@@ -233,7 +233,7 @@ def judge(
 
 
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
-    """The numbers as a person reads them."""
+    """The metrics as text."""
     m = metrics
     dropped = f", {counted(m.dropped_points, 'invalid return')} left out" if m.dropped_points else ""
     lines = [
@@ -242,18 +242,17 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, "
         f"{m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost{dropped}",
-        f"way            {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
+        f"trajectory     {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
         f"loop closures  {m.closures}",
         f"pose graph     {m.fit}",
-        f"map            {counted(m.map_points, 'point')}; "
-        f"{m.moving_points_removed:,} more left out as having moved",
+        f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         f"time           {m.run_s:.1f} s{m.compiling}, "
         f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
-        "  95 % below   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
+        "  95th perc.   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
     ]
     if m.ground_truth is not None:
         lines += _accuracy_lines(m.ground_truth)

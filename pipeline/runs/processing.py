@@ -1,4 +1,4 @@
-"""Every scan of a log through the chain and into the recording, and what came of it into files."""
+"""The loop over the scans of a log: SLAM, recording, checkpoints; then the result files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.results import Cloud, record_results, results_of, write_results
 from scanchain.runs.resume.checkpoint import Checkpoints
 from scanchain.runs.resume.journal import JOURNAL_FILE, Journal
-from scanchain.runs.resume.resuming import Left, after, go_on_recording, set_aside
+from scanchain.runs.resume.resuming import Left, after, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam, SlamResult
 
@@ -31,7 +31,7 @@ TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with th
 
 @dataclass(frozen=True, slots=True)
 class Processed:
-    """The result of a log that went through, what the recording has to say, and how long the user looked at it."""
+    """The result of a log, the warnings of the recording, and the seconds that the user kept the viewer open."""
 
     result: SlamResult
     cloud: Cloud
@@ -51,7 +51,7 @@ def process(
     left: Left | None,
     true_poses: TruePoses,
 ) -> Processed:
-    """Place every scan, from the first on or from where the run left off, and write the results."""
+    """Process every scan, from the first on or from the checkpoint, and write the results."""
     slam, scans, checkpoints = _begin(job, log, config, directory.path, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     with (
@@ -67,7 +67,7 @@ def process(
     ):
         if recording.web_address:
             progress.tell(f"viewer: {recording.web_address}")
-        notes = () if left is None else (go_on_recording(directory.path, left, recording, checkpoints),)
+        notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
         for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
             recording.log(step)
             journal.append(steps.append(step))
@@ -77,7 +77,7 @@ def process(
             checkpoints.write(slam, recording.secure())
         result = slam.finish(progress.say)
         judged = final_verdicts(result.closures, result.state)
-        progress.say("drawing and writing the map")
+        progress.say("building the maps and writing the results")
         with directory.results() as folder:
             results = results_of(log, config, steps, result, judged)
             write_results(folder, results)
@@ -92,7 +92,7 @@ def process(
 def _begin(
     job: Job, log: Log, config: Config, folder: Path, left: Left | None
 ) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
-    """The chain, new or as it was left, the scans that it has not seen, and what writes it down."""
+    """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
     if left is None:
         slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)
         return slam, log.scans(config.preprocess), Checkpoints(folder, job.checkpoint_s)
@@ -105,7 +105,7 @@ def _begin(
 
 
 def _record_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:
-    """Ground truth into the recording, moved onto the trajectory; one that does not fit is warned of elsewhere."""
+    """Record the ground truth aligned to the trajectory; one that does not fit is reported elsewhere."""
     with suppress(InputError):
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is not None:
@@ -114,7 +114,7 @@ def _record_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult
 
 
 def _hold(recording: Recorder, progress: Progress) -> float:
-    """Let the user look at a web viewer, which lives as long as the recording; how long that was."""
+    """Keep the web viewer open, which lives as long as the recording; seconds until the user ended it."""
     if not recording.web_address:
         return 0.0
     began = perf_counter()

@@ -64,7 +64,7 @@ class Provenance(Struct, frozen=True):
 
 
 def describe_start(command: Sequence[str], logs: Sequence[Source], configuration: str) -> Provenance:
-    """What is known when a run starts."""
+    """Provenance as known when a run starts."""
     return Provenance(
         complete=False,
         stopped="",

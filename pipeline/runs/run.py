@@ -1,4 +1,4 @@
-"""The main job: a log in, a run directory out."""
+"""A run: a log in, a run directory out."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 
 def _no_report(folder: Path) -> None:
-    """Nobody wants one: for scripts."""
+    """No report, for scripts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A run that came to its end; ``stopped`` says why it did not see the whole log, empty where it did."""
+    """A finished run; ``stopped`` is the reason why it did not see the whole log, empty if it did."""
 
     path: Path
     metrics: Metrics
@@ -107,12 +107,12 @@ def run(
 
 
 def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
-    """Say whether an earlier run is taken up, or lies there and is not."""
+    """Announce that an earlier run is resumed, or that one exists and is not."""
     if left is not None:
-        progress.tell(f"going on after {counted(len(left.steps), 'scan')} of {left.folder.name}")
+        progress.tell(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")
     elif (idle := resumable(job.out)) is not None:
         progress.tell(
-            f"{idle.name} is of a run that was stopped; --resume would go on with it, this one starts again"
+            f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over"
         )
 
 
@@ -152,7 +152,7 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
 def _true_poses(
     log: Log, file: TruthFile | None, progress: Progress, stamps_ns: NDArray[np.int64]
 ) -> Trajectory | None:
-    """Of the file named, else the log's own; a KITTI file's for the scans (N,) that were read before a stop."""
+    """Poses of the file named, else the log's own; of a KITTI file those of the scans (N,) read before a stop."""
     if file is None:
         return log.ground_truth()
     return (file.first(len(stamps_ns)) if progress.stopped else file).at(stamps_ns)
@@ -185,15 +185,15 @@ def _heading(log: Log, config: Config, stopped: str) -> str:
 
 
 def _wheels(log: Log, config: Config) -> str:
-    """The wheels of a log that was read, and whether they were used."""
+    """Wheel odometry of a log, with the reason if it was not used."""
     if not log.has_odometry:
-        return "wheels none"
+        return "no wheel odometry"
     unused = ""
     if config.odometry.prior == "constant-velocity":
         unused = ", not used: odometry.prior is constant-velocity"
     elif not log.scans_with_wheels:
         unused = ", not used: no reading is near the stamp of a scan"
-    return f"wheels {log.odometry_topic}{unused}"
+    return f"wheel odometry {log.odometry_topic}{unused}"
 
 
 def _complete(
@@ -204,7 +204,7 @@ def _complete(
     duration_s: float,
     report: Callable[[Path], None],
 ) -> tuple[str, ...]:
-    """Give a whole run its name; one that was stopped stays marked partial. What went wrong with the report."""
+    """Give a complete run its name; a stopped one stays marked partial. Returns problems with the report."""
     if stopped:
         directory.worth_keeping()
         replaced = msgspec.structs.replace(provenance, stopped=stopped, duration_s=duration_s)

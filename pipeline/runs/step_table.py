@@ -23,7 +23,7 @@ _SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix t
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """What is kept of a step: all but its points."""
+    """A step without its points."""
 
     index: int
     stamp_ns: int
@@ -40,7 +40,7 @@ class StepRow:
 
 
 class StepTable:
-    """Takes in steps, a few microseconds each; everything columnwise is done when it is written."""
+    """Rows of all steps; an append takes microseconds, columns are made when the table is written."""
 
     def __init__(self) -> None:
         self.rows: list[StepRow] = []
@@ -85,13 +85,13 @@ class StepTable:
         return (self.rows[-1].log_time_ns - self.rows[0].log_time_ns) * 1e-9 if self.rows else 0.0
 
     def covariances(self) -> list[Matrix | None]:
-        """Of each scan's match: (k, k) of a twist in the lidar's frame; None where a direction is undetermined."""
+        """Covariance (k, k) of each match, of a lidar-frame twist; None where a direction is unobservable."""
         k = len(self.rows[0].match.information) if self.rows else 0
         flat = _covariances(np.array([row.match.information for row in self.rows]))
         return [None if each is None else np.array(each).reshape(k, k) for each in flat]
 
     def states(self) -> Counter[State]:
-        """How many steps ended in each state."""
+        """Number of steps in each state."""
         return Counter(row.state for row in self.rows)
 
     def write(self, path: Path, trajectory: Trajectory) -> None:
@@ -143,7 +143,7 @@ STAGES = ("read", "preprocess", "match", "map", "loops")
 _NOTES = {
     "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it",
     "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
-    "SE(2) 3x3, SE(3) 6x6; null where the match leaves a direction undetermined",
+    "SE(2) 3x3, SE(3) 6x6; null where a direction of the match is unobservable",
     "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
     "keyframe": "number in the graph, -1 if none was made",
 }

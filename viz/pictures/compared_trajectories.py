@@ -1,4 +1,4 @@
-"""The courses of a comparison, from its table of scans."""
+"""The trajectories of a comparison, from its table of scans."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
-from scanchain.viz.pictures.trajectory_figures import Course, Floats, color_of
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
 
 
-def read_courses(directory: Path) -> list[Course]:
+def read_trajectories(directory: Path) -> list[DrawnTrajectory]:
     """One a method that began, in the order of the table, of the first run that came furthest."""
     scans, file = pq.read_table(directory / SCANS_FILE), directory / RELATIONS_FILE
     relations = pq.read_table(file) if file.exists() else None
     rows = read_table(directory).rows
-    courses = [_course(scans, relations, row, place) for place, row in enumerate(rows)]
-    return [course for course in courses if len(course.positions)]
+    trajectories = [_drawn(scans, relations, row, place) for place, row in enumerate(rows)]
+    return [trajectory for trajectory in trajectories if len(trajectory.positions)]
 
 
-def _course(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -> Course:
+def _drawn(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -> DrawnTrajectory:
     runs = _of(scans, row.name)
     chosen = runs.filter(pa.array(runs["repeat"].to_numpy() == _furthest(runs["repeat"].to_numpy())))
     errors_m = np.empty(0) if relations is None else _column(_of(relations, row.name), "error_m")
-    return Course(
+    return DrawnTrajectory(
         name=row.name,
         color=color_of(place),
         is_dashed="+loops" in row.base,
@@ -42,7 +42,7 @@ def _course(scans: pa.Table, relations: pa.Table | None, row: Row, place: int) -
 
 
 def _of(table: pa.Table, method: str) -> pa.Table:
-    """Its rows."""
+    """Rows of a method."""
     return table.filter(pa.array(np.array(table["method"].to_pylist(), object) == method))
 
 

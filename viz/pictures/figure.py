@@ -43,11 +43,11 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-class Sheet:
-    """One drawing with one pair of axes; a context, inside which ``axes`` is drawn on.
+class SvgFigure:
+    """One figure with one pair of axes; a context, inside which ``axes`` is drawn on.
 
-    height_inches : of the whole sheet
-    name : tells its parts from those of other drawings on the same page
+    height_inches : of the whole figure
+    name : tells its parts from those of other figures on the same page
     """
 
     def __init__(self, name: str, height_inches: float = 2.7) -> None:
@@ -62,32 +62,34 @@ class Sheet:
             _LEFT / _WIDTH, _BOTTOM / height_inches, 1 - _RIGHT / _WIDTH, 1 - _TOP / height_inches
         )
 
-    def __enter__(self) -> Sheet:
+    def __enter__(self) -> SvgFigure:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._context.__exit__(None, None, None)
 
     @classmethod
-    def of_plan(cls, name: str, low: NDArray[np.float64], high: NDArray[np.float64], spare: float = 0.0) -> Sheet:
-        """A sheet in the proportions of what lies between two corners; ``spare`` inches stay free beside it."""
+    def of_plan(
+        cls, name: str, low: NDArray[np.float64], high: NDArray[np.float64], spare: float = 0.0
+    ) -> SvgFigure:
+        """A figure in the proportions of the box between two corners; ``spare`` inches stay free beside it."""
         inches = _WIDTH - _LEFT - _RIGHT - spare
         height = inches * (high[1] - low[1]) / (high[0] - low[0]) + _BOTTOM + _TOP
-        sheet = cls(name, float(np.clip(height, _LOWEST, _HIGHEST)))
-        sheet.axes.set_aspect("equal")
-        sheet.axes.set_xlim(low[0], high[0])
-        sheet.axes.set_ylim(low[1], high[1])
-        sheet.axes.set_xlabel("x [m]")
-        sheet.axes.set_ylabel("y [m]")
-        return sheet
+        figure = cls(name, float(np.clip(height, _LOWEST, _HIGHEST)))
+        figure.axes.set_aspect("equal")
+        figure.axes.set_xlim(low[0], high[0])
+        figure.axes.set_ylim(low[1], high[1])
+        figure.axes.set_xlabel("x [m]")
+        figure.axes.set_ylabel("y [m]")
+        return figure
 
     def svg(self) -> Markup:
-        """The drawing, to be put into a page as it is; no text of a log is ever drawn."""
+        """The figure as SVG for a page; no text of a log is ever drawn."""
         buffer = io.StringIO()
         self.figure.patch.set_alpha(0.0)
         self.axes.patch.set_alpha(0.0)
-        nobody = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        self.figure.savefig(buffer, format="svg", dpi=_DPI, metadata=nobody)
+        anonymous = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        self.figure.savefig(buffer, format="svg", dpi=_DPI, metadata=anonymous)
         text = buffer.getvalue()
         text = text[text.index("<svg") :]
         text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)

@@ -9,8 +9,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.data import Points
-from scanchain.viz.pictures.figure import INK, Sheet
-from scanchain.viz.pictures.trajectory_figures import CLOSURES, Course, Floats, PathLine
+from scanchain.viz.pictures.figure import INK, SvgFigure
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, Floats, PathLine
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
@@ -36,33 +36,33 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
 
 def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
-    with Sheet.of_plan(name, low, high) as sheet:
-        _draw_points(sheet, points, low, high, by_height=True)
-        return sheet.svg()
+    with SvgFigure.of_plan(name, low, high) as figure:
+        _draw_points(figure, points, low, high, by_height=True)
+        return figure.svg()
 
 
 def path_over_map(
     name: str, points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats
 ) -> Markup:
     """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
-    with Sheet.of_plan(name, low, high) as sheet:
-        _draw_points(sheet, points, low, high, by_height=False)
+    with SvgFigure.of_plan(name, low, high) as figure:
+        _draw_points(figure, points, low, high, by_height=False)
         for line in lines:
             style = (0, (3, 3)) if line.is_dashed else "-"
             x, y = line.positions[:, :2].T
-            sheet.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
+            figure.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
         for place, marker in ((0, "o"), (-1, "s")):
-            sheet.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
-        return sheet.svg()
+            figure.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
+        return figure.svg()
 
 
-def _draw_points(sheet: Sheet, points: Points, low: Floats, high: Floats, *, by_height: bool) -> None:
+def _draw_points(figure: SvgFigure, points: Points, low: Floats, high: Floats, *, by_height: bool) -> None:
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
         image = _image(shown[inside], low, high, by_height=by_height)
         corners = (low[0], high[0], low[1], high[1])
-        sheet.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
+        figure.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
 
 
 def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
@@ -88,15 +88,15 @@ def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDA
 
 
 def loops_picture(
-    name: str, course: Course, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
+    name: str, trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
-    """The way (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3) from place to place."""
-    with Sheet.of_plan(name, low, high) as sheet:
-        sheet.axes.plot(course.positions[:, 0], course.positions[:, 1], color=_POINTS, linewidth=0.7)
+    """The trajectory (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3)."""
+    with SvgFigure.of_plan(name, low, high) as figure:
+        figure.axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 1], color=_POINTS, linewidth=0.7)
         for by, (_, color) in CLOSURES.items():
             chosen = edges[rejected_by == by][:, :, :2]
             gaps = np.full((len(chosen), 1, 2), np.nan)
             lines = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2)
-            sheet.axes.plot(lines[:, 0], lines[:, 1], color=color, linewidth=0.9)
-        sheet.axes.plot(*course.positions[0, :2], marker="o", markersize=4, color=INK)
-        return sheet.svg()
+            figure.axes.plot(lines[:, 0], lines[:, 1], color=color, linewidth=0.9)
+        figure.axes.plot(*trajectory.positions[0, :2], marker="o", markersize=4, color=INK)
+        return figure.svg()

@@ -54,35 +54,35 @@ def draw_map(
     points: NDArray[np.floating] | None = None,
     grid: GridPicture | None = None,
 ) -> None:
-    """Draw ways (N, d+1, d+1) over a map, all in the world frame, to a PNG.
+    """Draw trajectories (N, d+1, d+1) over a map, all in the world frame, to a PNG.
 
     points : (M, d) of the map; of a 3D one the height is the shade
-    ground_truth : moved onto the estimate beforehand; nothing is aligned here
+    ground_truth : already aligned to the estimate
     """
-    ways = [way for way in (optimized, odometry, ground_truth) if way is not None and len(way)]
-    low, high = _frame(ways, points, grid)
-    figure, axes = _paper(low, high)
+    paths = [path for path in (optimized, odometry, ground_truth) if path is not None and len(path)]
+    low, high = _frame(paths, points, grid)
+    figure, axes = _figure(low, high)
     if grid is not None:
         _draw_grid(axes, grid)
     if points is not None and len(points):
         _draw_points(axes, points)
-    _draw_way(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
-    _draw_way(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
-    _draw_way(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
+    _draw_path(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
+    _draw_path(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
+    _draw_path(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
     _mark_ends(axes, optimized)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_title(title, loc="left", fontsize=11)
-    if len(ways):
+    if len(paths):
         axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     write_figure(path, figure, dpi=150)
 
 
 def _frame(
-    ways: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
+    paths: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what must be seen: every way, the map but for outliers, and a margin."""
-    corners: list[NDArray[np.floating]] = [way[:, :2, -1] for way in ways]
+    """Corners of what must be seen: every trajectory, the map without outliers, and a margin."""
+    corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
     if points is not None and len(points):
         corners.append(np.array(extent(points[:, :2])))
     elif grid is not None:
@@ -96,8 +96,8 @@ def _frame(
     return low - margin, high + margin
 
 
-def _paper(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure, Axes]:
-    """A sheet in the proportions of the map."""
+def _figure(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure, Axes]:
+    """A figure in the proportions of the map."""
     from matplotlib.figure import Figure
 
     width, height = high - low
@@ -139,23 +139,23 @@ def _draw_points(axes: Axes, points: NDArray[np.floating]) -> None:
     )  # fmt: skip
 
 
-def _draw_way(
-    axes: Axes, way: Matrix | None, name: str, color: str, style: str | tuple[int, tuple[int, int]], width: float
+def _draw_path(
+    axes: Axes, poses: Matrix | None, name: str, color: str, style: str | tuple[int, tuple[int, int]], width: float
 ) -> None:
     """Draw one line, its length in the legend."""
-    if way is None or not len(way):
+    if poses is None or not len(poses):
         return
-    x, y = way[:, 0, -1], way[:, 1, -1]
-    length_m = float(np.linalg.norm(np.diff(way[:, :-1, -1], axis=0), axis=1).sum())
+    x, y = poses[:, 0, -1], poses[:, 1, -1]
+    length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
     axes.plot(x, y, color=color, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
 
 
-def _mark_ends(axes: Axes, way: Matrix) -> None:
-    if not len(way):
+def _mark_ends(axes: Axes, poses: Matrix) -> None:
+    if not len(poses):
         return
     marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
-    axes.plot(*way[0, :2, -1], marker="o", label="start", **marks)
-    axes.plot(*way[-1, :2, -1], marker="s", label="end", **marks)
+    axes.plot(*poses[0, :2, -1], marker="o", label="start", **marks)
+    axes.plot(*poses[-1, :2, -1], marker="s", label="end", **marks)
 
 
 def draw_run(directory: Path, picture: Path) -> None:

@@ -61,7 +61,7 @@ class Batcher:
 
     @property
     def is_due(self) -> bool:
-        """Whether the batch is large or old enough."""
+        """True if the batch is large or old enough."""
         return (
             len(self.steps) >= _MAX_SCANS
             or self.bytes >= _MAX_BYTES
@@ -69,7 +69,7 @@ class Batcher:
         )
 
     def messages(self) -> list[Message]:
-        """Everything the gathered steps say, scan by scan; the batch is empty afterwards."""
+        """Messages of the gathered steps, scan by scan; the batch is empty afterwards."""
         steps, self.steps, self.bytes = self.steps, [], 0
         verdicts, self.verdicts = self.verdicts, []
         if not steps:
@@ -104,10 +104,10 @@ class Batcher:
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
     def _trails(self, times: Times, odom: Matrix, world: Matrix) -> list[Message]:
-        """Each scan's piece of the way, before and after correction, and the correction where it changed.
+        """Each scan's segment of the trajectory, before and after correction, and the correction where it changed.
 
-        A piece of the corrected way starts where the scan before stands under the same correction, so that a
-        closure does not draw a jump.
+        A segment of the corrected trajectory starts where the scan before stands under the same correction, so
+        that a closure does not draw a jump.
         """
         first = odom[:1] if self.T_odom_before is None else self.T_odom_before[None]
         before = np.concatenate([first, odom[:-1]])
@@ -143,7 +143,7 @@ class Batcher:
         return messages
 
     def _counts(self, verdicts: list[Verdicts], times: Times) -> list[Message]:
-        """How many closures are accepted and rejected, where that changes."""
+        """Numbers of accepted and rejected closures, where they change."""
         counts = [(judged.accepted, judged.rejected) for judged in verdicts]
         before = [self.closures, *counts[:-1]]
         changed = np.array([now != then for now, then in zip(counts, before, strict=True)])

@@ -1,4 +1,4 @@
-"""How the viewer lays a recording out: the scene, how well it is known over time, everything else in tabs."""
+"""Layout of a recording in the viewer: the scene, observability over time, everything else in tabs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def whole_log() -> rrb.TimeAxis:
 
 
 def up_to_now() -> rrb.VisibleTimeRanges:
-    """For a way that grows with the time cursor instead of showing its last piece only."""
+    """Time range of a trajectory that grows with the time cursor, instead of showing its last segment only."""
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     return rrb.VisibleTimeRanges(
         [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in ("scan", "sensor_time")]
@@ -86,7 +86,7 @@ def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
 
 
 def eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
-    """From above for a 2D log, obliquely for a 3D one; far enough to see the whole way."""
+    """From above for a 2D log, obliquely for a 3D one; far enough to see the whole trajectory."""
     low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
     center = 0.5 * (low + high)
     size_m = max(float(np.linalg.norm(high - low)), 20.0 if dimension == 2 else 60.0)

@@ -1,4 +1,4 @@
-"""The recording of a comparison: every method's way and map on one timeline, each to be switched on and off."""
+"""The recording of a comparison: trajectories and maps of all methods on one timeline, to toggle one by one."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, metho
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.compared_trajectories import read_courses
-from scanchain.viz.pictures.trajectory_figures import Course
+from scanchain.viz.pictures.compared_trajectories import read_trajectories
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.blueprint import eye, time_panel, up_to_now, whole_log
 from scanchain.viz.recording.messages import Message, Times
@@ -30,36 +30,38 @@ _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 def record_comparison(directory: Path) -> None:
     """Write compare.rrd into a comparison's directory. Raises OSError."""
-    table, courses = read_table(directory), read_courses(directory)
+    table, trajectories = read_table(directory), read_trajectories(directory)
     stream = rr.RecordingStream(f"scanchain comparison {table.dimension}D")
     stream.set_log_time_enabled(False)
     stream.send_recording_name(Path(table.log.split(", ")[0]).name)
-    messages = _messages(directory, courses, _stamps(directory))
-    write_recording(directory / RECORDING_FILE, stream, _blueprint(courses, table), messages)
+    messages = _messages(directory, trajectories, _stamps(directory))
+    write_recording(directory / RECORDING_FILE, stream, _blueprint(trajectories, table), messages)
 
 
-def _messages(directory: Path, courses: Sequence[Course], stamps_ns: np.ndarray) -> list[Message]:
+def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_ns: np.ndarray) -> list[Message]:
     messages = [Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
     truth_file = directory / TRUTH_FILE
     if truth_file.exists():
-        way = shapes.positions(read_tum(truth_file).poses)
-        line = rr.LineStrips3D([way], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
+        path = shapes.positions(read_tum(truth_file).poses)
+        line = rr.LineStrips3D([path], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
         messages.append(Message(entities.GROUND_TRUTH, line))
-    for course in courses:
-        messages += _of(course, method_folder(directory, course.name) / MAP_FILE, stamps_ns)
+    for trajectory in trajectories:
+        messages += _of(trajectory, method_folder(directory, trajectory.name) / MAP_FILE, stamps_ns)
     return messages
 
 
-def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
-    """The way piece by piece, the lidar on it, the map, and the plots."""
-    name = rr.escape_entity_path_part(course.name)
-    color, positions = _rgb(course.color), course.positions.astype(np.float32)
+def _of(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
+    """The trajectory in segments, the lidar on it, the map, and the plots."""
+    name = rr.escape_entity_path_part(trajectory.name)
+    color, positions = _rgb(trajectory.color), trajectory.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
     strips = rr.LineStrips3D.columns(strips=shapes.segments(before, positions))
     messages = [
-        Message(f"world/{name}/way", rr.LineStrips3D.from_fields(colors=[color], radii=[entities.pixels(1.5)])),
-        Message(f"world/{name}/way", strips, times),
+        Message(
+            f"world/{name}/trajectory", rr.LineStrips3D.from_fields(colors=[color], radii=[entities.pixels(1.5)])
+        ),
+        Message(f"world/{name}/trajectory", strips, times),
         Message(f"world/{name}/lidar", rr.Points3D.from_fields(colors=[color], radii=[entities.pixels(5.0)])),
         Message(
             f"world/{name}/lidar", rr.Points3D.columns(positions=positions).partition([1] * len(positions)), times
@@ -70,47 +72,47 @@ def _of(course: Course, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
         faint = tuple((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
         archetype = rr.Points3D(points, colors=[faint], radii=[entities.pixels(0.5)])
         messages.append(Message(f"world/{name}/map", archetype))
-    for plot, values in _series(course).items():
+    for plot, values in _series(trajectory).items():
         known = np.isfinite(values)
         if known.any():
-            series = rr.SeriesLines(colors=[color], names=[course.name], widths=[1.0])
+            series = rr.SeriesLines(colors=[color], names=[trajectory.name], widths=[1.0])
             messages.append(Message(f"plots/{plot}/{name}", series))
             columns = rr.Scalars.columns(scalars=values[known])
             messages.append(Message(f"plots/{plot}/{name}", columns, times[known]))
     return messages
 
 
-def _series(course: Course) -> dict[str, np.ndarray]:
+def _series(trajectory: DrawnTrajectory) -> dict[str, np.ndarray]:
     """Scan by scan, by plot."""
-    return {"error": course.error_m, "time": 1e3 * course.seconds}
+    return {"error": trajectory.error_m, "time": 1e3 * trajectory.seconds}
 
 
-def _blueprint(courses: Sequence[Course], table: Table) -> rrb.Blueprint:
-    """The ways above, maps of all but the first method switched off; plots below, one legend for both."""
-    names = [rr.escape_entity_path_part(course.name) for course in courses]
-    overrides: dict[Any, Any] = {f"world/{name}/way": [up_to_now()] for name in names}
+def _blueprint(trajectories: Sequence[DrawnTrajectory], table: Table) -> rrb.Blueprint:
+    """Trajectories above, maps of all but the first method hidden; plots below, one legend for both."""
+    names = [rr.escape_entity_path_part(trajectory.name) for trajectory in trajectories]
+    overrides: dict[Any, Any] = {f"world/{name}/trajectory": [up_to_now()] for name in names}
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
-    ends = [course.positions for course in courses[:1]]
+    ends = [trajectory.positions for trajectory in trajectories[:1]]
     box = np.array([ends[0].min(axis=0), ends[0].max(axis=0)]) if ends else None
     scene = rrb.Spatial3DView(
         origin="world",
-        name="ways and maps",
+        name="trajectories and maps",
         overrides=overrides,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(table.dimension, box),
     )
     return rrb.Blueprint(
-        rrb.Vertical(scene, rrb.Horizontal(*_plots(courses)), row_shares=[2, 1]),
+        rrb.Vertical(scene, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1]),
         time_panel(table.scans),
         rrb.SelectionPanel(state="collapsed"),
     )
 
 
-def _plots(courses: Sequence[Course]) -> list[rrb.TimeSeriesView]:
-    """Of what is known of any course; a single scan that took for ever leaves the rest visible."""
+def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
+    """Plots of the known values, scaled so that a single slow scan leaves the rest visible."""
     views = []
     for plot, name in _PLOTS.items():
-        values = np.concatenate([np.empty(0), *(_series(course)[plot] for course in courses)])
+        values = np.concatenate([np.empty(0), *(_series(trajectory)[plot] for trajectory in trajectories)])
         if np.isfinite(values).any():
             highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
             legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")

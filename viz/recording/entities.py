@@ -83,7 +83,7 @@ def height_colors(points: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def constants(dimension: int) -> list[Message]:
-    """What never changes: axes, colors, line widths, names of the series."""
+    """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
     return [
         Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),

@@ -17,12 +17,12 @@ from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
 
 _GROWTH = 1.05  # drawn anew when it grew by this factor: the recording stays linear in the length of the log
-_DOUBT = 0.5  # robust weight below which the back end disagrees with a closure's verdict
+_DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
 @dataclass(frozen=True, slots=True)
 class Verdicts:
-    """Of a step: an event for each closure whose verdict is new, and how many are accepted and rejected since."""
+    """Events of a step, one per closure with a new verdict, and the numbers accepted and rejected since."""
 
     events: Sequence[str]
     accepted: int
@@ -72,7 +72,7 @@ class KeyframeGraph:
 
     @property
     def has_grown(self) -> bool:
-        """Whether it is time to draw it."""
+        """True if it is time to draw it."""
         return len(self.positions) > _GROWTH * self.drawn
 
     def draw(self, times: Times) -> list[Message]:
@@ -85,7 +85,7 @@ class KeyframeGraph:
             nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
         accepted = [item for item in self.judged if item.verdict is Verdict.ACCEPTED]
         rejected = [item for item in self.judged if item.verdict is Verdict.REJECTED]
-        colors = [entities.ORANGE if item.weight < _DOUBT else entities.GREEN for item in accepted]
+        colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), times),
             _strips(entities.ODOMETRY_EDGES, nodes[None], times),
@@ -107,7 +107,7 @@ class KeyframeGraph:
 
 
 def _as_found(closure: Closure) -> JudgedClosure:
-    """By the matcher alone, before the graph has a say."""
+    """Verdict of the matcher alone, before optimization."""
     return JudgedClosure(closure, closure.verdict, closure.reason, 1.0, float("nan"))
 
 

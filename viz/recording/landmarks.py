@@ -47,18 +47,18 @@ def _root(study: Study) -> str:
 def _truth(study: Study) -> list[Message]:
     """True trajectory and landmarks, for ever."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    way = rr.LineStrips3D([shapes.in_space(study.true_poses)], colors=[entities.GRAY], radii=entities.pixels(1.0))
+    path = rr.LineStrips3D([shapes.in_space(study.true_poses)], colors=[entities.GRAY], radii=entities.pixels(1.0))
     marks = rr.Points3D(shapes.in_space(known), colors=[entities.GRAY], radii=entities.pixels(4.0))
-    return [Message(f"{_root(study)}/truth/trajectory", way), Message(f"{_root(study)}/truth/landmarks", marks)]
+    return [Message(f"{_root(study)}/truth/trajectory", path), Message(f"{_root(study)}/truth/landmarks", marks)]
 
 
 def _state(study: Study, estimate: Estimate, when: int) -> list[Message]:
     """Trajectory and landmarks at one instant."""
     times, T = Times.at(when, when), estimate.T_truth_estimate
     color = entities.ORANGE if when == 0 else entities.BLUE
-    way = shapes.in_space(lie.transform(T, estimate.state.poses[:, :2]))
+    path = shapes.in_space(lie.transform(T, estimate.state.poses[:, :2]))
     points = shapes.in_space(lie.transform(T, estimate.state.landmarks))
-    line = rr.LineStrips3D.columns(strips=[way], colors=[color], radii=[entities.pixels(1.5)])
+    line = rr.LineStrips3D.columns(strips=[path], colors=[color], radii=[entities.pixels(1.5)])
     marks = rr.Points3D.columns(
         positions=points, colors=[color] * len(points), radii=[entities.pixels(3.0)] * len(points)
     )

@@ -1,4 +1,4 @@
-"""The recording of a run: what every step says, to a file, to a viewer, or to both.
+"""The rerun recording of a run, to a file, to a viewer, or to both.
 
 Nothing that goes wrong here after the start ends a run; it is collected in ``Recording.warnings``.
 """
@@ -88,13 +88,13 @@ class Recording:
 
     @property
     def warnings(self) -> list[str]:
-        """What went wrong so far, a line each."""
+        """Problems so far, a line each."""
         return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
 
-    def go_on(
+    def resume(
         self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
     ) -> None:
-        """Go on after the steps of ``rows``, with all closures tried by then and the graph as it was.
+        """Resume after the steps of ``rows``, with all closures tried by then and the graph as it was.
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
@@ -121,7 +121,7 @@ class Recording:
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
     ) -> None:
-        """Record the way after optimization: poses (N, d+1, d+1) of the scans ``indices``."""
+        """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
 
     def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
@@ -129,12 +129,12 @@ class Recording:
         self._send(lambda: self._settled(judged, graph))
 
     def log_ground_truth(self, poses: Matrix) -> None:
-        """Record true poses (N, 4, 4), moved onto the optimized way."""
+        """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
         line = rr.LineStrips3D([shapes.positions(poses)], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
         self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
 
     def log_map(self, points: NDArray[np.floating]) -> None:
-        """Record the finished map (N, d); thinned to a third of the points that the scans took."""
+        """Record the finished map (N, d), downsampled to a third of the points of the scans."""
         self._send(lambda: self._map(points))
 
     def log_grid(
@@ -148,7 +148,7 @@ class Recording:
         self._send(lambda: self._grid(cells, resolution_m, origin_m))
 
     def close(self) -> None:
-        """Write what is gathered, frame the view, and let go of file and viewer; once is enough."""
+        """Write the last batch, frame the view, and close file and viewer; may be called twice."""
         self._send(lambda: [*self.batcher.messages(), *self.graph.draw(self.now)])
         layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
         for sink in self.sinks:
@@ -169,7 +169,7 @@ class Recording:
                 return
 
     def _viewer_address(self) -> str:
-        """Where a viewer takes data, or nothing and a warning."""
+        """Address of a viewer; empty, with a warning, if there is none."""
         try:
             if "web" in self.wanted:
                 self.server = viewer.start_web(self.port, self.web_port)
@@ -241,7 +241,7 @@ class Recording:
             sink.send(messages)
 
     def _guard(self, act: Callable[[], object]) -> None:
-        """A recording that fails must not fail the run: say so, once for each kind of failure."""
+        """Turn an exception into a warning, once per kind: a recording that fails must not fail the run."""
         try:
             with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
                 act()

@@ -1,4 +1,4 @@
-"""Where a recording goes: a file, a live viewer, or both; each is a stream served by a thread of its own.
+"""Destinations of a recording: a file, a live viewer, or both; each is a stream served by its own thread.
 
 rerun can tee one stream to both, but it waits without a limit for a viewer that stops reading (a suspended laptop,
 a broken tunnel) and for a file on a full disk, and the run would wait with it. Here the run waits for a queue, and

@@ -29,7 +29,7 @@ class ViewerError(ScanchainError):
 
 
 def grpc_address(port: int) -> str:
-    """Where a viewer on this machine takes data."""
+    """Address at which a viewer on this machine takes data."""
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
@@ -39,7 +39,7 @@ def web_address(port: int, web_port: int) -> str:
 
 
 def is_listening(port: int) -> bool:
-    """Whether somebody accepts connections on a port of this machine."""
+    """True if a port of this machine accepts connections."""
     try:
         with socket.create_connection((HOST, port), timeout=_PROBE_S):
             return True
@@ -48,7 +48,7 @@ def is_listening(port: int) -> bool:
 
 
 def has_display() -> bool:
-    """Whether a window can be opened."""
+    """True if a window can be opened."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

@@ -1,4 +1,4 @@
-"""report.html of a batch: a row a log, the spread of the figures, every way in small."""
+"""report.html of a batch: a row a log, distributions of the figures, small plots of all trajectories."""
 
 from __future__ import annotations
 
@@ -12,27 +12,37 @@ import numpy as np
 from markupsafe import Markup
 
 from scanchain.batch.table import totals
-from scanchain.batch.task import Row, State, said_file
+from scanchain.batch.task import Row, State, output_file
 from scanchain.runs.metrics import Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.figure import Sheet
+from scanchain.viz.pictures.figure import SvgFigure
 from scanchain.viz.pictures.trajectory_figures import color_of
 from scanchain.viz.report import page
-from scanchain.viz.report.page import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Section, write_page
+from scanchain.viz.report.page import (
+    REPORT_FILE,
+    Cell,
+    Collapsible,
+    Drawing,
+    Grid,
+    Head,
+    Page,
+    Section,
+    write_page,
+)
 from scanchain.words import counted
 
-_MOST_WAYS = 60
+_MAX_TRAJECTORIES = 60
 _MAX_POINTS = 1500  # of a line
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
     Head("log"),
     Head("scans"),
-    Head("degen.", "", "degenerate scans: a direction of motion that nothing determines"),
+    Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
     Head("lost", "", "scans that could not be matched"),
-    Head("warn.", "", "warnings of the run: what was lost, left out or is wrong"),
-    Head("way", "m"),
+    Head("warn.", "", "warnings of the run: data lost, skipped or wrong"),
+    Head("path", "m", "length of the trajectory"),
     Head("loops", "", "loop closures accepted"),
     Head("ATE", "m", "rmse against the ground truth in the log, after optimization"),
     Head("KITTI", "%", "translational error of the KITTI metric"),
@@ -40,7 +50,7 @@ _HEADS = (
     Head("residual", "mm", "median over the scans"),
     Head("speed", "× real time"),
     Head("time", "s", "of the whole process"),
-    Head("memory", "MiB", "most that the process had"),
+    Head("memory", "MiB", "peak of the process"),
 )
 
 
@@ -51,19 +61,22 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
     page = Page(
         title=f"Batch of {counted(len(rows), 'log')}",
-        subtitle="Each was run in a process of its own.",
+        subtitle="Each was run in its own process.",
         facts=tuple(totals(rows)),
         warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
         + tuple(unreliable),
         notes=(),
-        sections=(_logs(directory, rows, names), *_spread(done), *_ways(directory, done, names)),
-        folds=(Fold("Command", shlex.join(without_keys(command))), Fold("Paths", "\n".join(map(_paths, rows)))),
+        sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),
+        collapsibles=(
+            Collapsible("Command", shlex.join(without_keys(command))),
+            Collapsible("Paths", "\n".join(map(_paths, rows))),
+        ),
     )
     write_page(directory / REPORT_FILE, page)
 
 
 def names_of(logs: Sequence[str]) -> dict[str, str]:
-    """What each log is called: its file's name, with as many folders before it as tell it from the others."""
+    """Display name of each log: its file name, with as many parent folders as make it unique."""
     names = {log: source_of(log).name for log in logs}
     for depth in range(2, max((len(Path(log).parts) for log in logs), default=0) + 1):
         counts = Counter(names.values())
@@ -75,7 +88,7 @@ def names_of(logs: Sequence[str]) -> dict[str, str]:
 
 def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Section:
     legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
-    text = "A name leads to the report of its run, or to what was printed where there is none."
+    text = "A name links to the report of its run, or to its output if there is none."
     return Section(
         "Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
     )
@@ -108,7 +121,7 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
 
 def _link(directory: Path, row: Row) -> str:
     """The run's report, else what the last try printed, from this page; empty where there is neither."""
-    for path in (Path(row.run) / REPORT_FILE if row.run else None, said_file(Path(), row.key)):
+    for path in (Path(row.run) / REPORT_FILE if row.run else None, output_file(Path(), row.key)):
         if path is not None and (directory / path).is_file():
             return quote(path.as_posix())
     return ""
@@ -123,7 +136,7 @@ def _paths(row: Row) -> str:
 
 
 def _spread(done: Sequence[Row]) -> Iterator[Section]:
-    """How the figures of the logs spread, where there are some to compare."""
+    """Distributions of the figures, if there are several logs."""
     drawn = (
         ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimized.ate_rmse_m),
         ("Speed", "× real time", lambda row, m: m.times_real_time),
@@ -135,7 +148,9 @@ def _spread(done: Sequence[Row]) -> Iterator[Section]:
         if len(values := _values(done, figure)) > 1
     ]
     if drawings:
-        yield Section("Spread", "Every log's figure, the least first.", drawings=tuple(drawings), is_small=True)
+        yield Section(
+            "Distributions", "Cumulative distribution over the logs.", drawings=tuple(drawings), is_small=True
+        )
 
 
 def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None]) -> list[float]:
@@ -144,36 +159,36 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 
 
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    with Sheet(name) as sheet:
+    with SvgFigure(name) as figure:
         share = 100.0 * (np.arange(len(values)) + 1) / len(values)
-        sheet.axes.step(values, share, where="post", color=color_of(0), marker="o", markersize=2.5)
-        sheet.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
-        sheet.axes.set_ylim(0.0, 105.0)
-        sheet.axes.set_xlabel(f"{name} [{unit}]")
-        sheet.axes.set_ylabel("logs at most so [%]")
-        sheet.axes.grid(visible=True)
-        return sheet.svg()
+        figure.axes.step(values, share, where="post", color=color_of(0), marker="o", markersize=2.5)
+        figure.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
+        figure.axes.set_ylim(0.0, 105.0)
+        figure.axes.set_xlabel(f"{name} [{unit}]")
+        figure.axes.set_ylabel("logs below [%]")
+        figure.axes.grid(visible=True)
+        return figure.svg()
 
 
-def _ways(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
-    """Every way from above, as far as a page can hold them."""
+def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
+    """Every trajectory from above, as far as a page can hold them."""
     drawings = [
-        Drawing(names[row.log], f"{row.run}", _way(row.key, directory / row.run / "trajectory.tum"))
-        for row in done[:_MOST_WAYS]
+        Drawing(names[row.log], f"{row.run}", _trajectory(row.key, directory / row.run / "trajectory.tum"))
+        for row in done[:_MAX_TRAJECTORIES]
     ]
-    text = f"The first {_MOST_WAYS} of {len(done):,}." if len(done) > _MOST_WAYS else ""
+    text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
     if drawings:
-        yield Section("Ways, optimized, seen from above", text, drawings=tuple(drawings), is_small=True)
+        yield Section("Optimized trajectories, seen from above", text, drawings=tuple(drawings), is_small=True)
 
 
-def _way(name: str, trajectory: Path) -> Markup:
+def _trajectory(name: str, trajectory: Path) -> Markup:
     positions = read_tum(trajectory).poses[:, :2, -1]
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
-    with Sheet(name, height_inches=3.6) as sheet:
-        sheet.axes.plot(*positions[rows].T, color=color_of(0))
-        sheet.axes.plot(*positions[0], color=color_of(0), marker="o", markersize=4.0)
-        sheet.axes.set_aspect("equal", adjustable="datalim")
-        sheet.axes.set_xlabel("x [m]")
-        sheet.axes.set_ylabel("y [m]")
-        sheet.axes.grid(visible=True)
-        return sheet.svg()
+    with SvgFigure(name, height_inches=3.6) as figure:
+        figure.axes.plot(*positions[rows].T, color=color_of(0))
+        figure.axes.plot(*positions[0], color=color_of(0), marker="o", markersize=4.0)
+        figure.axes.set_aspect("equal", adjustable="datalim")
+        figure.axes.set_xlabel("x [m]")
+        figure.axes.set_ylabel("y [m]")
+        figure.axes.grid(visible=True)
+        return figure.svg()

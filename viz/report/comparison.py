@@ -16,19 +16,30 @@ from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures import trajectory_figures as figures
-from scanchain.viz.pictures.compared_trajectories import read_courses
+from scanchain.viz.pictures.compared_trajectories import read_trajectories
 from scanchain.viz.pictures.map_figures import map_picture, surroundings
-from scanchain.viz.pictures.trajectory_figures import Course, Floats
-from scanchain.viz.report.page import REPORT_FILE, Cell, Drawing, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain.viz.report.page import (
+    REPORT_FILE,
+    Cell,
+    Collapsible,
+    Drawing,
+    Grid,
+    Head,
+    Page,
+    Row,
+    Section,
+    write_page,
+)
 from scanchain.viz.report.sections import (
     chip,
     error_section,
-    knowledge_section,
     loop_section,
-    provenance_folds,
+    provenance_sections,
     relation_section,
     time_section,
-    way_section,
+    trajectories_section,
+    uncertainty_section,
 )
 
 _WIDEST = 10  # columns of a table beside the summary
@@ -37,7 +48,7 @@ _NEARLY = 1.25  # times the thickness of the sharpest map
 
 def write_compare_report(directory: Path) -> None:
     """Draw and write the page."""
-    table, courses = read_table(directory), read_courses(directory)
+    table, trajectories = read_table(directory), read_trajectories(directory)
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
     page = Page(
@@ -46,14 +57,14 @@ def write_compare_report(directory: Path) -> None:
         facts=_facts(table),
         warnings=tuple(_warnings(table)),
         notes=tuple(table.notes),
-        sections=tuple(_sections(directory, table, courses, truth)),
-        folds=tuple(_folds(directory, table)),
+        sections=tuple(_sections(directory, table, trajectories, truth)),
+        collapsibles=tuple(_collapsibles(directory, table)),
     )
     write_page(directory / REPORT_FILE, page)
 
 
 def _subtitle(table: Table) -> str:
-    how = "through each method, each in a process of its own"
+    how = "through every method, each in its own process"
     return f"The same {table.scans:,} decoded scans {how}. {table.against}"
 
 
@@ -75,13 +86,13 @@ def _warnings(table: Table) -> Iterator[str]:
     for row in table.rows:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
-        if row.doubt:
-            yield f"{row.name} is unreliable: {row.doubt}"
+        if row.unreliable:
+            yield f"{row.name} is unreliable: {row.unreliable}"
 
 
-def _figures(table: Table, courses: Sequence[Course]) -> Iterator[Section]:
+def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
     """The summary, and all else in one table more, or in two where that would be too wide."""
-    yield Section("Summary", grid=_grid(table, table.rows, courses, columns_of(table.figures, "summary")))
+    yield Section("Summary", grid=_grid(table, table.rows, trajectories, columns_of(table.figures, "summary")))
     ended = [row for row in table.rows if row.status is Status.OK]
     accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
     parts = {"More on accuracy": accuracy, "More on time": time}
@@ -89,12 +100,14 @@ def _figures(table: Table, courses: Sequence[Course]) -> Iterator[Section]:
         parts = {"More figures": [*accuracy, *time]}
     for title, columns in parts.items():
         if columns:
-            yield Section(title, grid=_grid(table, ended, courses, columns))
+            yield Section(title, grid=_grid(table, ended, trajectories, columns))
 
 
-def _grid(table: Table, rows: Sequence[TableRow], courses: Sequence[Course], columns: Sequence[Column]) -> Grid:
+def _grid(
+    table: Table, rows: Sequence[TableRow], trajectories: Sequence[DrawnTrajectory], columns: Sequence[Column]
+) -> Grid:
     """A row a method; one that failed says how in place of its figures."""
-    chips = {course.name: chip(course) for course in courses}
+    chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
@@ -107,59 +120,65 @@ def _grid(table: Table, rows: Sequence[TableRow], courses: Sequence[Course], col
     return Grid(heads, tuple(lines), notes)
 
 
-def _sections(directory: Path, table: Table, courses: Sequence[Course], truth: Floats | None) -> Iterator[Section]:
-    yield from _figures(table, courses)
+def _sections(
+    directory: Path, table: Table, trajectories: Sequence[DrawnTrajectory], truth: Floats | None
+) -> Iterator[Section]:
+    yield from _figures(table, trajectories)
     is_planar = table.dimension == 2
-    drawn = [course for course in courses if len(course.positions)]
+    drawn = [trajectory for trajectory in trajectories if len(trajectory.positions)]
     if drawn:
         framing = _sharpest(table, drawn)
-        text = "All start in the same place."
+        text = "All start at the same pose."
         if truth is not None:
-            text = "Each moved onto the truth as for the ATE, one that did not come to its end by its first pose."
+            text = (
+                "Each is aligned to the ground truth as for the ATE; one that did not finish, by its first pose."
+            )
         if truth is None and len(framing) < len(drawn):
-            whole = {course.name for course in framing}
-            astray = ", ".join(course.name for course in drawn if course.name not in whole)
-            text += f" The corners are those of the sharper maps; what leaves the picture is of {astray}."
-        yield way_section(drawn, framing, truth, is_planar=is_planar, text=text)
+            whole = {trajectory.name for trajectory in framing}
+            astray = ", ".join(trajectory.name for trajectory in drawn if trajectory.name not in whole)
+            text += f" The axes frame the sharper maps; {astray} may leave them."
+        yield trajectories_section(drawn, framing, truth, is_planar=is_planar, text=text)
         yield from error_section(drawn, table.truth)
         yield from relation_section(drawn)
         yield from time_section(drawn)
-        yield from knowledge_section(drawn, is_planar=is_planar)
+        yield from uncertainty_section(drawn, is_planar=is_planar)
         yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
-    for course in courses:
+    for trajectory in trajectories:
         yield from loop_section(
-            course, method_folder(directory, course.name) / CLOSURES_FILE, f"Loop closures of {course.name}"
+            trajectory,
+            method_folder(directory, trajectory.name) / CLOSURES_FILE,
+            f"Loop closures of {trajectory.name}",
         )
     if len(table.rows) > 1:
         yield _disagreement(table)
 
 
-def _sharpest(table: Table, courses: Sequence[Course]) -> list[Course]:
-    """Those whose maps are nearly as sharp as the best: what pictures must show whole; all without maps."""
+def _sharpest(table: Table, trajectories: Sequence[DrawnTrajectory]) -> list[DrawnTrajectory]:
+    """Trajectories whose maps are nearly as sharp as the best, which frame the pictures; all without maps."""
     thickness_m = {row.name: row.figures.thickness_m or np.inf for row in table.rows}
-    limit_m = _NEARLY * min(thickness_m[course.name] for course in courses)
-    return [course for course in courses if thickness_m[course.name] <= limit_m]
+    limit_m = _NEARLY * min(thickness_m[trajectory.name] for trajectory in trajectories)
+    return [trajectory for trajectory in trajectories if thickness_m[trajectory.name] <= limit_m]
 
 
 def _map_section(
     directory: Path,
-    courses: Sequence[Course],
-    framing: Sequence[Course],
-    way: tuple[Floats, Floats],
+    trajectories: Sequence[DrawnTrajectory],
+    framing: Sequence[DrawnTrajectory],
+    box: tuple[Floats, Floats],
     dimension: int,
 ) -> Iterator[Section]:
     """Maps, all within the same corners; those of ``framing`` must be seen whole."""
-    files = [(course, method_folder(directory, course.name) / MAP_FILE) for course in courses]
-    maps = [(course, read_ply(file)) for course, file in files if file.exists()]
+    files = [(trajectory, method_folder(directory, trajectory.name) / MAP_FILE) for trajectory in trajectories]
+    maps = [(trajectory, read_ply(file)) for trajectory, file in files if file.exists()]
     if not maps:
         return
-    whole = {course.name for course in framing}
-    corners = surroundings(*way, [points for course, points in maps if course.name in whole])
+    whole = {trajectory.name for trajectory in framing}
+    corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
     drawings = tuple(
-        Drawing(course.name, "", map_picture(f"map {course.name}", points, *corners), chip(course))
-        for course, points in maps
+        Drawing(trajectory.name, "", map_picture(f"map {trajectory.name}", points, *corners), chip(trajectory))
+        for trajectory, points in maps
     )
-    text = "The same points of the same scans, put where each method has the lidar."
+    text = "The same points of the same scans, placed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""
     yield Section("Maps", text, drawings=drawings, is_small=True)
 
@@ -173,17 +192,19 @@ def _disagreement(table: Table) -> Section:
     return Section(
         "Disagreement",
         "Median distance between the motions that two methods find for a scan, in millimeters. "
-        "Not ground truth: two that err alike agree.",
+        "Not a measure of accuracy: two methods with the same error agree.",
         grid=Grid((Head("mm"), *(Head(name) for name in names)), tuple(rows)),
     )
 
 
-def _folds(directory: Path, table: Table) -> Iterator[Fold]:
-    yield from provenance_folds(table.provenance, table.baselines)
-    yield Fold("Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows))
+def _collapsibles(directory: Path, table: Table) -> Iterator[Collapsible]:
+    yield from provenance_sections(table.provenance, table.baselines)
+    yield Collapsible("Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows))
     definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
     if definitions:
-        yield Fold("What errors are", "\n\n".join(definitions))
-    yield Fold(
-        "Settings, as --settings takes them", (directory / SETTINGS_FILE).read_text(encoding="utf-8"), is_long=True
+        yield Collapsible("Definitions of the errors", "\n\n".join(definitions))
+    yield Collapsible(
+        "Settings, in the form of --settings",
+        (directory / SETTINGS_FILE).read_text(encoding="utf-8"),
+        is_long=True,
     )

@@ -69,7 +69,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with what it shows; ``svg`` comes from a ``Sheet`` or is a scene, all else is escaped.
+    """A picture with what it shows; ``svg`` comes from an ``SvgFigure`` or is a scene, all else is escaped.
 
     ``is_wide`` : over the whole width of the page
     """
@@ -94,8 +94,8 @@ class Section:
 
 
 @dataclass(frozen=True, slots=True)
-class Fold:
-    """Text that is shown on demand, as it stands; on paper too, unless ``is_long``."""
+class Collapsible:
+    """Collapsible section of plain text; printed on paper too, unless ``is_long``."""
 
     title: str
     text: str
@@ -115,7 +115,7 @@ class Page:
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
     sections: tuple[Section, ...]
-    folds: tuple[Fold, ...] = ()
+    collapsibles: tuple[Collapsible, ...] = ()
     script: str = ""
 
 

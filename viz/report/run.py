@@ -22,17 +22,17 @@ from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.trajectory_figures import Course, Floats, color_of
-from scanchain.viz.report.page import REPORT_FILE, Cell, Fold, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
+from scanchain.viz.report.page import REPORT_FILE, Cell, Collapsible, Grid, Head, Page, Row, Section, write_page
 from scanchain.viz.report.sections import (
     error_section,
-    knowledge_section,
     loop_section,
-    provenance_folds,
+    provenance_sections,
     time_section,
-    way_section,
+    trajectories_section,
+    uncertainty_section,
 )
-from scanchain.viz.report.trajectory_map import SCRIPT, Told, trajectory_section
+from scanchain.viz.report.trajectory_map import SCRIPT, Tables, trajectory_section
 from scanchain.words import counted
 
 
@@ -48,9 +48,9 @@ def write_run_report(directory: Path) -> None:
         warnings=tuple(line for line in (metrics.unreliable, made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
-        folds=(
-            *provenance_folds(made, {}),
-            Fold("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
+        collapsibles=(
+            *provenance_sections(made, {}),
+            Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
         ),
         script=SCRIPT,
     )
@@ -99,39 +99,41 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
     optimized, before = (_against(each, truth, gap_s) for each in (trajectory, odometry))
     nees = None if truth is None else nees_of_steps(steps, odometry, truth, gap_s=gap_s)
-    T_world_truth = lie.inverse(optimized.T_truth_way)
-    courses = [
-        _course("optimized", 0, trajectory, lie.identity(3), optimized, steps, nees),
-        _course("odometry", 3, odometry, T_world_truth @ before.T_truth_way, before, None, None),
+    T_world_truth = lie.inverse(optimized.T_truth_estimate)
+    trajectories = [
+        _drawn("optimized", 0, trajectory, lie.identity(3), optimized, steps, nees),
+        _drawn("odometry", 3, odometry, T_world_truth @ before.T_truth_estimate, before, None, None),
     ]
     if metrics.ground_truth is not None:
         yield accuracy_section(metrics.ground_truth)
     is_planar = metrics.dimension == 2
-    way = None if truth is None else lie.transform(T_world_truth, optimized.truth)
+    true_path = None if truth is None else lie.transform(T_world_truth, optimized.truth)
     loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
     grain_m = float(str(config["maps.voxel_size_m"]))
-    yield trajectory_section(courses[0], Told.read(steps, loops_file), way, points, grain_m)
+    yield trajectory_section(trajectories[0], Tables.read(steps, loops_file), true_path, points, grain_m)
     if config["loops.enabled"]:
-        yield from loop_section(courses[0], loops_file, "Loop closures")
+        yield from loop_section(trajectories[0], loops_file, "Loop closures")
     text = (
-        "Odometry and truth are moved onto the optimized trajectory as for the ATE." if truth is not None else ""
+        "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."
+        if truth is not None
+        else ""
     )
-    yield way_section(courses, courses, way, is_planar=is_planar, text=text)
+    yield trajectories_section(trajectories, trajectories, true_path, is_planar=is_planar, text=text)
     if metrics.ground_truth is not None:
-        yield from error_section(courses, metrics.ground_truth.source)
-    yield from knowledge_section(courses[:1], is_planar=is_planar)
+        yield from error_section(trajectories, metrics.ground_truth.source)
+    yield from uncertainty_section(trajectories[:1], is_planar=is_planar)
     yield stages_section(metrics)
-    yield from time_section(courses[:1])
+    yield from time_section(trajectories[:1])
 
 
 @dataclass(frozen=True, slots=True)
 class _Off:
-    """A way against the truth: how it was moved onto it, and (N,) meters off, NaN where nothing is known.
+    """A trajectory against the ground truth: its alignment, and errors (N,) in meters, NaN without a true pose.
 
     ``truth`` : (K, 3) true positions at the scans that have one; more would lengthen the path by their noise
     """
 
-    T_truth_way: Pose
+    T_truth_estimate: Pose
     errors_m: Floats
     truth: Floats
 
@@ -146,14 +148,14 @@ def _against(trajectory: Trajectory, truth: Trajectory | None, gap_s: float | No
     return _Off(ate.T_reference_estimate, errors_m, pairs.reference[:, :3, 3])
 
 
-def _course(
-    name: str, place: int, trajectory: Trajectory, T_world_way: Pose, off: _Off, steps: pa.Table | None,
+def _drawn(
+    name: str, place: int, trajectory: Trajectory, T_world_estimate: Pose, off: _Off, steps: pa.Table | None,
     nees: Floats | None,
-) -> Course:  # fmt: skip
-    """One of the two ways in the frame of the map; what is known of the scans belongs to the first."""
+) -> DrawnTrajectory:  # fmt: skip
+    """One of the two trajectories in the frame of the map; figures of the scans belong to the first."""
     unknown = np.full(len(trajectory), np.nan)
-    poses = T_world_way @ trajectory.poses
-    return Course(
+    poses = T_world_estimate @ trajectory.poses
+    return DrawnTrajectory(
         name=name,
         color=color_of(place),
         is_dashed=False,
@@ -182,7 +184,7 @@ def _seconds(steps: pa.Table) -> Floats:
 
 
 def accuracy_section(truth: GroundTruth) -> Section:
-    """How far off both ways were."""
+    """Accuracy of both trajectories."""
     rows = tuple(
         Row(
             name, tuple(Cell(text, is_bad=bool(complaint) and k == 0) for k, text in enumerate(_figures(accuracy)))
@@ -193,8 +195,8 @@ def accuracy_section(truth: GroundTruth) -> Section:
         )
     )
     heads = (
-        Head("way"), Head("ATE", "m", "rmse"), Head("ATE mean", "m"), Head("ATE max", "m"), Head("ATE/path", "%"),
-        Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
+        Head("trajectory"), Head("ATE", "m", "rmse"), Head("ATE mean", "m"), Head("ATE max", "m"),
+        Head("ATE/path", "%"), Head("ATE rot.", "deg", "rmse"), Head("KITTI", "%"), Head("KITTI rot.", "deg/m"),
     )  # fmt: skip
     missing = f", {truth.optimized.missing}" if truth.optimized.missing else ""
     text = (

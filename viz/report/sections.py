@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 from scanchain.runs.provenance import Provenance
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import loops_picture
-from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, Course, Floats
-from scanchain.viz.report.page import Cell, Chip, Drawing, Fold, Grid, Head, Row, Section
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats
+from scanchain.viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _MEDIANS = "Of long logs, medians of neighboring scans."
@@ -25,65 +25,70 @@ _FIGURES = re.compile(
 )  # of one closure; limits stand behind them
 
 
-def chip(course: Course) -> Chip:
-    """The course in a legend."""
-    return Chip(course.name, course.color, course.is_dashed)
+def chip(trajectory: DrawnTrajectory) -> Chip:
+    """The trajectory in a legend."""
+    return Chip(trajectory.name, trajectory.color, trajectory.is_dashed)
 
 
-def _legend(courses: Sequence[Course]) -> tuple[Chip, ...]:
-    """Of several courses; one needs none."""
-    return tuple(chip(course) for course in courses) if len(courses) > 1 else ()
+def _legend(trajectories: Sequence[DrawnTrajectory]) -> tuple[Chip, ...]:
+    """Legend of several trajectories; one needs none."""
+    return tuple(chip(trajectory) for trajectory in trajectories) if len(trajectories) > 1 else ()
 
 
-def way_section(
-    courses: Sequence[Course], framing: Sequence[Course], truth: Floats | None, *, is_planar: bool, text: str
+def trajectories_section(
+    trajectories: Sequence[DrawnTrajectory],
+    framing: Sequence[DrawnTrajectory],
+    truth: Floats | None,
+    *,
+    is_planar: bool,
+    text: str,
 ) -> Section:
-    """Where they went; ``framing`` are those that must be seen whole."""
+    """Trajectories from above, and their heights; ``framing`` are those that must fit in the axes."""
     corners = figures.frame(framing, truth)
-    drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", courses, truth, *corners))]
+    drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", trajectories, truth, *corners))]
     if not is_planar:
-        height = figures.height("height", courses, truth, *corners)
+        height = figures.height("height", trajectories, truth, *corners)
         drawings.append(Drawing("Height", "Over the distance traveled.", height))
-    chips = _legend(courses) if truth is None else (*map(chip, courses), _TRUTH_CHIP)
+    chips = _legend(trajectories) if truth is None else (*map(chip, trajectories), _TRUTH_CHIP)
     return Section("Trajectories", text, chips, tuple(drawings))
 
 
-def error_section(courses: Sequence[Course], truth_name: str) -> Iterator[Section]:
-    """How far off they were."""
-    known = _with(courses, "error_m")
+def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> Iterator[Section]:
+    """Position errors over distance and their distribution."""
+    known = _with(trajectories, "error_m")
     if not known:
         return
     yield Section(
         "Error",
-        f"Distance of each pose from the true one after rigid alignment, against {truth_name}.",
+        f"Distance of each position from the true one after rigid alignment, against {truth_name}.",
         _legend(known),
         (
             Drawing("Over the distance", _MEDIANS, figures.error_over_distance("error", known)),
             Drawing(
                 "Distribution",
-                "Share of the scans that are off by less.",
+                "Share of the scans with a smaller error.",
                 figures.distribution("errors", known, "error_m", 1.0, "position error [m]"),
             ),
         ),
     )
 
 
-def relation_section(courses: Sequence[Course]) -> Iterator[Section]:
-    """How far off they were over relations set by hand."""
-    known = _with(courses, "relation_error_m")
+def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
+    """Errors over manually verified relations."""
+    known = _with(trajectories, "relation_error_m")
     if known:
         drawing = Drawing(
             "Distribution",
-            "Share of the relations that are off by less.",
+            "Share of the relations with a smaller error.",
             figures.distribution("relations", known, "relation_error_m", 1.0, "error of a relation [m]"),
         )
         text = "Distance between the motion of a relation and that of the trajectory."
         yield Section("Error over relations", text, _legend(known), (drawing,))
 
 
-def time_section(courses: Sequence[Course]) -> Iterator[Section]:
-    """How long a scan took."""
-    known = _with(courses, "seconds")
+def time_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
+    """Time per scan along the log and its distribution."""
+    known = _with(trajectories, "seconds")
     if known:
         yield Section(
             "Time per scan",
@@ -100,29 +105,29 @@ def time_section(courses: Sequence[Course]) -> Iterator[Section]:
         )
 
 
-def knowledge_section(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Section]:
-    """What they knew of themselves: covariances against errors, and directions that nothing determined."""
-    told = _with(courses, "observability")
+def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Section]:
+    """Consistency of the covariances with the errors, and observability."""
+    told = _with(trajectories, "observability")
     if not told:
         return
     along = Drawing(
-        "Observability along the way",
-        "How many times the least that it takes is known of the worst direction, worst of neighboring scans. "
-        "Below the dotted line a scan is called degenerate.",
+        "Observability",
+        "Information along the least constrained direction over the minimum required, least of neighboring scans. "
+        "Below 1 (dotted) a scan is degenerate.",
         figures.observability("observability", told),
     )
     whose = f" of {told[0].name}" if len(told) > 1 else ""
     where = Drawing(
-        "Where little was seen",
-        f"The same on the way{whose}.",
+        "Observability on the trajectory",
+        f"The same, seen from above{whose}.",
         figures.observability_plan("blind", told[0]),
     )
-    drawings = (*_consistency(courses, is_planar=is_planar), along, where)
-    yield Section("Certainty", "", _legend(told), drawings)
+    drawings = (*_consistency(trajectories, is_planar=is_planar), along, where)
+    yield Section("Uncertainty", "", _legend(told), drawings)
 
 
-def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Drawing]:
-    judged = _with(courses, "nees")
+def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Drawing]:
+    judged = _with(trajectories, "nees")
     if judged:
         yield Drawing(
             "Covariance consistency",
@@ -132,24 +137,26 @@ def _consistency(courses: Sequence[Course], *, is_planar: bool) -> Iterator[Draw
         )
 
 
-def loop_section(course: Course, path: Path, title: str) -> Iterator[Section]:
+def loop_section(trajectory: DrawnTrajectory, path: Path, title: str) -> Iterator[Section]:
     """Every loop closure tried, and how many of them met which verdict."""
     if not path.exists():
         return
     table = pq.ParquetFile(path).read()  # read_table imports much more
     if not table.num_rows:
-        yield Section(title, "None was tried: the way came back to no place that it had left.")
+        yield Section(title, "None was tried: the trajectory did not return to a place visited before.")
         return
     ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
     rejected_by = np.array(table["rejected_by"].to_pylist())
     counts = Counter(rejected_by.tolist())
-    low, high = figures.frame([course], None)
-    picture = loops_picture(f"loops {course.name}", course, course.positions[ends], rejected_by, low, high)
+    low, high = figures.frame([trajectory], None)
+    picture = loops_picture(
+        f"loops {trajectory.name}", trajectory, trajectory.positions[ends], rejected_by, low, high
+    )
     yield Section(
         title,
         f"{len(ends):,} tried; each is a row of loops.parquet.",
         tuple(Chip(f"{name}: {counts[by]:,}", color) for by, (name, color) in CLOSURES.items()),
-        (Drawing("On the way", "", picture),),
+        (Drawing("On the trajectory", "", picture),),
         _verdict_grid(table),
     )
 
@@ -186,15 +193,17 @@ def _millimeters(value_m: float) -> str:
     return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
-def _with(courses: Sequence[Course], key: str) -> list[Course]:
-    return [course for course in courses if np.isfinite(getattr(course, key)).any()]
+def _with(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajectory]:
+    return [trajectory for trajectory in trajectories if np.isfinite(getattr(trajectory, key)).any()]
 
 
-def provenance_folds(made: Provenance, others: dict[str, str]) -> Iterator[Fold]:
+def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Collapsible]:
     """The command, and the versions that it ran with."""
-    yield Fold("Command", shlex.join(made.command))
+    yield Collapsible("Command", shlex.join(made.command))
     versions = {"python": made.python} | made.versions | others
-    yield Fold("Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items()))
-    yield Fold(
+    yield Collapsible(
+        "Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items())
+    )
+    yield Collapsible(
         "Log files", "\n".join(f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
     )

@@ -19,66 +19,68 @@ from scanchain.data import Points, State
 from scanchain.runs.closures import BACK_END
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import map_picture, path_over_map, surroundings
-from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, Course, Floats, PathLine
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats, PathLine
 from scanchain.viz.report.page import Chip, Drawing, Section
 from scanchain.words import counted
 
 _CONTRADICTED = "contradicted"
 _COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6"}
-_MAX_PIECES = 3000  # of a path; of longer ones the worst state of successive scans
+_MAX_SEGMENTS = 3000  # of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # of a verdict
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What a run's tables say of its path: a row a scan, a row a closure tried (None without loop closing)."""
+class Tables:
+    """Tables of a run: a row a scan, a row a closure tried (None without loop closing)."""
 
     steps: pa.Table
     closures: pa.Table | None
 
     @classmethod
-    def read(cls, steps: pa.Table, closures_file: Path) -> Told:
+    def read(cls, steps: pa.Table, closures_file: Path) -> Tables:
         """With the closures, where their file is."""
         return cls(steps, pq.ParquetFile(closures_file).read() if closures_file.exists() else None)
 
 
 def trajectory_section(
-    course: Course, told: Told, truth: Floats | None, points: Points, grain_m: float
+    trajectory: DrawnTrajectory, tables: Tables, truth: Floats | None, points: Points, grain_m: float
 ) -> Section:
     """The optimized path and the map (M, 3), in one frame; ``truth`` (K, 3) likewise, None where there is none.
 
     grain_m : of the map
     """
     is_flat = not np.ptp(points[:, 2]) if len(points) else True
-    lines, chips = zip(*_lines(course.positions, told, truth), strict=True)
-    low, high = surroundings(*figures.frame([course], truth), [points])
-    drag = "Drag to move" if is_flat else "Drag to turn, Shift-drag to move"
+    lines, chips = zip(*_lines(trajectory.positions, tables, truth), strict=True)
+    low, high = surroundings(*figures.frame([trajectory], truth), [points])
+    drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     above = "seen from above; dark is low, bright is high."
-    over_map = path_over_map("path", points, course.positions, lines, low, high)
+    over_map = path_over_map("path", points, trajectory.positions, lines, low, high)
     drawings = (
         Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
         *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture("map", points, low, high)),)),
         Drawing(
-            "Map to be explored",
-            f"{drag}, click it and scroll to zoom, double-click to begin anew; two fingers zoom and move.",
+            "Interactive map",
+            f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
             map_scene(points, lines, low, high, grain_m=grain_m, is_flat=is_flat),
             is_wide=not is_flat,
         ),
     )
-    joined = "Contradicted: scans joined by closures that the back end rejected because the rest contradicts them."
+    joined = (
+        "Contradicted: scans of closures that the back end rejected as the rest of the graph contradicts them."
+    )
     text = joined if any(chip.name.startswith(_CONTRADICTED) for chip in chips) else ""
     return Section("Trajectory and map", text, chips, drawings)
 
 
-def _lines(path: Floats, told: Told, truth: Floats | None) -> Iterator[tuple[PathLine, Chip]]:
-    """What is drawn and how it is called, the path first; of what there is none there is no line."""
+def _lines(path: Floats, tables: Tables, truth: Floats | None) -> Iterator[tuple[PathLine, Chip]]:
+    """Lines with their legends, the path first; empty ones are omitted."""
     yield PathLine(path, "#2f7de1", 1.2), Chip("trajectory", "#2f7de1")
-    yield from _closure_lines(path, told.closures)
-    marks = _states(told)
+    yield from _closure_lines(path, tables.closures)
+    marks = _states(tables)
     for state, color in _COLORS.items():
         count = int((marks == list(_COLORS).index(state)).sum())
         if count:
-            line = PathLine(_stretches(path, marks, list(_COLORS).index(state)), color, 2.6)
+            line = PathLine(_marked_parts(path, marks, list(_COLORS).index(state)), color, 2.6)
             yield line, Chip(f"{state}: {counted(count, 'scan')}", color)
     if truth is not None:
         yield PathLine(truth, TRUTH, 0.9, is_dashed=True), Chip("ground truth", TRUTH, is_dashed=True)
@@ -99,15 +101,15 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
             yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
-def _states(told: Told) -> NDArray[np.int64]:
+def _states(tables: Tables) -> NDArray[np.int64]:
     """(N,) of every scan its place in ``_COLORS``, −1 where nothing is wrong."""
     names = list(_COLORS)
-    states = told.steps["state"].to_pylist()
+    states = tables.steps["state"].to_pylist()
     marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
-    if told.closures is None or not told.closures.num_rows:
+    if tables.closures is None or not tables.closures.num_rows:
         return marks
-    keyframes = np.append(np.flatnonzero(told.steps["keyframe"].to_numpy() >= 0), len(marks))
-    chosen = told.closures.filter(pc.field("rejected_by") == BACK_END)
+    keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
+    chosen = tables.closures.filter(pc.field("rejected_by") == BACK_END)
     for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
         end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
         stretch = marks[scan:end]
@@ -115,9 +117,9 @@ def _states(told: Told) -> NDArray[np.int64]:
     return marks
 
 
-def _stretches(path: Floats, marks: NDArray[np.int64], mark: int) -> Floats:
+def _marked_parts(path: Floats, marks: NDArray[np.int64], mark: int) -> Floats:
     """The parts of the path that lead to a scan of this mark, NaN elsewhere."""
-    size = max(1, -(-len(path) // _MAX_PIECES))
+    size = max(1, -(-len(path) // _MAX_SEGMENTS))
     groups = [slice(k, k + size) for k in range(0, len(path), size)]
     is_marked = np.array([bool((marks[group] == mark).any()) for group in groups])
     positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
@@ -154,14 +156,14 @@ def map_scene(
         "lines": [_line(line, low, high) for line in lines if len(line.positions)],
     }
     template = Markup(
-        '<canvas class="scene" tabindex="0" role="img" aria-label="Map and trajectory, to be turned and zoomed" '
+        '<canvas class="scene" tabindex="0" role="img" aria-label="Map and trajectory, to rotate and zoom" '
         'data-scene="{}"></canvas><div class="buttons"></div>'
     )
     return template.format(json.dumps(scene, separators=(",", ":")))
 
 
 def _line(line: PathLine, low: Floats, high: Floats) -> dict[str, object]:
-    """As the script takes it: whole and thinned out, or, where it is broken, as pairs of points."""
+    """As the script takes it: whole and downsampled, or, where it is broken, as pairs of points."""
     positions, is_known = line.positions, np.isfinite(line.positions[:, 0])
     if is_broken := not is_known.all():
         starts = np.flatnonzero(is_known[:-1] & is_known[1:])

@@ -1,1 +1,1 @@
-"""Checkpoints of a run, and how one goes on after it was stopped."""
+"""Checkpoints of a run, and resuming it after it was stopped."""

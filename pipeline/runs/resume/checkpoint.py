@@ -1,4 +1,4 @@
-"""state.checkpoint: the whole chain as it was after some scan, to go on from."""
+"""state.checkpoint: the whole state of SLAM after some scan, to resume from."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least 
 
 
 def _version() -> str:
-    """That of the package and a checksum of its code: other code would not go on to the same bits."""
+    """Version of the package and checksum of its code: other code would not give the same bits."""
     package = Path(__file__).parents[2]
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})"
@@ -52,7 +52,7 @@ def _version() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The chain after ``scans`` scans, which took ``run_s`` seconds of work.
+    """SLAM after ``scans`` scans, which took ``run_s`` seconds of work.
 
     The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
     numbers the processes that wrote to the run directory, from 0.
@@ -86,10 +86,10 @@ _CLASSES = Classes(
 
 
 class Checkpoints:
-    """Writes the chain down every so often, and so rarely that it takes a twentieth of the time at the most."""
+    """Writer of checkpoints, at an interval at which they take at most 5 % of the time."""
 
     def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
-        """run_s : that the ``process`` earlier processes took up to the checkpoint gone on from."""
+        """run_s : seconds that the ``process`` earlier processes took up to the checkpoint."""
         self.path = folder / CHECKPOINT_FILE
         self.process = process
         self.every_s = every_s
@@ -97,7 +97,7 @@ class Checkpoints:
         self.next_s = perf_counter() + every_s
 
     def are_due(self) -> bool:
-        """Whether it is time for the next."""
+        """True when it is time for the next."""
         return perf_counter() >= self.next_s
 
     def write(self, slam: Slam, recorded_bytes: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""What is kept of a run that failed, and what is said of it."""
+"""A failed run: the files that are kept, and the error that says where they are."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from scanchain.words import counted
 
 
 class PartialRunError(ScanchainError):
-    """A run that failed after some scans; what there is lies in a directory marked partial."""
+    """A run that failed after some scans; its results so far are in a directory marked partial."""
 
 
 def how_to_resume(command: Sequence[str]) -> str:
-    """What goes on with a run that this command line began; one without was begun by a script."""
+    """Command that resumes the run which this command line started; scripts have none."""
     words = [*without_keys(command[1:]), *([] if "--resume" in command else ["--resume"])]
     again = f"scanchain {shlex.join(words)}" if len(command) > 1 else "the same with --resume"
-    return f"to go on with it: {again}"
+    return f"to resume: {again}"
 
 
 def rescued(
     error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
 ) -> BaseException:
-    """The error to raise; what there is of a run that got somewhere is written and said where it lies."""
+    """The error to raise; the results so far are written, and the error names their directory."""
     is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
     if not len(steps) and not is_bug:
         return error
@@ -60,7 +60,7 @@ def rescued(
 
 
 def _reason(error: BaseException) -> str:
-    """What ended a run, in words."""
+    """Reason why a run ended, as text."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     known = told(error) if isinstance(error, OSError) else ""
@@ -68,7 +68,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
-    """Write what there is. Raises OSError where the disk is full, after which nothing half-written is left."""
+    """Write the results so far. Raises OSError on a full disk, after which nothing half-written is left."""
     written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
     try:
         provenance.write(folder / RUN_FILE)

@@ -1,4 +1,4 @@
-"""Going on with a run that was killed: what it left is checked against what is asked for now."""
+"""Resuming a run that was killed: its files are checked against the present log and configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """What a killed run left: its directory, the chain at the last checkpoint, the steps up to there."""
+    """State of a killed run: its directory, SLAM at the last checkpoint, the steps up to there."""
 
     folder: Path
     checkpoint: Checkpoint
@@ -31,7 +31,7 @@ class Left:
 
 
 def find_left(out: Path, configuration: str) -> Left | None:
-    """What there is of an earlier run into ``out``, None where it had no checkpoint.
+    """State of an earlier run into ``out``, None if it had no checkpoint.
 
     configuration : that of now, as TOML. Raises InputError where that run's, or its version, was another.
     """
@@ -59,7 +59,7 @@ def after(
 
 
 def set_aside(folder: Path, checkpoint: Checkpoint) -> None:
-    """Remove what will be made anew, but for the recording, which only gets another name.
+    """Remove files that will be written again, except the recording, which is renamed.
 
     The name tells which process wrote it: one killed before its own first checkpoint leaves it to the next.
     """
@@ -73,21 +73,21 @@ def set_aside(folder: Path, checkpoint: Checkpoint) -> None:
             path.unlink()
 
 
-def go_on_recording(folder: Path, left: Left, recording: Recorder, checkpoints: Checkpoints) -> str:
-    """Let the recorder go on where the last checkpoint left it, and take over from there; what to say of it."""
+def resume_recording(folder: Path, left: Left, recording: Recorder, checkpoints: Checkpoints) -> str:
+    """Resume the recording where the last checkpoint left it; returns a note about it."""
     checkpoint, slam = left.checkpoint, left.checkpoint.slam
     before = _recorded_by(checkpoint.process, folder)
     is_whole = 0 < checkpoint.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
     if is_whole:
         os.truncate(before, checkpoint.recorded_bytes)
-    recording.go_on(before if is_whole else None, left.steps.rows, slam.closures, slam.graph.state())
+    recording.resume(before if is_whole else None, left.steps.rows, slam.closures, slam.graph.state())
     recorded_bytes = recording.secure()
     checkpoints.write(slam, recorded_bytes)
-    note = f"went on after {counted(checkpoint.scans, 'scan')}"
+    note = f"resumed after {counted(checkpoint.scans, 'scan')}"
     if recorded_bytes and is_whole:
         before.unlink()
     elif before.exists():
-        note += f"; the recording up to there is {before.name}{'' if is_whole else ', which lacks something'}"
+        note += f"; the recording up to there is {before.name}{'' if is_whole else ', incomplete'}"
     elif recorded_bytes:
         note += "; the recording begins there"
     return note

@@ -1,4 +1,4 @@
-"""What ``scanchain optimize`` has found out about a graph, as text and as JSON."""
+"""Report of ``scanchain optimize`` on a graph, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What there is to print."""
+class GraphReport:
+    """Everything to print about an optimized graph."""
 
     file: G2oFile
     change: GraphChange
@@ -33,7 +33,7 @@ class Answer:
     certificate: Certificate
 
     def text(self, written: list[Path]) -> str:
-        """A line for each fact."""
+        """One line per fact."""
         graph, done = self.file.graph, self.optimization
         guess = done.initialization
         if guess == "given":
@@ -44,30 +44,28 @@ class Answer:
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
             *self._projected,
-            f"first guess    {guess}",
+            f"initial guess  {guess}",
             f"chi2           {self._chi2}",
             f"iterations     {done.iterations:,} in {1e3 * done.time_s:.0f} ms; {self._ending}",
         ]
         if graph.is_loop.any():
             rest = "; they do not count" if done.rejected.any() else ""
-            lines.append(
-                f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} suspected edges{rest}"
-            )
+            lines.append(f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} loop edges{rest}")
         lines += self._free
-        held = ", the robust weights held" if graph.is_loop.any() else ""
+        held = ", with fixed robust weights" if graph.is_loop.any() else ""
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
 
     @property
     def _warnings(self) -> list[str]:
-        """What to know before the rest is read."""
+        """Warnings to read before the rest."""
         weight = self.file.graph.weight[self.file.graph.is_loop]
-        doubted = int((weight < _HALF).sum())
-        if 2 * doubted <= len(weight):
+        downweighted = int((weight < _HALF).sum())
+        if 2 * downweighted <= len(weight):
             return []
         return [
-            f"{doubted:,} of {len(weight):,} suspected edges are rejected or count less than half: if they are "
-            "right, all below is wrong; the certificate is for the edges in force, not for the choice of them"
+            f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they are "
+            "right, all below is wrong; the certificate covers the edges in force, not their selection"
         ]
 
     @property
@@ -86,13 +84,13 @@ class Answer:
 
     @property
     def _ending(self) -> str:
-        """Why the iteration stopped."""
+        """Reason why the iteration stopped."""
         done = self.optimization
         return done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
 
     @property
     def _chi2(self) -> str:
-        """Of the edges in force before and after, with how many degrees of freedom."""
+        """χ² of the edges in force before and after, with the degrees of freedom."""
         from scanchain.graph.optimization import fit, has_loops
 
         before, after = self.change.before, self.change.after
