@@ -137,11 +137,13 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     The search radius is what odometry may have drifted since the place was seen, ``drift`` meters a meter, at
     least ``min_radius_m`` and at most ``max_radius_m``.
 
-    In 3D, places are also recognized by their looks from above, as far as ``place_radius_m`` around where voxels
-    have their full size, wherever odometry has them within ``place_drift`` meters a meter. They look alike from
-    ``min_likeness`` on, and are the same if ``min_place_overlap`` of the points lie on surfaces,
-    ``min_agreement`` of as many of those in sight do so as within either view alone, and the match knows every
-    direction by ``min_place_information``.
+    ``recognizer`` proposes places seen before, however far the map has drifted: "auto" (descriptors of submaps
+    seen from above in 3D, none in the plane), "none", or a class of your own, ``module:Class``. Submaps reach
+    ``place_radius_m`` around a keyframe where voxels have their full size; a closure is plausible within
+    ``place_drift`` meters a meter of where odometry has it. In 3D, descriptors are similar from
+    ``min_similarity`` on, and submaps are of one place if ``min_place_overlap`` of the points lie on surfaces,
+    ``min_agreement`` of as many of those in sight do so as within either submap alone, and the match has
+    ``min_place_information`` in every direction.
 
     In the plane ``refine`` aligns every scan once more, at the end, to the map of all keyframes.
     """
@@ -157,10 +159,10 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     edge_sigma_m: Positive = 0.05
     edge_sigma_rad: Positive = 0.005
     optimize_every: Count = 10
-    recognize_places: bool = True
+    recognizer: str = "auto"
     place_radius_m: Positive = 32.0
     place_drift: Positive = 0.1
-    min_likeness: Share = 0.45
+    min_similarity: Share = 0.45
     min_place_overlap: Share = 0.4
     min_place_information: NonNegative = 0.005
     min_agreement: Share = 0.87

@@ -212,7 +212,7 @@ class Slam:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
             if tracked.elsewhere_m > 0.0:
                 sigmas = (tracked.elsewhere_m, np.pi)
-                self.closer.begin_piece(keyframe.index)
+                self.closer.start_segment(keyframe.index)
             self.graph.add_edge(
                 last.index,
                 keyframe.index,

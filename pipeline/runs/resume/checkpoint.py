@@ -13,18 +13,12 @@ from scanchain.clock import working_s
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.voxels.voxel_shapes import Voxels
-from scanchain.loops.anywhere_closer import AnywhereCloser
-from scanchain.loops.closer import LoopCloser
-from scanchain.loops.doubt import Doubt
-from scanchain.loops.gallery import Gallery
-from scanchain.loops.near_closer import NearCloser
-from scanchain.loops.pieces import Pieces
-from scanchain.loops.place import Place
+from scanchain.loops.closer import LoopCloser, ProximityCloser
+from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.place_closer import PlaceCloser
-from scanchain.loops.planar_search import PlanarSearch
-from scanchain.loops.recognition import Recognition
-from scanchain.loops.submaps import Submaps
-from scanchain.loops.verification import Verifier
+from scanchain.loops.relocalization import PlanarSearch, Relocalizer
+from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.matching import PointToShapeMatcher, SvdMatcher, VoxelMap
 from scanchain.odometry import FrontEnd, Odometry
 from scanchain.odometry.experience import Experience
@@ -66,16 +60,17 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, Experience, Resolution, Sweep,
-        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, NearCloser, PlaceCloser, PlanarSearch,
-        Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph, GrowingArray, PointStore, StoredPoints,
-        Pieces, AnywhereCloser,
+        VoxelMap, Voxels, PointToShapeMatcher, SvdMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer,
+        PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, GrowingArray,
+        PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
         (PoseGraph, "_problem"): None,
         (PoseGraph, "_factor_is_now"): False,
-        (Submaps, "held"): OrderedDict(),
+        (VoxelSubmaps, "cached"): OrderedDict(),
+        (PlaceCloser, "recognizer"): None,
         (PointStore, "file"): None,
     },
     _version(),

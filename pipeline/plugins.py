@@ -1,0 +1,57 @@
+"""Classes of the user's own, named as ``module:Class`` in a configuration key."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from scanchain.errors import InputError
+
+
+def load(name: str) -> type:
+    """The class that ``module:Class`` names: installed, on PYTHONPATH or else in the working directory.
+
+    The working directory joins the search path only for a module found nowhere else: until then nothing that
+    happens to lie there is imported. Raises InputError where there is no such module or class.
+    """
+    module_name, _, class_name = name.partition(":")
+    if not module_name or not class_name:
+        raise InputError(f"{name!r} names no class; wanted module:Class, as in my_module:MyClass")
+    module = _imported(module_name, name)
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+        classes = [key for key in own if isinstance(vars(module)[key], type)]
+        there = f"there are {', '.join(classes)}" if classes else "it defines none"
+        raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
+    return found
+
+
+def _imported(module_name: str, name: str) -> ModuleType:
+    here = str(Path.cwd())
+    importlib.invalidate_caches()
+    try:
+        try:
+            return importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            if not _is_missing(module_name, error) or here in sys.path:
+                raise
+        sys.path.append(here)
+        return importlib.import_module(module_name)
+    except Exception as error:  # whatever the module does at its top level
+        if _is_missing(module_name, error):
+            raise InputError(
+                f"{name}: there is no module {module_name} in {here} or on PYTHONPATH; go to its folder, or set "
+                "PYTHONPATH to it"
+            ) from None
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{name}: importing {module_name} failed with {type(error).__name__}: {reason}"
+        ) from error
+
+
+def _is_missing(module_name: str, error: Exception) -> bool:
+    """Whether it is the module itself, or a package it lies in, that was not found."""
+    return isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}.")
