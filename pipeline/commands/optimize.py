@@ -139,7 +139,7 @@ class Outputs:
 
     def write(self, answer: Answer) -> list[Path]:
         """Write them all; which those are."""
-        from scanchain.graph.files.covariance_table import chosen_poses, write_covariances
+        from scanchain.graph.covariance import chosen_poses, write_covariances
         from scanchain.graph.files.g2o_write import write_graph
 
         file = answer.file
