@@ -210,11 +210,11 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     edge_sigma_m : translational standard deviation added to that of a loop edge
     edge_sigma_rad : rotational standard deviation added to that of a loop edge
     optimize_every : keyframes between two optimizations of the graph, at the least
-    recognize_places : whether revisits are also found by place recognition, from descriptors of submaps seen
-        from above
-    place_radius_m : radius of a descriptor; it shrinks with the voxels
+    recognizer : proposes places seen before, however far the map has drifted: "auto" (descriptors of submaps seen
+        from above in 3D, none in the plane), "none", or ``module:Class`` of your own
+    place_radius_m : radius of a submap that is recognized; it shrinks with the voxels
     place_drift : drift in meters a meter within which recognized places are accepted
-    min_likeness : descriptor similarity from which on a place is verified by matching
+    min_similarity : descriptor similarity from which on a place is verified by matching
     min_place_overlap : ``min_overlap`` of a recognized place
     min_place_information : ``min_information`` of a recognized place
     min_agreement : agreement about free space from which on a recognized place is accepted, relative to that
@@ -233,10 +233,10 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     edge_sigma_m: Positive = 0.05
     edge_sigma_rad: Positive = 0.005
     optimize_every: Count = 10
-    recognize_places: bool = True
+    recognizer: str = "auto"
     place_radius_m: Positive = 32.0
     place_drift: Positive = 0.1
-    min_likeness: Share = 0.45
+    min_similarity: Share = 0.45
     min_place_overlap: Share = 0.4
     min_place_information: NonNegative = 0.005
     min_agreement: Share = 0.87

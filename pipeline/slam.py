@@ -30,7 +30,7 @@ from scanchain.data import (
 from scanchain.errors import InputError
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.graduation import Judgment
+from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.loops import LoopCloser, refined, spread
 from scanchain.odometry import FrontEnd, Located, checked_start
 from scanchain.point_store import PointStore
@@ -38,12 +38,12 @@ from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
 _GROWTH = 0.05  # of the graph, between two optimizations that change little
-_SURPRISE = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
+_LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
 @dataclass(frozen=True, slots=True)
 class SlamResult:
-    """What a log amounts to.
+    """The result of a log.
 
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried.
@@ -93,7 +93,7 @@ class Slam:
         self.T_world_odom = lie.identity(self.dimension)
         self.traveled_m = 0.0
         self.waiting_closures = 0
-        self.surprising = False
+        self.moves_map = False
         self.lost_scans = 0
         self.optimized_at = 0
         self.is_finished = False
@@ -157,7 +157,7 @@ class Slam:
             tell("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
         tell(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
-        state = self._optimize("mended")
+        state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
@@ -212,7 +212,7 @@ class Slam:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
             if tracked.elsewhere_m > 0.0:
                 sigmas = (tracked.elsewhere_m, np.pi)
-                self.closer.begin_piece(keyframe.index)
+                self.closer.start_segment(keyframe.index)
             self.graph.add_edge(
                 last.index,
                 keyframe.index,
@@ -242,7 +242,7 @@ class Slam:
         expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
         error = lie.log(lie.between(Z_ij, expected))
         self.waiting_closures += 1
-        self.surprising |= lie.apart(expected, Z_ij)[0] > _SURPRISE * config.edge_sigma_m
+        self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         return replace(closure, chi2_before=float(error @ information @ error))
 
@@ -250,19 +250,19 @@ class Slam:
         """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
 
         The growth asked for is a share of the graph, so that all optimizations together cost little more than a
-        few of the last one. Verdicts are mended where the map moves: there a wrong one would last.
+        few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
         enough = self.config.loops.optimize_every
-        if not self.surprising:
+        if not self.moves_map:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:
             return None
-        return self._optimize("mended" if self.surprising else "graduated")
+        return self._optimize("refined" if self.moves_map else "gnc")
 
-    def _optimize(self, judgment: Judgment) -> GraphState:
-        state = self.graph.optimize(self.config.graph, initialize="given", judgment=judgment).state
-        self.waiting_closures, self.surprising, self.optimized_at = 0, False, len(self.keyframes)
+    def _optimize(self, rejection: OutlierRejection) -> GraphState:
+        state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
+        self.waiting_closures, self.moves_map, self.optimized_at = 0, False, len(self.keyframes)
         self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
 

@@ -127,7 +127,7 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], [0]), "is_loop .* wanted .* True or"),
         (lambda: PoseGraph(2).optimize(Config()), "config is .*; wanted a GraphConfig"),
         (lambda: PoseGraph(2).optimize(GraphConfig(), initialize="best"), "initialize is 'best'; it must be"),
-        (lambda: PoseGraph(2).optimize(GraphConfig(), judgment="fair"), "judgment is 'fair'; it must be"),
+        (lambda: PoseGraph(2).optimize(GraphConfig(), rejection="fair"), "rejection is 'fair'; it must be"),
         (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),

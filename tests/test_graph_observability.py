@@ -8,9 +8,9 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.edge_checks import ranks
 from scanchain.graph.observability import free_poses
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.soundness import ranks
 
 PLAIN = GraphConfig(robust="none")
 NAMES = {2: ("x", "y", "yaw"), 3: ("x", "y", "z", "roll", "pitch", "yaw")}

@@ -10,9 +10,8 @@ from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.solvers.curvature import full_curvature
-from scanchain.graph.solvers.estimate import Estimate
-from scanchain.graph.solvers.steps import Optimizer
+from scanchain.graph.solvers.descent import Optimizer
+from scanchain.graph.solvers.minimizer import Evaluation, full_curvature
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
@@ -103,7 +102,7 @@ def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
     problem, poses = graph._prepared(), graph.poses
     weights = np.array([1.0, 0.5, 1.0, 0.7])
     errors = problem.errors(poses)
-    now = Estimate(poses, errors, problem.chi2(errors), 0.0)
+    now = Evaluation(poses, errors, problem.chi2(errors), 0.0)
     values = full_curvature(problem, now, problem.linearize(poses, errors, weights))
     n, step = problem.pattern.scalars, 1e-3
 

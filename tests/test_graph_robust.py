@@ -7,7 +7,7 @@ from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.verdicts import contradictions
+from scanchain.graph.robust.inliers import contradictions
 from tests.benchmarks.wrong_edges import try_wrong_loops
 
 

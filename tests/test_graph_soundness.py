@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scanchain.graph.soundness import positive_semidefinite, ranks
+from scanchain.graph.edge_checks import positive_semidefinite, ranks
 
 
 def some_matrices(k, seed=0):

@@ -7,7 +7,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
-from scanchain.kernels.graph.shortest_paths import shortest_ways
+from scanchain.kernels.graph.shortest_paths import shortest_paths
 from scanchain.kernels.registration import descent
 from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.residuals import normal_equations
@@ -332,7 +332,7 @@ def test_deskewing_moves_each_point_along_the_motion(dimension):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_shortest_ways_equal_those_of_scipy(seed):
+def test_shortest_paths_equal_those_of_scipy(seed):
     rng = np.random.default_rng(seed)
     edges = np.concatenate([np.stack([np.arange(39), np.arange(1, 40)], axis=1), rng.integers(0, 45, (20, 2))])
     lengths = rng.uniform(0.1, 2.0, len(edges))
@@ -340,9 +340,9 @@ def test_shortest_ways_equal_those_of_scipy(seed):
     for (i, j), length in zip(edges, lengths, strict=True):
         dense[i, j] = dense[j, i] = min(dense[i, j], length)
     expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
-    assert shortest_ways(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
+    assert shortest_paths(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
 
 
 def test_an_edge_of_infinite_length_leads_nowhere():
     edges = np.array([[0, 1], [1, 2]])
-    assert shortest_ways(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]
+    assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]

@@ -12,7 +12,7 @@ from scanchain.landmarks import guess as guesses
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
 from scanchain.landmarks.files.npz import read_landmark_data
 from scanchain.landmarks.minimize import QUADRATIC, minimize
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
 
 
@@ -103,7 +103,7 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
     start = {
         "disturbed": guesses.disturbed(good, 1.0, 0.5),
         "turned the other way": guesses.disturbed(good, -1.0, -0.5),
-        "origin": State(good.poses, np.zeros_like(good.landmarks)),
+        "origin": Values(good.poses, np.zeros_like(good.landmarks)),
     }[guess]
     minimum = minimize(problem, start, create_solver("schur"), optimizer=optimizer)
     assert minimum.converged

@@ -5,8 +5,8 @@ import pytest
 
 from scanchain.kernels.landmarks import dead_reckoning
 from scanchain.landmarks.files.mrclam import RangeLog
-from scanchain.landmarks.ranges.correlation import Likeness
 from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise, chain, reckon
+from scanchain.landmarks.ranges.noise_model import SightingPairs
 from scanchain.landmarks.ranges.slam import solve_range_log
 
 OF_ITS_OWN = np.array([0.0, -0.05, 0.04, -0.03, 0.2])
@@ -90,7 +90,7 @@ def test_sightings_that_err_alike_count_as_fewer_and_leave_the_covariance_honest
 
 def test_a_share_is_one_over_the_sum_of_a_sightings_correlations():
     seen_s, landmarks = np.array([0.0, 0.4, 0.7, 30.0, 0.1]), np.array([0, 0, 0, 0, 1])
-    likeness = Likeness(seen_s, landmarks)
+    likeness = SightingPairs(seen_s, landmarks)
     correlation = np.array([0.5, 0.25, 0.0, 0.0, 0.0, 0.0])  # up to 0.5 s, up to 1 s, beyond
     assert np.allclose(likeness.share(correlation), [1 / 1.75, 1 / 2.0, 1 / 1.75, 1.0, 1.0])
 
@@ -102,7 +102,7 @@ def test_correlations_of_residuals_are_found_by_their_lag():
     residuals[0] = rng.normal(size=2)
     for k in range(1, 4000):
         residuals[k] = 0.8 * residuals[k - 1] + 0.6 * rng.normal(size=2)
-    found = Likeness(seen_s, np.zeros(4000, int)).correlation(residuals)
+    found = SightingPairs(seen_s, np.zeros(4000, int)).correlation(residuals)
     assert found[0] == pytest.approx(0.8, abs=0.05)
     assert found[1] == pytest.approx(0.5 * (0.8**2 + 0.8**3), abs=0.08)
     assert np.all(np.diff(found) <= 0.0)

@@ -8,7 +8,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.landmarks import column_order
 from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
-from scanchain.landmarks.solvers.eliminate_landmarks import LandmarkElimination
+from scanchain.landmarks.solvers.schur import LandmarkElimination
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
 OWN = ("qr", "qr_colamd", "cholesky", "schur")

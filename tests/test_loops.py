@@ -1,4 +1,4 @@
-"""Loop closure in the plane: what the graph may be off by, and revisits after drift."""
+"""Loop closure in the plane: uncertainty from drift, and revisits after drift."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from scanchain.data import Verdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
-from scanchain.loops.doubt import Doubt
+from scanchain.loops.connectivity import Drift
 from scanchain.runs.closures import final_verdicts
 
 
@@ -25,32 +25,32 @@ def chain(count, sigma_m=0.01):
     return graph
 
 
-def test_doubt_grows_along_the_way_up_to_its_limit():
-    doubts_m = Doubt(0.1).between(chain(30), 29, 2.0)
-    assert np.allclose(doubts_m, np.minimum(0.1 * (29 - np.arange(30)), 2.0))
+def test_uncertainty_grows_along_the_path_up_to_its_limit():
+    uncertainty_m = Drift(0.1).between(chain(30), 29, 2.0)
+    assert np.allclose(uncertainty_m, np.minimum(0.1 * (29 - np.arange(30)), 2.0))
 
 
-def test_a_loop_shortens_the_way_for_all_that_it_joins():
+def test_a_loop_shortens_the_path_for_all_that_it_connects():
     graph = chain(30)
     graph.add_edge(5, 25, lie.pose_2d(20.0, 0.0, 0.0), 1e6 * np.eye(3), is_loop=True)
-    doubts_m = Doubt(0.1).between(graph, 29, 5.0)
-    assert doubts_m[5] == pytest.approx(0.4, abs=1e-3)
-    assert doubts_m[8] == pytest.approx(0.7, abs=1e-3)
+    uncertainty_m = Drift(0.1).between(graph, 29, 5.0)
+    assert uncertainty_m[5] == pytest.approx(0.4, abs=1e-3)
+    assert uncertainty_m[8] == pytest.approx(0.7, abs=1e-3)
 
 
-def test_an_edge_counts_by_its_own_doubt_where_odometry_was_lost():
+def test_an_edge_counts_by_its_own_uncertainty_where_odometry_was_lost():
     graph = chain(3)
     graph.add_pose(lie.pose_2d(3.0, 0.0, 0.0), 3)
     graph.add_edge(2, 3, lie.pose_2d(1.0, 0.0, 0.0), np.diag([2.0, 2.0, 25.0]))
-    assert Doubt(0.1).between(graph, 3, 5.0) == pytest.approx([1.2, 1.1, 1.0, 0.0])
+    assert Drift(0.1).between(graph, 3, 5.0) == pytest.approx([1.2, 1.1, 1.0, 0.0])
 
 
-def test_doubt_follows_a_graph_that_grows():
-    graph, doubt = chain(10), Doubt(0.1)
-    doubt.between(graph, 9, 5.0)
+def test_uncertainty_follows_a_graph_that_grows():
+    graph, drift = chain(10), Drift(0.1)
+    drift.between(graph, 9, 5.0)
     graph.add_pose(lie.pose_2d(10.0, 0.0, 0.0), 10)
     graph.add_edge(9, 10, lie.pose_2d(1.0, 0.0, 0.0), 1e6 * np.eye(3))
-    assert Doubt(0.1).between(graph, 10, 5.0) == pytest.approx(doubt.between(graph, 10, 5.0))
+    assert Drift(0.1).between(graph, 10, 5.0) == pytest.approx(drift.between(graph, 10, 5.0))
 
 
 def run(longer, turn_rad_m):

@@ -1,4 +1,4 @@
-"""Place recognition in 3D: the view from above, the gallery, local maps that agree or do not."""
+"""Place recognition in 3D: descriptors, their database, submaps that agree or do not."""
 
 from functools import cache
 
@@ -11,15 +11,12 @@ from scanchain import lie
 from scanchain.data import Keyframe, Proposal, Verdict
 from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.kernels.search.descriptor import count_heights, mark_heights
-from scanchain.loops.agreement import free_space_agreement
-from scanchain.loops.gallery import Gallery
-from scanchain.loops.local_map import local_map
-from scanchain.loops.pieces import Pieces
-from scanchain.loops.place import compare, describe
-from scanchain.loops.place_closer import PlaceCloser
-from scanchain.loops.submaps import Submaps
-from scanchain.loops.upright import level_frame
-from scanchain.loops.verification import Verifier
+from scanchain.loops import LoopCloser
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.descriptor import compare, describe, level_frame
+from scanchain.loops.descriptor_recognizer import DescriptorDatabase
+from scanchain.loops.submaps import VoxelSubmaps, submap_around
+from scanchain.loops.verification import SubmapVerifier, free_space_agreement
 from scanchain.simulation import plan
 from scanchain.simulation.sensors import take_sweep
 
@@ -76,10 +73,10 @@ def street(offset_m=0.0, backwards=False):
 
 @cache
 def place_in_the_middle(offset_m=0.0, backwards=False):
-    """Local map and place around the middle of that drive."""
+    """Submap and descriptor around the middle of that drive."""
     keyframes = passage(street(offset_m, backwards))
-    surroundings = local_map(keyframes, len(keyframes) // 2, RADIUS_M, Pieces())
-    return surroundings, describe(surroundings, lie.identity(3))
+    submap = submap_around(keyframes, len(keyframes) // 2, RADIUS_M, Segments())
+    return submap, describe(submap, lie.identity(3))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -118,11 +115,11 @@ def test_where_nothing_was_seen_nothing_is_said():
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.9, 3.0, -2.3, -0.7])
 def test_a_place_is_known_again_however_it_is_turned(yaw):
-    surroundings, place = place_in_the_middle()
-    turned = describe(surroundings, pose(3.0, -4.0, yaw=yaw))
-    likeness = compare(turned, place)
-    error = lie.log(likeness.T_target_source)
-    assert likeness.score > 0.8
+    submap, place = place_in_the_middle()
+    turned = describe(submap, pose(3.0, -4.0, yaw=yaw))
+    alignment = compare(turned, place)
+    error = lie.log(alignment.T_target_source)
+    assert alignment.similarity > 0.8
     assert np.linalg.norm(error[:3]) < 0.3 and np.linalg.norm(error[3:]) < 0.03
     assert np.linalg.norm(turned.key - place.key) < 0.25
 
@@ -130,21 +127,21 @@ def test_a_place_is_known_again_however_it_is_turned(yaw):
 @pytest.mark.parametrize(("offset_m", "backwards"), [(0.0, False), (4.0, False), (4.0, True), (0.0, True)])
 def test_a_place_is_known_again_from_the_other_lane_and_the_other_way(offset_m, backwards):
     _, first = place_in_the_middle()
-    surroundings, second = place_in_the_middle(offset_m, backwards)
-    likeness = compare(second, first)
-    truth = lie.inverse(place_in_the_middle()[0].anchor.T_odom_lidar) @ surroundings.anchor.T_odom_lidar
-    error = lie.inverse(truth) @ likeness.T_target_source
-    assert likeness.score > 0.6
+    submap, second = place_in_the_middle(offset_m, backwards)
+    alignment = compare(second, first)
+    truth = lie.inverse(place_in_the_middle()[0].anchor.T_odom_lidar) @ submap.anchor.T_odom_lidar
+    error = lie.inverse(truth) @ alignment.T_target_source
+    assert alignment.similarity > 0.6
     assert np.linalg.norm(error[:2, 3]) < 1.0 and lie.rotation_angle(error) < 0.1
 
 
 def test_a_heading_that_is_expected_is_kept_to():
-    surroundings, place = place_in_the_middle()
-    opposite = describe(surroundings, pose(yaw=np.pi))
+    submap, place = place_in_the_middle()
+    opposite = describe(submap, pose(yaw=np.pi))
     free = compare(opposite, place)
     held = compare(opposite, place, expected_rad=0.0, within_rad=0.5)
     level = lie.inverse(place.T_anchor_level) @ held.T_target_source @ opposite.T_anchor_level
-    assert free.score > held.score
+    assert free.similarity > held.similarity
     assert abs(np.arctan2(level[1, 0], level[0, 0])) < 0.6
 
 
@@ -159,30 +156,30 @@ def test_up_is_where_the_ground_says_whatever_the_lidars_tilt(pitch, roll):
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_the_gallery_finds_what_trying_all_finds():
+def test_the_database_finds_what_a_linear_search_finds():
     rng = np.random.default_rng(0)
-    gallery, kept = Gallery(), []
+    database, kept = DescriptorDatabase(), []
     _, model = place_in_the_middle()
     for k in range(120):
         key = rng.normal(size=len(model.key)).astype(np.float32)
-        place = type(model)(k, model.T_anchor_level, model.cell_m, model.image, model.spectrum, key)
-        found = gallery.alike(place, 5, before_m=k - 10.0)
+        descriptor = type(model)(k, model.T_anchor_level, model.cell_m, model.image, model.spectrum, key)
+        found = database.most_similar(descriptor, 5, k - 10.0)
         old = [other for other in kept if other.anchor <= k - 10]
         expected = sorted(old, key=lambda other: float(np.linalg.norm(other.key - key)))[:5]
         assert [other.anchor for other in found] == [other.anchor for other in expected]
-        gallery.add(place, float(k))
-        kept.append(place)
+        database.add(descriptor, float(k))
+        kept.append(descriptor)
 
 
-def test_local_maps_of_one_place_agree_and_those_of_two_do_not():
+def test_submaps_of_one_place_agree_and_those_of_two_do_not():
     here, _ = place_in_the_middle()
     again, _ = place_in_the_middle(4.0, True)
     truth = lie.inverse(here.anchor.T_odom_lidar) @ again.anchor.T_odom_lidar
-    true = Verifier(configured(3)).measure(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
+    true = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
     error = lie.inverse(truth) @ true.match.T_target_source
     assert true.match.converged and true.overlap > 0.6 and true.agreement > 0.9
     assert np.linalg.norm(error[:3, 3]) < 0.1 and lie.rotation_angle(error) < 0.005
-    false = Verifier(configured(3)).measure(again, here, truth @ pose(0.0, 9.0))
+    false = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(0.0, 9.0))
     assert false.agreement < 0.87
 
 
@@ -197,7 +194,7 @@ def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     points, T = scan_from(50.0, -2.0, 0.0)
-    submaps = Submaps(3, 5, configured(3).local_map, Pieces())
+    submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
     submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
@@ -217,7 +214,7 @@ def there_and_back(lost_m=0.0):
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])
 def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lost_m):
     keyframes, truth = there_and_back(lost_m)
-    closer = PlaceCloser(configured(3), Pieces())
+    closer = LoopCloser(configured(3), 3).places
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     accepted = [
         closure
@@ -234,7 +231,7 @@ def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lo
 def test_a_place_that_odometry_cannot_have_missed_by_so_much_is_refused():
     keyframes, _ = there_and_back(8.0)
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    closures = PlaceCloser(configured(3, {"loops.place_drift": 0.001}), Pieces()).close(
+    closures = LoopCloser(configured(3, {"loops.place_drift": 0.001}), 3).places.close(
         keyframes, poses, np.ones(len(keyframes), bool), finish=True
     )
     assert closures and all(closure.verdict is Verdict.REJECTED for closure in closures)

@@ -140,7 +140,7 @@ class Outputs:
 
     def write(self, report: GraphReport) -> list[Path]:
         """Write them all and return their paths."""
-        from scanchain.graph.files.covariance_table import chosen_poses, write_covariances
+        from scanchain.graph.covariance import chosen_poses, write_covariances
         from scanchain.graph.files.g2o_write import write_graph
 
         file = report.file

@@ -1,12 +1,21 @@
-"""Covariances of poses from the factor of H, without its inverse."""
+"""Covariances of poses from the factor of H, without its inverse, and as a table."""
 
 from __future__ import annotations
 
+import csv
+import io
+from pathlib import Path
+
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
+from scanchain.whole_file import write_whole
+
+_NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 
 
 def own_covariances(problem: BetweenProblem) -> Matrix:
@@ -35,3 +44,34 @@ def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
             selection[problem.variable[pose]] += sign * np.eye(problem.freedom)
     flat = problem.packing.rows(selection)
     return flat.T @ problem.cholesky.solve(flat)
+
+
+def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places among ``ids`` (K,) of the poses that ``all`` or ``0,7,12`` name."""
+    if text.strip() == "all":
+        return np.arange(len(ids))
+    try:
+        wanted = [int(word) for word in text.split(",")]
+    except ValueError:
+        raise InputError(f"--marginals is {text!r}; take all, or vertex ids with commas between them") from None
+    unknown = sorted(set(wanted) - set(ids.tolist()))
+    if unknown:
+        raise InputError(f"--marginals {unknown[0]}: no such vertex; the ids go from {ids.min()} to {ids.max()}")
+    place = {name: index for index, name in enumerate(ids.tolist())}
+    return np.array([place[name] for name in wanted])
+
+
+def write_covariances(path: Path, ids: NDArray[np.int64], covariances: Matrix) -> None:
+    """Write a CSV file, a line a pose: its id and the upper triangle of its covariance (K, k, k).
+
+    Of twists in the pose's own frame, T exp(ξ), order (translation, rotation): m², m rad, rad². Raises OSError.
+    """
+    names = _NAMES[covariances.shape[-1]]
+    upper = np.triu_indices(len(names))
+    header = ["id", *(f"{names[a]}_{names[b]}" for a, b in zip(*upper, strict=True))]
+    file = io.StringIO(newline="")
+    writer = csv.writer(file)
+    writer.writerow(header)
+    for name, row in zip(ids.tolist(), covariances[:, upper[0], upper[1]].tolist(), strict=True):
+        writer.writerow([name, *row])
+    write_whole(path, file.getvalue().encode())

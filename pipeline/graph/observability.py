@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.edge_checks import is_connected, listed, loose
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.soundness import is_connected, listed, loose
 from scanchain.words import counted
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}

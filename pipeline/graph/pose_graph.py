@@ -15,6 +15,7 @@ from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, relative_covariance
+from scanchain.graph.edge_checks import check_connected, check_edges, ranks
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -26,11 +27,9 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization
-from scanchain.graph.robust.graduation import Judgment
+from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.solvers.solve import solve
-from scanchain.graph.soundness import check_connected, check_edges, ranks
 from scanchain.words import counted
 
 
@@ -196,20 +195,20 @@ class PoseGraph:
         self._fixed.add(index)
 
     def optimize(
-        self, config: GraphConfig, *, initialize: Initialization = "auto", judgment: Judgment = "mended"
+        self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: OutlierRejection = "refined"
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        judgment : of loop edges under the truncated loss; "graduated" is good enough on the way and cheaper
+        rejection : of loop edges under the truncated loss; "gnc" is good enough on the way and cheaper
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
-        checks.one_of(judgment, get_args(Judgment), "judgment")
+        checks.one_of(rejection, get_args(OutlierRejection), "rejection")
         begin = working_s()
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            solved = solve(problem, self.poses, self.is_loop, config, initialize, judgment)
+            solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         minimum = solved.minimum

@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.landmarks.files.mrclam import RangeLog
-from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.problem import LandmarkData, Values
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
@@ -41,7 +41,7 @@ class Truth:
     landmarks: Matrix
 
 
-def of_positions(state: State, data: LandmarkData) -> Accuracy:
+def of_positions(state: Values, data: LandmarkData) -> Accuracy:
     """Against the positions of a course file; both lie in one frame."""
     return Accuracy(
         _rms(state.poses - data.true_poses),
@@ -67,7 +67,7 @@ def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.
     return Truth(known, poses, surveyed)
 
 
-def against_truth(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
+def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
     """ATE of the poses after rigid alignment, landmarks by the same alignment; and T_truth_estimate (3, 3)."""
     stamps_ns = nanoseconds(nodes_s[truth.known])
     estimate = Trajectory(stamps_ns, pose_matrices(state.poses[truth.known]))

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.kernels.landmarks import factors
-from scanchain.landmarks.assembly import landmark_columns, pattern_of, pose_columns, whitening
-from scanchain.landmarks.problem import LandmarkData, State
-from scanchain.landmarks.system import Layout, LinearSystem
+from scanchain.landmarks.problem import LandmarkData, Values
+from scanchain.landmarks.system import Layout, LinearSystem, landmark_columns, pattern_of, pose_columns, whitening
 
 _ANCHOR = 0.01  # noise of the first pose, in shares of a step's
 
@@ -134,7 +133,7 @@ class BearingRangeProblem:
         self._slope = -self.motion_whitening @ given.calibration.slope
         self._observation = whitening(given.measured_covariance)
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: Values) -> Linearization:
         """Residuals and Jacobians at a state."""
         given, p = self.measurements, state.poses.shape[1]
         calibration = given.calibration

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.landmarks.bearing_range import BearingRangeProblem
 from scanchain.landmarks.minimize import Optimizer, minimize
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
@@ -58,7 +58,7 @@ def compare_linear(system: LinearSystem, methods: Sequence[str], repeats: int) -
 
 
 def compare_nonlinear(
-    problem: BearingRangeProblem, guess: State, optimizer: Optimizer, methods: Sequence[str], repeats: int
+    problem: BearingRangeProblem, guess: Values, optimizer: Optimizer, methods: Sequence[str], repeats: int
 ) -> tuple[MethodResult, ...]:
     """Minimize from the guess with every method, interleaved; slow ones once only."""
 

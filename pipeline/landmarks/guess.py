@@ -11,7 +11,7 @@ from scanchain.data import Matrix
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements
 from scanchain.landmarks.minimize import minimize
-from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.problem import LandmarkData, Values
 from scanchain.landmarks.ranges.dead_reckoning import chain
 from scanchain.landmarks.solvers import LinearSolver
 
@@ -20,25 +20,25 @@ _STEPS = 2
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
 
-def from_odometry(measurements: Measurements) -> State:
+def from_odometry(measurements: Measurements) -> Values:
     """Poses chained by the motions, every landmark where its first observation puts it."""
     if measurements.motion.shape[1] == 3:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
         poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
-    return State(poses, _first_seen(measurements, poses)[0], measurements.calibration.value)
+    return Values(poses, _first_seen(measurements, poses)[0], measurements.calibration.value)
 
 
-def of_relative_positions(data: LandmarkData) -> State:
+def of_relative_positions(data: LandmarkData) -> Values:
     """The same for a linear problem."""
     poses = np.cumsum(np.vstack([np.zeros(2), data.odometry]), axis=0)
     _, first = np.unique(data.observed[:, 1], return_index=True)
     landmarks = np.full(data.true_landmarks.shape, np.nan)
     landmarks[data.observed[first, 1]] = poses[data.observed[first, 0]] + data.measured[first]
-    return State(poses, landmarks)
+    return Values(poses, landmarks)
 
 
-def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
+def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
     """The poses but for the first moved by a shift along both axes and turned about the origin."""
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     poses = state.poses.copy()
@@ -47,7 +47,7 @@ def disturbed(state: State, shift_m: float, turn_rad: float) -> State:
     return replace(state, poses=poses)
 
 
-def growing(measurements: Measurements, solver: LinearSolver) -> State:
+def growing(measurements: Measurements, solver: LinearSolver) -> Values:
     """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
 
     Dead reckoning over the whole log may be meters off, where a robust loss finds but a local minimum; over a
@@ -65,11 +65,11 @@ def growing(measurements: Measurements, solver: LinearSolver) -> State:
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
         state = minimize(
-            BearingRangeProblem(part), State(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
+            BearingRangeProblem(part), Values(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
         ).state
         poses, landmarks[known], own = state.poses, state.landmarks, state.calibration
         if reach == count:
-            return State(poses, landmarks, own)
+            return Values(poses, landmarks, own)
         reach *= _GROWTH
 
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.solvers.descent import descend
-from scanchain.graph.solvers.steps import step_rule
+from scanchain.graph.solvers.descent import descend, step_rule
 from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearization
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 from scanchain.landmarks.system import LinearSystem
 
@@ -48,7 +47,7 @@ class Minimum:
     iterations : steps; converged, reason : whether and why it stopped
     """
 
-    state: State
+    state: Values
     at: Linearization
     weights: NDArray[np.float64]
     cost: float
@@ -59,7 +58,7 @@ class Minimum:
 
 def minimize(
     problem: BearingRangeProblem,
-    guess: State,
+    guess: Values,
     solver: LinearSolver,
     *,
     loss: Loss = QUADRATIC,
@@ -87,7 +86,7 @@ def minimize(
 class Evaluation:
     """A state with its residuals and the cost of them."""
 
-    state: State
+    state: Values
     at: Linearization
     cost: float
 

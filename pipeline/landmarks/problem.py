@@ -41,7 +41,7 @@ class LandmarkData:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class Values:
     """An estimate: poses (K, 2) x, y or (K, 3) x, y, heading, landmarks (L, 2); m, rad.
 
     ``calibration`` (C,) are unknowns of the robot itself, none for a file.
@@ -56,10 +56,10 @@ class State:
         """All in one, poses first, landmarks last, (n,)."""
         return np.concatenate([self.poses.ravel(), self.calibration, self.landmarks.ravel()])
 
-    def moved(self, step: NDArray[np.float64]) -> State:
-        """The state a step (n,) away, poses first, landmarks last."""
+    def moved(self, step: NDArray[np.float64]) -> Values:
+        """The values a step (n,) away, poses first, landmarks last."""
         poses, calibration, landmarks = np.split(step, np.cumsum([self.poses.size, self.calibration.size]))
-        return State(
+        return Values(
             self.poses + poses.reshape(self.poses.shape),
             self.landmarks + landmarks.reshape(self.landmarks.shape),
             self.calibration + calibration,

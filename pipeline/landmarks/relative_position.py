@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanchain.landmarks.assembly import (
+from scanchain.landmarks.problem import LandmarkData, Values
+from scanchain.landmarks.system import (
+    Layout,
+    LinearSystem,
     Rows,
     difference_rows,
     landmark_columns,
@@ -12,8 +15,6 @@ from scanchain.landmarks.assembly import (
     pose_columns,
     whitening,
 )
-from scanchain.landmarks.problem import LandmarkData, State
-from scanchain.landmarks.system import Layout, LinearSystem
 
 _ANCHOR = 100.0  # times the weight of a step
 
@@ -38,7 +39,7 @@ def linear_system(data: LandmarkData) -> LinearSystem:
     return LinearSystem(pattern_of([group.columns for group in groups], layout), values, np.concatenate(b))
 
 
-def state_of(data: LandmarkData, x: np.ndarray) -> State:
+def state_of(data: LandmarkData, x: np.ndarray) -> Values:
     """The unknowns as positions."""
     split = 2 * len(data.true_poses)
-    return State(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))
+    return Values(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))

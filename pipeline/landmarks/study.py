@@ -12,7 +12,7 @@ from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.landmarks.accuracy import Accuracy
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.minimize import Optimizer
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
 
 Guess = Literal["odometry", "disturbed", "origin"]
@@ -52,7 +52,7 @@ def left_out_fact(what: str) -> list[Fact]:
 class Estimate:
     """Poses and landmarks, how far off they are, and T_truth_estimate (3, 3) that carries them to the truth."""
 
-    state: State
+    state: Values
     accuracy: Accuracy
     T_truth_estimate: Pose
 

@@ -10,16 +10,15 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.landmarks import guess as guesses
 from scanchain.landmarks.accuracy import of_positions
-from scanchain.landmarks.assembly import landmark_columns, pose_columns
 from scanchain.landmarks.bearing_range import BearingRangeProblem, world_referenced
 from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.minimize import minimize
-from scanchain.landmarks.problem import LandmarkData, State
+from scanchain.landmarks.problem import LandmarkData, Values
 from scanchain.landmarks.relative_position import linear_system, state_of
 from scanchain.landmarks.solvers import create_solver, methods_for
 from scanchain.landmarks.study import Estimate, Fact, Guess, Options, Study, left_out_fact
-from scanchain.landmarks.system import LinearSystem
+from scanchain.landmarks.system import LinearSystem, landmark_columns, pose_columns
 from scanchain.words import FREEDOM, counted
 
 _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
@@ -32,8 +31,8 @@ def study_file(data: LandmarkData, options: Options) -> Study:
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    before: State
-    after: State
+    before: Values
+    after: Values
     converged: bool
     system: LinearSystem
     build_s: float
@@ -94,7 +93,7 @@ def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
     return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
 
 
-def _guess(problem: BearingRangeProblem, guess: Guess) -> State:
+def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
     state = guesses.from_odometry(problem.measurements)
     if guess == "disturbed":
         return guesses.disturbed(state, _SHIFT_M, _TURN_RAD)

@@ -13,7 +13,7 @@ from scanchain.data import Trajectory
 from scanchain.landmarks.accuracy import Accuracy, Truth, against_truth, nanoseconds, pose_matrices, truth_at
 from scanchain.landmarks.compare import compare_linear
 from scanchain.landmarks.files.mrclam import RangeLog, read_mrclam
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.ranges.dead_reckoning import OWN, OWN_UNITS
 from scanchain.landmarks.ranges.slam import RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import methods_for
@@ -58,7 +58,7 @@ def study_log(folder: Path, options: Options) -> Study:
     )
 
 
-def _estimate(state: State, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
+def _estimate(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
     if np.count_nonzero(truth.known) < 2:
         nothing = Accuracy(np.nan, np.nan, "no motion capture at these times")
         return Estimate(state, nothing, lie.identity(2))

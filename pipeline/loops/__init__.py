@@ -1,7 +1,6 @@
-"""Propose and verify revisits, and let every scan have its share of what they tell."""
+"""Loop closure: place recognition, verification, relocalization; and the trajectory of all scans at the end."""
 
 from scanchain.loops.closer import LoopCloser
-from scanchain.loops.refinement import refined
-from scanchain.loops.spreading import spread
+from scanchain.loops.refinement import refined, spread
 
 __all__ = ["LoopCloser", "refined", "spread"]

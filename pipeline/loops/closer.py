@@ -1,48 +1,104 @@
-"""Loop closures: where a keyframe may be by position and drift and, in 3D, places recognized by their looks."""
+"""Loop closures: to keyframes near by position and drift, to recognized places, and by relocalization."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from scanchain.config import Config
-from scanchain.data import Closure, Keyframe
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import Config, LoopsConfig
+from scanchain.data import Closure, Keyframe, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.loops.anywhere_closer import AnywhereCloser
-from scanchain.loops.near_closer import NearCloser
-from scanchain.loops.pieces import Pieces
+from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.place_closer import PlaceCloser
+from scanchain.loops.relocalization import PlanarSearch, Relocalizer
+from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.verification import ScanVerifier
 
 
 class LoopCloser:
-    """Looks from each new keyframe for an older place and measures where it lies."""
+    """Searches from each new keyframe for older ones that it revisits and verifies them."""
 
     def __init__(self, config: Config, dimension: int) -> None:
-        self.pieces = Pieces()
-        self.near = NearCloser(config, dimension, self.pieces)
-        self.anywhere = AnywhereCloser(self.near, self.pieces) if dimension == 2 else None
-        self.places = (
-            PlaceCloser(config, self.pieces) if dimension == 3 and config.loops.recognize_places else None
-        )
+        """Raises InputError for a recognizer that cannot be loaded."""
+        self.segments = Segments()
+        submaps = VoxelSubmaps(dimension, config.loops.submap_keyframes, config.local_map, self.segments)
+        verifier = ScanVerifier(config, submaps)
+        search = PlanarSearch(submaps) if dimension == 2 else None
+        self.near = ProximityCloser(config.loops, submaps, verifier, search)
+        self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
+        self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
-    def begin_piece(self, keyframe: int) -> None:
-        """Say that nobody knows how the lidar came to this keyframe from the one before."""
-        self.pieces.begin(keyframe)
+    def start_segment(self, keyframe: int) -> None:
+        """Say that the motion from the keyframe before to this one is unknown."""
+        self.segments.start(keyframe)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to an older place near it, and of places recognized; accepted or not.
+        """Closures of the newest keyframe, and of places whose submaps are complete by now; accepted or not.
 
-        keyframes : all so far; graph : their best known poses, and how they are joined
+        keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        groups = self.pieces.groups(graph)
-        joined = groups == groups[-1]
-        near = self.near.close(keyframes, graph, joined)
-        if self.anywhere is not None:
-            return near + self.anywhere.close(keyframes, graph, groups)
-        return near if self.places is None else near + self.places.close(keyframes, graph.poses, joined)
+        components = self.segments.components(graph)
+        connected = components == components[-1]
+        closures = self.near.close(keyframes, graph, connected)
+        if self.relocalizer is not None:
+            closures += self.relocalizer.close(keyframes, graph, components)
+        return closures + self.places.close(keyframes, graph.poses, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the places that waited for more of their surroundings to be seen."""
-        if self.places is None:
+        """Closures of the places whose submaps the end of the log leaves incomplete."""
+        components = self.segments.components(graph)
+        return self.places.close(keyframes, graph.poses, components == components[-1], finish=True)
+
+
+class ProximityCloser:
+    """Aligns each new keyframe to the nearest older one; in the plane, searches within the drift if that fails."""
+
+    def __init__(
+        self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: ScanVerifier, search: PlanarSearch | None
+    ) -> None:
+        self.config = config
+        self.submaps = submaps
+        self.verifier = verifier
+        self.search = search
+        self.drift = Drift(config.drift)
+
+    def close(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, connected: NDArray[np.bool_]
+    ) -> tuple[Closure, ...]:
+        """Closures of the newest keyframe to older ones, accepted or not.
+
+        connected : (K,) keyframes in the component of the newest
+        """
+        old = self._old(keyframes)
+        if not old:
             return ()
-        groups = self.pieces.groups(graph)
-        return self.places.close(keyframes, graph.poses, groups == groups[-1], finish=True)
+        T_world, newest = graph.poses, len(keyframes) - 1
+        uncertainty_m = self.drift.between(graph, newest, self.config.max_radius_m)[:old]
+        distance_m = np.linalg.norm(T_world[:old, :-1, -1] - T_world[-1, :-1, -1], axis=1)
+        near = np.flatnonzero(
+            connected[:old] & (distance_m <= np.maximum(uncertainty_m, self.config.min_radius_m))
+        )
+        if not len(near):
+            return ()
+        target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
+        T_first = lie.between(T_world[target], T_world[-1])
+        verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
+        closure = verified.closure(target, newest)
+        if closure.verdict is Verdict.ACCEPTED or self.search is None:
+            return (closure,)
+        found = self.search.find(keyframes, T_world, near, uncertainty_m)
+        if found is None:
+            return (closure,)
+        searched = self.verifier.verify(keyframes, newest, found.anchor, found.T_anchor_source, newest=old - 1)
+        return closure, searched.closure(found.anchor, newest, Proposal.PLACE)
+
+    def _old(self, keyframes: Sequence[Keyframe]) -> int:
+        """Number of the first keyframes that lie far enough back along the path to count as revisited."""
+        limit_m = keyframes[-1].traveled_m - self.config.min_travel_m
+        old = len(keyframes)
+        while old > 0 and keyframes[old - 1].traveled_m > limit_m:
+            old -= 1
+        return old

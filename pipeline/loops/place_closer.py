@@ -1,4 +1,4 @@
-"""Loop closures of places recognized: described once complete, compared with all older ones, measured, judged."""
+"""Loop closures of recognized places: a submap is added once complete, queried, and its candidates verified."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
-from scanchain.loops.local_map import FUTURE, PAST, LocalMap, local_map
-from scanchain.loops.pieces import Pieces
-from scanchain.loops.place import describe
-from scanchain.loops.recognition import Candidate, Recognition
-from scanchain.loops.upright import level_frame
-from scanchain.loops.verification import Measurement, Verifier
+from scanchain.errors import InputError
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_recognizer
+from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
+from scanchain.loops.verification import ScanVerifier, SubmapVerifier, Verification
 
-_SPACING = 1.0 / 3.0  # radii of the way between two places
+_SPACING = 1.0 / 3.0  # radii of the path between two submaps
 
 
 class PlaceCloser:
-    """Asks of every few keyframes whether their surroundings were seen before.
+    """Asks the recognizer of every few keyframes whether their surroundings were seen before.
 
-    The surroundings are complete once the lidar has gone on by the radius of a view.
+    A submap is complete once the lidar has gone on by its radius.
     """
 
-    def __init__(self, config: Config, pieces: Pieces) -> None:
-        self.config = config.loops
-        self.pieces = pieces
-        self.map_config = config.local_map
-        self.recognition = Recognition(config.loops)
-        self.verifier = Verifier(config)
+    def __init__(self, config: Config, dimension: int, segments: Segments, verifier: ScanVerifier) -> None:
+        """Verifier : of candidates in the plane; in 3D submaps are aligned."""
+        self.config = config
+        self.dimension = dimension
+        self.segments = segments
+        self.scan_verifier = verifier
+        self.submap_verifier = SubmapVerifier(config)
+        self.recognizer = create_recognizer(config, dimension)
+        self.added: list[int] = []
         self.examined = 0
         self.next_m = 0.0
         self.last: Closure | None = None
@@ -39,27 +41,39 @@ class PlaceCloser:
     def close(
         self,
         keyframes: Sequence[Keyframe],
-        T_world_keyframes: Matrix,
-        joined: NDArray[np.bool_],
+        T_world: Matrix,
+        connected: NDArray[np.bool_],
         *,
         finish: bool = False,
     ) -> tuple[Closure, ...]:
-        """Closures of the places that are complete by now, accepted or not; with ``finish``, of all that are left.
+        """Closures of the submaps that are complete by now, accepted or not; with ``finish``, of all others, too.
 
-        keyframes : all so far; T_world_keyframes : (K, 4, 4) their best known poses
-        joined : (K,) those that lie as the graph says as seen from the newest, and among themselves
+        keyframes : all so far; T_world : (K, d+1, d+1) their best known poses
+        connected : (K,) keyframes in the component of the newest
         """
+        recognizer = self._recognizer(keyframes)
+        if recognizer is None:
+            return ()
         closures: list[Closure] = []
         for anchor in self._anchors(keyframes, finish):
-            closures += self._closures(anchor, keyframes, T_world_keyframes, joined)
+            closures += self._closures(recognizer, anchor, keyframes, T_world, connected)
         return tuple(closures)
 
+    def _recognizer(self, keyframes: Sequence[Keyframe]) -> Recognizer | None:
+        """The recognizer; after a checkpoint, which does not hold it, a new one with the same submaps."""
+        if self.recognizer is None:
+            self.recognizer = create_recognizer(self.config, self.dimension)
+            if self.recognizer is not None:
+                for index in self.added:
+                    self.recognizer.add(self._submap(keyframes[index], keyframes))
+        return self.recognizer
+
     def _anchors(self, keyframes: Sequence[Keyframe], finish: bool) -> Iterator[Keyframe]:
-        """Keyframes that places are made of, each once."""
+        """Keyframes that submaps are made around, each once."""
         while self.examined < len(keyframes):
             keyframe = keyframes[self.examined]
             radius_m = self._radius_m(keyframe)
-            if keyframes[-1].traveled_m < keyframe.traveled_m + FUTURE * radius_m and not finish:
+            if keyframes[-1].traveled_m < keyframe.traveled_m + RADII_AHEAD * radius_m and not finish:
                 return
             self.examined += 1
             if keyframe.traveled_m >= self.next_m:
@@ -67,86 +81,86 @@ class PlaceCloser:
                 yield keyframe
 
     def _closures(
-        self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix, joined: NDArray[np.bool_]
+        self,
+        recognizer: Recognizer,
+        anchor: Keyframe,
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+        connected: NDArray[np.bool_],
     ) -> Iterator[Closure]:
         """The first that is accepted, after those that are not."""
-        radius_m = self._radius_m(anchor)
-        surroundings = local_map(keyframes, anchor.index, radius_m, self.pieces)
-        place = describe(surroundings, level_frame(anchor, self.map_config))
-        apart_m = max((PAST + FUTURE) * radius_m, self.config.min_travel_m)  # no scan belongs to both
-        candidates = self.recognition.candidates(
-            place,
-            self._expected(anchor, keyframes, T_world),
-            before_m=anchor.traveled_m - apart_m,
-            radius_m=radius_m,
-            keyframes=keyframes,
-            T_world=T_world,
-        )
-        for candidate in candidates:
-            is_known = bool(joined[candidate.target] == joined[anchor.index])
-            if not is_known and candidate.proposed_by is Proposal.POSITION:
+        submap = self._submap(anchor, keyframes)
+        recognizer.add(submap)
+        self.added.append(anchor.index)
+        apart_m = max((RADII_BEHIND + RADII_AHEAD) * submap.radius_m, self.config.loops.min_travel_m)
+        T_expected = self._expected(anchor, keyframes, T_world)
+        query = Query(submap, anchor.traveled_m - apart_m, T_expected, keyframes, T_world)
+        for candidate in recognizer.query(query):
+            self._check(candidate, query)
+            is_connected = bool(connected[candidate.target] == connected[anchor.index])
+            if not is_connected and candidate.proposed_by is Proposal.POSITION:
                 continue
-            target = local_map(keyframes, candidate.target, radius_m, self.pieces)
-            measured = self.verifier.measure(surroundings, target, candidate.likeness.T_target_source)
-            closure = self._judge(candidate, surroundings, target, measured, T_world if is_known else None)
+            verified = self._verify(submap, candidate, keyframes)
+            problem = self._problem(candidate, verified, query, is_connected)
+            closure = verified.closure(candidate.target, anchor.index, candidate.proposed_by, problem=problem)
             yield closure
             if closure.verdict is Verdict.ACCEPTED:
                 self.last = closure
                 return
 
+    def _submap(self, anchor: Keyframe, keyframes: Sequence[Keyframe]) -> Submap:
+        return submap_around(keyframes, anchor.index, self._radius_m(anchor), self.segments)
+
+    def _radius_m(self, anchor: Keyframe) -> float:
+        return self.config.loops.place_radius_m * anchor.scale
+
     def _expected(self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
-        """T_world_lidar by odometry since the last closure; that one may not have moved the map yet."""
+        """T_world_anchor by odometry since the last closure; that one may not have moved the map yet."""
         if self.last is None:
             return T_world[anchor.index]
         T_last_anchor = lie.between(keyframes[self.last.source].T_odom_lidar, anchor.T_odom_lidar)
         return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
 
-    def _radius_m(self, anchor: Keyframe) -> float:
-        return self.config.place_radius_m * anchor.scale
-
-    def _judge(
-        self,
-        candidate: Candidate,
-        source: LocalMap,
-        target: LocalMap,
-        measured: Measurement,
-        T_world: Matrix | None,
-    ) -> Closure:
-        """A closure and its verdict; without poses of the world the way between the two says nothing."""
-        i, j = target.anchor.index, source.anchor.index
-        moved_m = 0.0
-        if T_world is not None:
-            moved = lie.inverse(T_world[j]) @ T_world[i] @ measured.match.T_target_source
-            moved_m = float(np.linalg.norm(moved[:3, 3]))
-        traveled_m = source.anchor.traveled_m - target.anchor.traveled_m
-        problem = self._problem(candidate, measured, moved_m, traveled_m)
-        return Closure(
-            target=i,
-            source=j,
-            match=measured.match,
-            overlap=measured.overlap,
-            verdict=Verdict.REJECTED if problem else Verdict.ACCEPTED,
-            reason=problem or "verified by matching",
-            proposed_by=candidate.proposed_by,
-        )
-
-    def _problem(self, candidate: Candidate, measured: Measurement, moved_m: float, traveled_m: float) -> str:
-        """Why a measurement is no closure, empty if it is one."""
-        limits, match = self.config, measured.match
-        plausible_m = max(limits.place_drift * traveled_m, limits.min_radius_m)
-        if not match.is_fit:
-            return match.reason
-        if measured.overlap < limits.min_place_overlap:
-            return f"overlap {measured.overlap:.2f} < loops.min_place_overlap ({limits.min_place_overlap:g})"
-        if match.degeneracy_eigenvalue < limits.min_place_information:
-            return (
-                f"information {match.degeneracy_eigenvalue:.1e} < "
-                f"loops.min_place_information ({limits.min_place_information:g})"
+    def _check(self, candidate: Candidate, query: Query) -> None:
+        """Refuse what a recognizer must not answer."""
+        name, target = self.config.loops.recognizer, candidate.target
+        is_old = 0 <= target < len(query.keyframes) and query.keyframes[target].traveled_m <= query.max_traveled_m
+        if not is_old:
+            raise InputError(
+                f"loops.recognizer {name}: candidate {target} for keyframe {query.submap.anchor.index} is not "
+                "older; wanted one whose traveled_m is at most query.max_traveled_m"
             )
-        if measured.agreement < limits.min_agreement:
-            return f"agreement {measured.agreement:.2f} < loops.min_agreement ({limits.min_agreement:g})"
+        T, size = np.asarray(candidate.T_target_source), self.dimension + 1
+        if T.shape != (size, size) or not np.isfinite(T).all():
+            raise InputError(
+                f"loops.recognizer {name}: T_target_source of candidate {target} has the shape {T.shape}; wanted "
+                f"a finite pose ({size}, {size})"
+            )
+
+    def _verify(self, source: Submap, candidate: Candidate, keyframes: Sequence[Keyframe]) -> Verification:
+        T_first = candidate.T_target_source
+        if self.dimension == 2:
+            newest, index = len(keyframes) - 1, source.anchor.index
+            return self.scan_verifier.verify(
+                keyframes, index, candidate.target, T_first, newest=newest, alone=True
+            )
+        target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
+        return self.submap_verifier.verify(source, target, T_first)
+
+    def _problem(self, candidate: Candidate, verified: Verification, query: Query, is_connected: bool) -> str:
+        """Why a candidate is no closure though it aligns, empty if it is one.
+
+        Between unconnected keyframes the distance that odometry has them apart means nothing.
+        """
+        limits, anchor = self.config.loops, query.submap.anchor
         if candidate.rival >= 0:
-            return f"keyframe {candidate.rival} looks as much alike"
-        if moved_m > plausible_m:
+            return f"keyframe {candidate.rival} is as similar"
+        if not is_connected:
+            return ""
+        T_world_i, T_world_j = query.T_world[candidate.target], query.T_world[anchor.index]
+        moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
+        moved_m = float(np.linalg.norm(moved[:-1, -1]))
+        traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
+        if moved_m > max(limits.place_drift * traveled_m, limits.min_radius_m):
             return f"{moved_m:.1f} m from the prediction > loops.place_drift ({limits.place_drift:g}) of the way"
         return ""

@@ -1,4 +1,4 @@
-"""Every scan of a planar log aligned once more, at the end, to the map that the corrected keyframes make."""
+"""The trajectory of all scans from the keyframes' corrected poses; in the plane, refined scan by scan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,23 @@ from scanchain.registration.plicp import terms_of
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
 _THREADS = 2
-_AT_ONCE = 2048  # scans a thread, in memory
+_MAX_SCANS = 2048  # of a thread, in memory
+
+
+def spread(T_world_keyframes: Matrix, scan_indices: NDArray[np.int64], odometry: Matrix) -> Matrix:
+    """World poses (N, d+1, d+1) of all scans: each keyframe's correction, blended between it and the next.
+
+    scan_indices : (K,) of the keyframes, the first of them 0; odometry : (N, d+1, d+1) T_odom_lidar
+    """
+    following = np.append(np.arange(1, len(scan_indices)), -1)
+    relative = lie.between(odometry[scan_indices], odometry[scan_indices[following]])
+    target = lie.between(T_world_keyframes, T_world_keyframes[following])
+    correction = lie.log(target @ lie.inverse(relative))
+    before = np.searchsorted(scan_indices, np.arange(len(odometry)), side="right") - 1
+    span = np.append(np.diff(scan_indices), 1)[before]
+    share = np.clip((np.arange(len(odometry)) - scan_indices[before]) / span, 0.0, 1.0)
+    within = lie.between(odometry[scan_indices[before]], odometry)
+    return T_world_keyframes[before] @ lie.exp(share[:, None] * correction[before]) @ within
 
 
 def refined(
@@ -30,24 +46,24 @@ def refined(
     keyframes: Sequence[Keyframe],
     config: Config,
 ) -> Matrix:
-    """T_world_lidar (N, 3, 3) of all scans where they fit the keyframes of every pass best; near where they are.
+    """T_world_lidar (N, 3, 3) of all scans, each aligned once more to the map of all corrected keyframes.
 
-    A pose is held, as surely as an edge of odometry, where the map tells nothing.
+    In directions that the map does not constrain, the prior of an edge of odometry keeps a pose where it is.
     spans : (N, 2) first row and number of each scan's points in the store
     """
     surfaces, least_share = _map_of(poses, keyframes, config), config.matching.min_inlier_share
     terms = terms_of(_briefly(config), surfaces, wide=False)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
-    held = np.diag(sigma**-2.0) * terms.variance
+    prior = np.diag(sigma**-2.0) * terms.variance
     result = poses.copy()
 
     def refine_part(part: slice, points: Points) -> None:
         starts = np.append(0, np.cumsum(spans[part, 1]))
-        refine(surfaces.voxels, points, starts, result[part], held, least_share, terms)
+        refine(surfaces.voxels, points, starts, result[part], prior, least_share, terms)
 
     with ThreadPoolExecutor(_THREADS) as pool:  # no scan depends on another, and kernels let others run
-        for first in range(0, len(poses), _THREADS * _AT_ONCE):
-            parts = [slice(first + k * _AT_ONCE, first + (k + 1) * _AT_ONCE) for k in range(_THREADS)]
+        for first in range(0, len(poses), _THREADS * _MAX_SCANS):
+            parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(_THREADS)]
             clouds = [_points_of(spans[part], store) for part in parts]
             list(pool.map(refine_part, parts, clouds))
     return result
@@ -69,7 +85,7 @@ def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> Vox
 
 
 def _briefly(config: Config) -> MatchingConfig:
-    """Poses that are good already need no more than a few steps, to partners nearby."""
+    """Matching with few steps and correspondences nearby, for poses that are good already."""
     return msgspec.structs.replace(
         config.matching, reach_voxels=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD
     )

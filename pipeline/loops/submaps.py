@@ -1,32 +1,77 @@
-"""Small maps around a keyframe, built when a loop closure first asks for them."""
+"""Submaps: the scans around a keyframe in its frame, as points or as voxels."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
-from scanchain.data import Keyframe
-from scanchain.loops.pieces import Pieces
+from scanchain.data import Keyframe, Points, Pose
+from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
-_HELD = 64  # submaps in memory; the one unused for longest goes first
+RADII_AHEAD = 1.0  # of the trajectory after the anchor
+RADII_BEHIND = 2.0  # and before it: a lidar that looks ahead sees a place from far off
+_MAX_POINTS = 80_000  # gathered, of keyframes evenly spread over the submap
+_MAX_CACHED = 64  # voxel submaps in memory; the least recently used one is dropped first
 
 
-class Submaps:
-    """Maps of 2n + 1 keyframes around every n-th one, in that keyframe's frame, its voxels of the size used there.
+@dataclass(frozen=True, slots=True)
+class Submap:
+    """The keyframes around an ``anchor``, in the order they were taken, cropped to a radius around it.
 
-    Neighboring keyframes are placed by odometry, which over so short a way is as good as any pose known later;
-    those of another piece are left out.
+    Odometry places them; over so short a path it is as good as any pose known later.
     """
 
-    def __init__(self, dimension: int, half_width: int, config: LocalMapConfig, pieces: Pieces) -> None:
-        self.pieces = pieces
+    anchor: Keyframe
+    members: Sequence[Keyframe]
+    radius_m: float
+
+    def views(self, count: int) -> Iterator[tuple[Pose, Points]]:
+        """T_anchor_lidar and points (N, d) in the lidar's frame of so many members at most, evenly spread."""
+        T_anchor_odom = lie.inverse(self.anchor.T_odom_lidar)
+        for member in self.members[:: max(-(-len(self.members) // count), 1)]:
+            yield T_anchor_odom @ member.T_odom_lidar, member.points
+
+    def points(self) -> Points:
+        """(M, d) meters within the radius, anchor's frame."""
+        total = sum(len(member.points) for member in self.members)
+        count = max(len(self.members) * _MAX_POINTS // max(total, _MAX_POINTS), 1)
+        moved = np.vstack([lie.transform(T, points) for T, points in self.views(count)])
+        return moved[np.einsum("ij,ij->i", moved, moved) < self.radius_m**2]
+
+
+def submap_around(keyframes: Sequence[Keyframe], anchor: int, radius_m: float, segments: Segments) -> Submap:
+    """The submap of a keyframe out of the keyframes of its segment so far."""
+    here_m = keyframes[anchor].traveled_m
+    begin, end = segments.span(anchor, len(keyframes))
+    first = bisect_left(keyframes, here_m - RADII_BEHIND * radius_m, begin, end, key=_traveled_m)
+    last = bisect_left(keyframes, here_m + RADII_AHEAD * radius_m, begin, end, key=_traveled_m)
+    return Submap(keyframes[anchor], keyframes[first:last], radius_m)
+
+
+def _traveled_m(keyframe: Keyframe) -> float:
+    return keyframe.traveled_m
+
+
+class VoxelSubmaps:
+    """Voxel maps of 2n + 1 keyframes around every n-th one, built when first asked for.
+
+    They lie in that keyframe's frame, with voxels of the size that odometry used there; keyframes of another
+    segment are left out.
+    """
+
+    def __init__(self, dimension: int, half_width: int, config: LocalMapConfig, segments: Segments) -> None:
+        self.segments = segments
         self.dimension = dimension
         self.half_width = half_width
         self.config = config
-        self.held: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
+        self.cached: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
 
     def anchor_of(self, keyframe: int) -> int:
         """The last keyframe up to this one that has a submap around it."""
@@ -34,14 +79,14 @@ class Submaps:
 
     def around(self, anchor: int, keyframes: Sequence[Keyframe], newest: int) -> VoxelMap:
         """The submap of an anchor out of the keyframes up to ``newest``."""
-        begin, end = self.pieces.span(anchor, len(keyframes))
+        begin, end = self.segments.span(anchor, len(keyframes))
         first, last = max(anchor - self.half_width, begin), min(anchor + self.half_width, newest, end - 1)
-        submap = self.held.pop((anchor, last), None)
+        submap = self.cached.pop((anchor, last), None)
         if submap is None:
             submap = self._build(keyframes[anchor], keyframes[first : last + 1])
-        self.held[anchor, last] = submap
-        if len(self.held) > _HELD:
-            self.held.popitem(last=False)
+        self.cached[anchor, last] = submap
+        if len(self.cached) > _MAX_CACHED:
+            self.cached.popitem(last=False)
         return submap
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:

@@ -1,53 +1,118 @@
-"""A supposed revisit, measured: local map against local map, from coarse to fine."""
+"""Verification of a proposed loop closure: alignment from the initial pose, and whether the result is one.
+
+A scan is aligned to a voxel submap or, in 3D, a submap to a submap, which are then checked for free space, too.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose
+from scanchain.data import Closure, Keyframe, Match, Points, Pose, Proposal, Verdict
+from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
-from scanchain.loops.agreement import free_space_agreement
-from scanchain.loops.local_map import LocalMap
+from scanchain.loops.submaps import Submap, VoxelSubmaps
 from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
 
-_COARSE = 2.0  # times the usual voxels, for the first alignment
+_MIN_OVERLAP_ALONE = 0.8  # asked of a match for which no expected pose speaks
+_COARSE = 2.0  # times the usual voxels, for the first alignment of two submaps
+_VIEWS = 8  # of each submap that are compared with the other
+_BINS = (90, 180)  # of elevation and azimuth: 2°
+_MARGIN_SHARE = 0.05  # of a range, by which it may differ in any case
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
-    """How two local maps lie, and how well they fit there.
+class Verification:
+    """The alignment of a proposed loop closure.
 
     Attributes
     ----------
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
-    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both ways,
-        divided by the share that either map has with itself
+    problem : why it is no loop closure, empty if it is one
+    agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both
+        directions, divided by the share that either submap has with itself; 1 where not compared
     """
 
     match: Match
     overlap: float
-    agreement: float
+    problem: str
+    agreement: float = 1.0
+
+    def closure(
+        self, target: int, source: int, proposed_by: Proposal = Proposal.POSITION, *, problem: str = ""
+    ) -> Closure:
+        """The closure of two keyframes; a ``problem`` besides those of the alignment rejects it, too."""
+        problem = self.problem or problem
+        verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
+        reason = problem or "verified by matching"
+        return Closure(target, source, self.match, self.overlap, verdict, reason, proposed_by)
 
 
-class Verifier:
-    """Aligns local maps with the matcher of odometry."""
+class ScanVerifier:
+    """Aligns a keyframe's scan to a voxel submap."""
+
+    def __init__(self, config: Config, submaps: VoxelSubmaps) -> None:
+        self.config = config.loops
+        self.match_voxel_m = config.preprocess.match_voxel_m
+        self.matcher = PointToShapeMatcher(config.matching)
+        self.submaps = submaps
+
+    def verify(
+        self,
+        keyframes: Sequence[Keyframe],
+        source: int,
+        target: int,
+        T_first: Pose,
+        *,
+        newest: int,
+        alone: bool = False,
+    ) -> Verification:
+        """The source's scan in the submap of an anchor, from an initial pose.
+
+        newest : keyframe that may be in the submap
+        alone : whether nothing but the match speaks for the closure, of which more is asked then
+        """
+        submap = self.submaps.around(target, keyframes, newest)
+        points = downsample(keyframes[source].points, submap.scale * self.match_voxel_m)
+        match = self.matcher.align(points, submap, T_first, wide=True)
+        overlap = overlap_of(points, match.T_target_source, submap)
+        moved_m = lie.apart(T_first, match.T_target_source)[0]
+        min_overlap = _MIN_OVERLAP_ALONE if alone else self.config.min_overlap
+        return Verification(match, overlap, self._problem(match, overlap, moved_m, min_overlap))
+
+    def _problem(self, match: Match, overlap: float, moved_m: float, min_overlap: float) -> str:
+        limits, information = self.config, match.degeneracy_eigenvalue
+        if not match.is_fit:
+            return match.reason
+        if overlap < min_overlap:
+            return f"overlap {overlap:.2f} < loops.min_overlap ({min_overlap:g})"
+        if information < limits.min_information:
+            return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
+        if moved_m > limits.max_radius_m:
+            return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
+        return ""
+
+
+class SubmapVerifier:
+    """Aligns 3D submaps from coarse to fine and compares what they saw as free."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.matcher = PointToShapeMatcher(config.matching)
 
-    def measure(self, source: LocalMap, target: LocalMap, T_first: Pose) -> Measurement:
-        """Where the source lies in the target, near the first guess."""
+    def verify(self, source: Submap, target: Submap, T_first: Pose) -> Verification:
+        """The source in the target, from an initial pose."""
         scale = source.anchor.scale
         fine_m = scale * self.config.preprocess.match_voxel_m
         surfaces, dense = target.points(), source.points()
-        rough = self._align(downsample(dense, _COARSE * fine_m), surfaces, T_first, _COARSE * scale)
+        coarse = downsample(dense, _COARSE * fine_m)
+        rough = self.matcher.align(coarse, self._voxels(surfaces, _COARSE * scale), T_first, wide=True)
         voxels = self._voxels(surfaces, scale)
         points, others = downsample(dense, fine_m), downsample(surfaces, fine_m)
         match = self.matcher.align(points, voxels, rough.T_target_source)
@@ -56,23 +121,50 @@ class Verifier:
             free_space_agreement(target, points, T, margin_m),
             free_space_agreement(source, others, lie.inverse(T), margin_m),
         )
-        alone = min(
+        with_itself = min(
             free_space_agreement(source, points, lie.identity(3), margin_m),
             free_space_agreement(target, others, lie.identity(3), margin_m),
         )
-        return Measurement(match, overlap(points, T, voxels), both_ways / max(alone, 1e-9))
-
-    def _align(self, points: Points, surfaces: Points, T_first: Pose, scale: float) -> Match:
-        return self.matcher.align(points, self._voxels(surfaces, scale), T_first, wide=True)
+        overlap, agreement = overlap_of(points, T, voxels), both_ways / max(with_itself, 1e-9)
+        return Verification(match, overlap, self._problem(match, overlap, agreement), agreement)
 
     def _voxels(self, points: Points, scale: float) -> VoxelMap:
         result = VoxelMap(3, self.config.local_map, scale)
         result.insert(points, lie.identity(3))
         return result
 
+    def _problem(self, match: Match, overlap: float, agreement: float) -> str:
+        limits, information = self.config.loops, match.degeneracy_eigenvalue
+        if not match.is_fit:
+            return match.reason
+        if overlap < limits.min_place_overlap:
+            return f"overlap {overlap:.2f} < loops.min_place_overlap ({limits.min_place_overlap:g})"
+        if information < limits.min_place_information:
+            return (
+                f"information {information:.1e} < loops.min_place_information ({limits.min_place_information:g})"
+            )
+        if agreement < limits.min_agreement:
+            return f"agreement {agreement:.2f} < loops.min_agreement ({limits.min_agreement:g})"
+        return ""
 
-def overlap(points: Points, T: Pose, surfaces: VoxelMap) -> float:
+
+def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, margin_m: float) -> float:
+    """Share, of the source's points that the target's lidar could see, that lie where it did see a surface.
+
+    points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
+    """
+    ranges_m = np.empty(_BINS)
+    agreeing = contradicting = 0
+    for T_target_lidar, seen in submap.views(_VIEWS):
+        nearest_ranges(seen, ranges_m)
+        T_lidar_source = lie.between(T_target_lidar, T_target_source)
+        yes, no = compare_ranges(points, T_lidar_source, ranges_m, margin_m, _MARGIN_SHARE)
+        agreeing, contradicting = agreeing + yes, contradicting + no
+    return agreeing / max(agreeing + contradicting, 1) if agreeing + contradicting else 1.0
+
+
+def overlap_of(points: Points, T: Pose, surfaces: VoxelMap) -> float:
     """Share of the points (N, d) that, moved by T, lie within a voxel of the surfaces."""
-    partner = np.empty(len(points), np.int32)
+    correspondence = np.empty(len(points), np.int32)
     size_m = surfaces.voxels.size_m
-    return associate(surfaces.voxels, points, T, 1, size_m, partner) / max(len(points), 1)
+    return associate(surfaces.voxels, points, T, 1, size_m, correspondence) / max(len(points), 1)

@@ -20,7 +20,7 @@ from scanchain.landmarks.bearing_range import BearingRangeProblem, no_calibratio
 from scanchain.landmarks.files.mrclam import read_mrclam
 from scanchain.landmarks.guess import from_odometry
 from scanchain.landmarks.minimize import minimize
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise
 from scanchain.landmarks.ranges.fit import LogModel
 from scanchain.landmarks.ranges.slam import solve_range_log
@@ -83,7 +83,7 @@ def with_gtsam(log, optimizer, parameters, *, covariances=False):
     seconds = time.perf_counter() - begin
     poses = [found.atPose2(k) for k in range(len(guess.poses))]
     landmarks = np.array([found.atPoint2(LANDMARK + k) for k in range(len(guess.landmarks))])
-    return seconds, State(np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]), landmarks)
+    return seconds, Values(np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]), landmarks)
 
 
 METHODS = {

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
 from scanchain.graph.files.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.soundness import nearest_semidefinite, positive_semidefinite
 
 Indefinite = Literal["project", "refuse"]
 

@@ -12,8 +12,16 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.graph.files.g2o_lines import EDGES, POINT, SIGHTING, VERTICES
-from scanchain.graph.files.toro import TORO_EDGES, TORO_VERTICES, to_toro_angles, to_toro_triangle
+from scanchain.graph.files.g2o_lines import (
+    EDGES,
+    POINT,
+    SIGHTING,
+    TORO_EDGES,
+    TORO_VERTICES,
+    VERTICES,
+    to_toro_angles,
+    to_toro_triangle,
+)
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.whole_file import write_whole
 

@@ -1,1 +1,1 @@
-"""Which loop edges are in force: robust losses, graduated non-convexity, verdicts."""
+"""Robust losses of loop edges, graduated non-convexity, the set of inliers."""

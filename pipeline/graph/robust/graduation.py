@@ -1,4 +1,4 @@
-"""Robust minimization: from a convex loss to the loss itself, then verdicts that the other edges bear out."""
+"""Robust minimization: graduated non-convexity (GNC), then a refined set of inlier loop edges."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import REJECTED_WEIGHT, Matrix
-from scanchain.graph.robust.losses import GRADUATED, RobustLoss, rejection_limit
-from scanchain.graph.robust.verdicts import Verdicts, contradictions, fair_price
-from scanchain.graph.solvers.estimate import Estimate, Minimum
-from scanchain.graph.solvers.optimizer import Minimizer
-from scanchain.graph.soundness import is_connected
+from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
+from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
+from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
-Judgment = Literal["graduated", "mended"]
+OutlierRejection = Literal["gnc", "refined"]
 
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
-_MOST_ROUNDS = 50  # of mending verdicts
+_MAX_ROUNDS = 50  # of refining the inlier set
 _FEWER, _FEWEST = 0.3, 1e-3  # after changes that do not help, of those that promise the most
 
 
@@ -28,17 +27,18 @@ def minimize(
     loss: RobustLoss,
     max_iterations: int,
     tolerance: float,
-    judgment: Judgment,
+    rejection: OutlierRejection,
 ) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    judgment : of truncated edges: as the graduation leaves them, or mended by what the other edges bear out
+    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others
     """
     now, used = minimizer.evaluate(poses, loss), 0
-    if loss.kernel in GRADUATED and len(minimizer.loops):
-        now, loss, used = _graduate(minimizer, now, loss)
-    if judgment == "mended" and loss.kernel == "truncated" and len(minimizer.loops):
-        minimum = _judge(minimizer, now, loss, max_iterations, tolerance)
+    graduation = loss.graduation(now.chi2[minimizer.loops])
+    if graduation is not None and len(minimizer.loops):
+        now, loss, used = _graduate(minimizer, now, graduation)
+    if rejection == "refined" and loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _refine(minimizer, now, loss, max_iterations, tolerance)
     else:
         minimum = minimizer.descend(now, loss, max_iterations, tolerance)
         if loss.kernel not in ("none", "truncated"):
@@ -46,16 +46,16 @@ def minimize(
     return replace(minimum, iterations=used + minimum.iterations)
 
 
-def _graduate(minimizer: Minimizer, now: Estimate, loss: RobustLoss) -> tuple[Estimate, RobustLoss, int]:
+def _graduate(minimizer: Minimizer, now: Evaluation, graduation: Graduation) -> tuple[Evaluation, RobustLoss, int]:
     """Follow the minimum from the convex loss to the loss itself, one step for each level."""
     used, focus = 0, _Focus(minimizer)
-    loss = loss.started(now.chi2[minimizer.loops])
-    while not loss.settled(now.chi2[minimizer.loops]):
+    while not graduation.is_over(now.chi2[minimizer.loops]):
+        loss = graduation.loss
         chosen = focus.on(minimizer.weights(now.chi2, loss))
         minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, 1, 0.0)
         now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
-        loss = loss.tightened()
-    return minimizer.reweighed(now, loss), loss, used
+        graduation.tighten()
+    return minimizer.reweighed(now, graduation.loss), graduation.loss, used
 
 
 def _settle_without_outliers(
@@ -99,44 +99,44 @@ class _Focus:
         return self._chosen
 
 
-def _judge(
-    minimizer: Minimizer, now: Estimate, loss: RobustLoss, max_iterations: int, tolerance: float
+def _refine(
+    minimizer: Minimizer, now: Evaluation, loss: RobustLoss, max_iterations: int, tolerance: float
 ) -> Minimum:
-    """The minimum with the verdicts of now, and then with those that the other edges bear out."""
+    """The minimum with the inliers of now, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
-    minimum = _settle(minimizer, now, Verdicts(kept, nominal), max_iterations, tolerance)
+    minimum = _settle(minimizer, now, InlierSet(kept, nominal), max_iterations, tolerance)
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
     against = _against(minimizer, minimum, nominal)
     price = fair_price(against[kept], nominal, problem.freedom)
-    minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, Verdicts(kept, price)))
+    minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
     share = 1.0
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         gain = np.where(kept, against - price, price - against)
         if share < _FEWEST or not (gain > 0.0).any():
             break
-        verdicts = Verdicts(kept ^ (gain > (1.0 - share) * gain.max()), price)
-        trial = _settle(minimizer, minimum.estimate, verdicts, max_iterations, tolerance)
+        inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
+        trial = _settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
         used = minimum.iterations + trial.iterations
         if not trial.estimate.cost < minimum.estimate.cost:
             minimum, share = replace(minimum, iterations=used), _FEWER * share
             continue
-        minimum, kept, share = replace(trial, iterations=used), verdicts.kept, 1.0
+        minimum, kept, share = replace(trial, iterations=used), inliers.kept, 1.0
         against = _against(minimizer, minimum, price)
     return minimum
 
 
 def _settle(
-    minimizer: Minimizer, start: Estimate, verdicts: Verdicts, max_iterations: int, tolerance: float
+    minimizer: Minimizer, start: Evaluation, inliers: InlierSet, max_iterations: int, tolerance: float
 ) -> Minimum:
-    """The minimum with these verdicts."""
-    weights = minimizer.weights(start.chi2, verdicts)
+    """The minimum with these inliers."""
+    weights = minimizer.weights(start.chi2, inliers)
     chosen = _Focus(minimizer).on(weights)
-    kept = verdicts.kept
-    inner = Verdicts(kept if chosen is minimizer else kept[kept], verdicts.price)
+    kept = inliers.kept
+    inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
     minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
-    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, verdicts), weights=weights)
+    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
 
 
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
 from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
+from scanchain.kernels.graph.fronts import Fronts
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -192,3 +193,23 @@ def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64])
         matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
     )
     return np.argsort(factor.perm_c).astype(np.int64)
+
+
+def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
+    """U of the last factorization, A = Uᵀ U, in the order of elimination; zeros kept where it may fill in."""
+    return front_rows(cholesky._fronts, cholesky._factor)
+
+
+def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
+    """The upper triangular matrix whose rows the fronts keep, in the order of elimination."""
+    widths = np.diff(fronts.row_start)
+    count = int(fronts.pivots.sum())
+    front = np.repeat(np.arange(len(widths)), fronts.pivots)
+    within = np.arange(count) - np.repeat(np.cumsum(fronts.pivots) - fronts.pivots, fronts.pivots)
+    lengths = widths[front] - within
+    row_start = np.concatenate([[0], np.cumsum(lengths)])
+    along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
+    columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
+    first = fronts.factor_start[front] + within * widths[front] + within
+    values = factor[np.repeat(first, lengths) + along]
+    return csr_matrix((values, columns, row_start), shape=(count, count))

@@ -1,14 +1,186 @@
-"""Step after step downhill by a step rule, until nothing more is to be gained."""
+"""Descent to a minimum: the loop, and the step rules of the optimizers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol
+from typing import Generic, Literal, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scanchain.graph.solvers.steps import E, LocalModel, StepRule, Vector
+from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
+
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
+Vector = NDArray[np.float64]
+
+_MOST_DAMPING = 1e12
+_LEAST_DAMPING = 1e-15
+_FIRST_DAMPING = 1e-12  # all but Gauss-Newton: the weakest modes of a long chain have 1e-9 of diag H
+_GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
+_SHORTEST = 1e-12  # share of the first trust region, or of the best length, at which no step is worth trying
+
+
+class Estimate(Protocol):
+    """Where a minimization is."""
+
+    @property
+    def cost(self) -> float:
+        """χ², or what stands in its place."""
+        ...
+
+
+class LocalModel(Protocol):
+    """cost(ξ) ≈ cost + 2 gᵀξ + ξᵀH ξ; ``gradient`` g and ``diagonal`` diag H, (n,)."""
+
+    @property
+    def gradient(self) -> Vector: ...  # noqa: D102
+
+    @property
+    def diagonal(self) -> Vector: ...  # noqa: D102
+
+    def solve(self, damping: float) -> Vector:
+        """−(C + damping diag H)⁻¹ g, C the curvature of choice; raises SingularMatrixError."""
+        ...
+
+    def bend(self, step: Vector) -> Vector:
+        """H ξ."""
+        ...
+
+
+E = TypeVar("E", bound=Estimate)
+
+
+@dataclass(frozen=True, slots=True)
+class Move(Generic[E]):
+    """A step (n,), and where it leads."""
+
+    step: Vector
+    to: E
+
+
+class StepRule(Protocol):
+    """Makes moves; may keep what it learns from one to the next."""
+
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+        """One move, or None where no step lowers the cost."""
+        ...
+
+
+def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
+    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
+    if optimizer == "gauss-newton":
+        return GaussNewton()
+    if optimizer in ("levenberg-marquardt", "newton"):
+        return Damped(first_damping)
+    return Dogleg() if optimizer == "dogleg" else GradientDescent()
+
+
+class GaussNewton:
+    """x ← x − H⁻¹ g, whether or not the cost falls."""
+
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+        """Raises SingularMatrixError where the equations leave something free."""
+        step = model.solve(0.0)
+        to = moved(step)
+        return Move(step, to) if np.isfinite(to.cost) else None
+
+
+class Damped:
+    """x ← x − (C + λ diag H)⁻¹ g (Marquardt 1963), λ by the gain ratio (Nielsen 1999)."""
+
+    def __init__(self, first_damping: float) -> None:
+        self._first, self._damping, self._growth = first_damping, first_damping, _GROWTH
+
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+        """Damp more until the cost falls."""
+        while self._damping < _MOST_DAMPING:
+            try:
+                step = model.solve(self._damping)
+            except SingularMatrixError:
+                self._damp()
+                continue
+            to = moved(step)
+            if to.cost <= now.cost:
+                predicted = float((step * (self._damping * model.diagonal * step - model.gradient)).sum())
+                self._ease((now.cost - to.cost) / max(predicted, 1e-300))
+                return Move(step, to)
+            self._damp()
+        self._damping, self._growth = self._first, _GROWTH
+        return None
+
+    def _damp(self) -> None:
+        self._damping *= self._growth
+        self._growth *= 4.0
+
+    def _ease(self, gain: float) -> None:
+        eased = self._damping * max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        self._damping, self._growth = max(eased, _LEAST_DAMPING), _GROWTH
+
+
+class Dogleg:
+    """Along the steepest descent and then toward the Gauss-Newton step, within a trust region (Powell 1970).
+
+    Lengths are measured with diag H, so that meters and radians compare.
+    """
+
+    def __init__(self) -> None:
+        self._radius = 0.0
+
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+        """Shrink the region until the cost falls; radius by Madsen et al. (2004), algorithm 3.21."""
+        scale = np.sqrt(model.diagonal)
+        newton, cauchy = model.solve(0.0), steepest_descent(model)
+        first = float(np.linalg.norm(scale * newton))
+        self._radius = self._radius or first
+        while self._radius > _SHORTEST * first:
+            step = _within(newton, cauchy, scale, self._radius)
+            to = moved(step)
+            foreseen = float(-(step * (2.0 * model.gradient + model.bend(step))).sum())
+            gain = (now.cost - to.cost) / max(foreseen, 1e-300)
+            length = float(np.linalg.norm(scale * step))
+            if gain > 0.75:
+                self._radius = max(self._radius, 3.0 * length)
+            elif not gain > 0.25:
+                self._radius = 0.5 * min(self._radius, length)
+            if to.cost <= now.cost:
+                return Move(step, to)
+        self._radius = 0.0
+        return None
+
+
+class GradientDescent:
+    """Steepest descent in the measure of diag H, to the lowest point of the model, halved until it helps."""
+
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+        """Go down the gradient."""
+        step, share = steepest_descent(model), 1.0
+        while share > _SHORTEST:
+            to = moved(share * step)
+            if to.cost <= now.cost:
+                return Move(share * step, to)
+            share *= 0.5
+        return None
+
+
+def steepest_descent(model: LocalModel) -> Vector:
+    """The lowest point of the quadratic model along −D⁻¹g, D = diag H."""
+    direction = -model.gradient / np.maximum(model.diagonal, 1e-300)
+    bent = float(direction @ model.bend(direction))
+    return direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
+
+
+def _within(newton: Vector, cauchy: Vector, scale: Vector, radius: float) -> Vector:
+    """The point of the path 0 → cauchy → newton at which it leaves the region, or its end."""
+    if np.linalg.norm(scale * newton) <= radius:
+        return newton
+    length = float(np.linalg.norm(scale * cauchy))
+    if length >= radius:
+        return cauchy * (radius / length)
+    a, b = scale * cauchy, scale * (newton - cauchy)
+    ab, bb = float(a @ b), float(b @ b)
+    return cauchy + (newton - cauchy) * ((-ab + np.sqrt(ab * ab + bb * (radius**2 - length**2))) / bb)
 
 
 class Landscape(Protocol[E]):

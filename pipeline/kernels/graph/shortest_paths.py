@@ -1,4 +1,4 @@
-"""The shortest ways through a graph from one of its nodes (Dijkstra 1959)."""
+"""Shortest paths through a graph from one of its nodes (Dijkstra 1959)."""
 
 import heapq
 
@@ -7,12 +7,13 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def shortest_ways(edges, lengths, count: int, source: int, limit: float):
-    """Length (count,) of the shortest way from the source to every node, infinite beyond the limit.
+def shortest_paths(edges, lengths, count: int, source: int, limit: float):
+    """Length (count,) of the shortest path from the source to every node, infinite beyond the limit.
 
-    edges : (E, 2) int64 node pairs, walked both ways; lengths : (E,) ≥ 0, infinite for an edge that is closed
+    edges : (E, 2) int64 node pairs, traversed in both directions
+    lengths : (E,) ≥ 0, infinite for a closed edge
     """
-    first, neighbors, ways = _neighbors(edges, lengths, count)
+    first, neighbors, distances = _neighbors(edges, lengths, count)
     result = np.full(count, np.inf)
     result[source] = 0.0
     heap = [(0.0, source)]
@@ -21,7 +22,7 @@ def shortest_ways(edges, lengths, count: int, source: int, limit: float):
         if length > result[node]:
             continue
         for k in range(first[node], first[node + 1]):
-            there = length + ways[k]
+            there = length + distances[k]
             if there <= limit and there < result[neighbors[k]]:
                 result[neighbors[k]] = there
                 heapq.heappush(heap, (there, neighbors[k]))
@@ -38,10 +39,10 @@ def _neighbors(edges, lengths, count: int):
     for node in range(1, count + 2):
         first[node] += first[node - 1]
     neighbors = np.empty(2 * edges.shape[0], np.int64)
-    ways = np.empty(2 * edges.shape[0])
+    distances = np.empty(2 * edges.shape[0])
     for e in range(edges.shape[0]):
         for end in range(2):
             row = first[edges[e, end] + 1]
             first[edges[e, end] + 1] += 1
-            neighbors[row], ways[row] = edges[e, 1 - end], lengths[e]
-    return first, neighbors, ways
+            neighbors[row], distances[row] = edges[e, 1 - end], lengths[e]
+    return first, neighbors, distances

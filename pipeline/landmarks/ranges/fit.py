@@ -1,4 +1,4 @@
-"""State and noise of a range log estimated in turn, until neither changes any more."""
+"""Values and noise of a range log estimated in turn, until neither changes any more."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.files.mrclam import RangeLog
 from scanchain.landmarks.guess import from_odometry, growing
 from scanchain.landmarks.minimize import Minimum, minimize
-from scanchain.landmarks.problem import State
-from scanchain.landmarks.ranges.correlation import Likeness
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise, Reckoning, reckon
-from scanchain.landmarks.ranges.student import StudentLoss
-from scanchain.landmarks.ranges.variances import Consistency, consistency
+from scanchain.landmarks.ranges.noise_model import Consistency, SightingPairs, StudentLoss, consistency
 from scanchain.landmarks.solvers import LinearSolver
 
 _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
@@ -37,7 +35,7 @@ class LogModel:
         self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
         self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
         self.observed = np.stack([node, landmark], axis=1)
-        self.likeness = Likeness(log.seen_s, landmark)
+        self.likeness = SightingPairs(log.seen_s, landmark)
 
     def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
         """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
@@ -72,9 +70,9 @@ class LogFit:
     iterations : steps after the guess
     """
 
-    reckoned: State
+    reckoned: Values
     problem: BearingRangeProblem
-    guess: State
+    guess: Values
     minimum: Minimum
     variances: NDArray[np.float64]
     loss: StudentLoss
@@ -129,7 +127,7 @@ class _Settled:
 
 def _settled(
     problem: BearingRangeProblem,
-    state: State,
+    state: Values,
     loss: StudentLoss,
     variances: NDArray[np.float64],
     reckoning: Reckoning,

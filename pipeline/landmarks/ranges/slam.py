@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from scanchain.clock import working_s
 from scanchain.data import Matrix
-from scanchain.landmarks.assembly import landmark_columns, pose_columns
 from scanchain.landmarks.bearing_range import BearingRangeProblem
 from scanchain.landmarks.files.mrclam import RangeLog
-from scanchain.landmarks.problem import State
+from scanchain.landmarks.problem import Values
 from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
 from scanchain.landmarks.ranges.fit import LogModel, fit_log
-from scanchain.landmarks.ranges.student import StudentLoss
+from scanchain.landmarks.ranges.noise_model import StudentLoss
 from scanchain.landmarks.solvers import ESTIMATOR, create_solver
+from scanchain.landmarks.system import landmark_columns, pose_columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,8 @@ class RangeSolution:
     """
 
     nodes_s: NDArray[np.float64]
-    state: State
-    reckoned: State
+    state: Values
+    reckoned: Values
     landmarks: NDArray[np.int64]
     pose_covariance: Matrix
     landmark_covariance: Matrix
@@ -57,7 +57,7 @@ class RangeSolution:
     reason: str
     time_s: float
     problem: BearingRangeProblem
-    guess: State
+    guess: Values
 
 
 def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
@@ -67,7 +67,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
 
     Bearings and ranges follow Student's t (``StudentLoss``); the scales of it and the variances of the odometry
     are found by restricted maximum likelihood (``consistency``). Errors of one landmark's sightings are alike for
-    a while, by what the residuals show (``Likeness``): each sighting counts as a share of an independent one.
+    a while, by what the residuals show (``SightingPairs``): each sighting counts as a share of an independent one.
     Raises InputError where the observations are too few for that.
     """
     begin = working_s()

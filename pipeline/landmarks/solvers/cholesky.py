@@ -6,8 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
-from scanchain.graph.solvers.factor_matrix import upper_factor
+from scanchain.graph.solvers.cholesky import (
+    BlockPattern,
+    SingularMatrixError,
+    SparseCholesky,
+    analyze,
+    upper_factor,
+)
 from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.solvers.solution import Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from scanchain.graph.solvers.factor_matrix import front_rows
+from scanchain.graph.solvers.cholesky import front_rows
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.graph.fronts import Fronts, lay_out_fronts
 from scanchain.kernels.landmarks import column_order, normal_equations, sparse_qr

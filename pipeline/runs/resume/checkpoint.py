@@ -13,18 +13,12 @@ from scanchain.clock import working_s
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.voxels.voxel_shapes import Voxels
-from scanchain.loops.anywhere_closer import AnywhereCloser
-from scanchain.loops.closer import LoopCloser
-from scanchain.loops.doubt import Doubt
-from scanchain.loops.gallery import Gallery
-from scanchain.loops.near_closer import NearCloser
-from scanchain.loops.pieces import Pieces
-from scanchain.loops.place import Place
+from scanchain.loops.closer import LoopCloser, ProximityCloser
+from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.place_closer import PlaceCloser
-from scanchain.loops.planar_search import PlanarSearch
-from scanchain.loops.recognition import Recognition
-from scanchain.loops.submaps import Submaps
-from scanchain.loops.verification import Verifier
+from scanchain.loops.relocalization import PlanarSearch, Relocalizer
+from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, Odometry
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
@@ -68,16 +62,17 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, ErrorStatistics, Recovery,
-        MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser,
-        NearCloser, PlaceCloser, PlanarSearch, Submaps, Doubt, Recognition, Gallery, Place, Verifier, PoseGraph,
-        GrowingArray, PointStore, StoredPoints, Pieces, AnywhereCloser,
+        MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
+        PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift,
+        PoseGraph, GrowingArray, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
         (PoseGraph, "_problem"): lambda graph: None,
         (PoseGraph, "_factor_is_now"): lambda graph: False,
-        (Submaps, "held"): lambda submaps: OrderedDict(),
+        (VoxelSubmaps, "cached"): lambda submaps: OrderedDict(),
+        (PlaceCloser, "recognizer"): lambda closer: None,
         (PointStore, "file"): lambda store: None,
         (Odometry, "matcher"): lambda odometry: create_matcher(odometry.config.matching),
     },

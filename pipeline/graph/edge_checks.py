@@ -1,4 +1,4 @@
-"""Whether a pose graph can be optimized at all; what is wrong with it, where it cannot."""
+"""Checks of a pose graph's edges: numbers, positive semidefiniteness, connectivity."""
 
 from __future__ import annotations
 

@@ -1,20 +1,78 @@
-"""Descent over a pose graph with one robust loss, by the step rule of choice."""
+"""Descent over a pose graph with one robust loss: cost, quadratic model and step rule."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem, NormalEquations
+from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
-from scanchain.graph.robust.verdicts import Verdicts
-from scanchain.graph.solvers.curvature import full_curvature
-from scanchain.graph.solvers.descent import descend
-from scanchain.graph.solvers.estimate import Estimate, Minimum
-from scanchain.graph.solvers.steps import Optimizer, Vector, step_rule
+from scanchain.graph.solvers.descent import Optimizer, Vector, descend, step_rule
 
-Loss = RobustLoss | Verdicts
+_STEP = 1e-6  # m or rad, of the central differences
+Loss = RobustLoss | InlierSet
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Poses with what follows from them: residuals e, χ² of every edge, and the robust cost Σ ρ(χ²)."""
+
+    poses: Matrix
+    errors: Matrix
+    chi2: NDArray[np.float64]
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """Where a minimization ended, with what robust weights (E,), after how many linear solves, and why."""
+
+    estimate: Evaluation
+    weights: NDArray[np.float64]
+    iterations: int
+    converged: bool
+    reason: str
+
+
+def full_curvature(problem: BetweenProblem, now: Evaluation, equations: NormalEquations) -> NDArray[np.float64]:
+    """∂²(½ Σ w eᵀΩe)/∂ξ² as block values of the problem's pattern, the weights held.
+
+    Gauss-Newton leaves out eᵀΩ ∂²e/∂ξ². Here the slope JᵀwΩe of every edge is differentiated by central
+    differences over left twists of both ends; a second derivative in exponential coordinates is symmetric.
+    """
+    k, count = problem.freedom, len(problem.edges)
+    turned = np.empty((2, k, count, k))
+    for end in range(2):
+        for axis in range(k):
+            twist = np.zeros(k)
+            twist[axis] = _STEP
+            ahead, back = (_slopes(problem, now.poses, equations.weights, end, sign * twist) for sign in (1, -1))
+            turned[end, axis] = (ahead - back) / (2.0 * _STEP)
+    by_i, by_j = turned.transpose(0, 2, 1, 3)  # (E, k, k): row is the axis moved, column that of the slope at j
+    both = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
+    blocks = np.zeros((len(problem.pattern.rows), k, k))
+    i, j, pair = problem.slots.T
+    for slot, block in ((i, -by_i), (j, by_j)):
+        np.add.at(blocks, slot[slot >= 0], 0.5 * (block + np.swapaxes(block, 1, 2))[slot >= 0])
+    coupling = np.where((i > j)[:, None, None], both, np.swapaxes(both, 1, 2))
+    np.add.at(blocks, pair[pair >= 0], coupling[pair >= 0])
+    return problem.packing.values(blocks)
+
+
+def _slopes(
+    problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64], end: int, twist: NDArray[np.float64]
+) -> Matrix:
+    """Slope (E, k) of every edge's ½ w χ² with a left twist of j, after one of its ends has moved."""
+    ends = [poses[problem.edges[:, 0]], poses[problem.edges[:, 1]]]
+    ends[end] = lie.exp(twist) @ ends[end]
+    errors, jacobian = problem.between(*ends)
+    pull = weights[:, None, None] * problem.information @ errors[..., None]
+    return (np.swapaxes(jacobian, 1, 2) @ pull)[..., 0]
 
 
 class Minimizer:
@@ -27,15 +85,15 @@ class Minimizer:
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
         self._rule = step_rule(optimizer)
 
-    def evaluate(self, poses: Matrix, loss: Loss) -> Estimate:
+    def evaluate(self, poses: Matrix, loss: Loss) -> Evaluation:
         """Residuals, χ² and cost at these poses."""
         errors = self.problem.errors(poses)
         chi2 = self.problem.chi2(errors)
-        return Estimate(poses, errors, chi2, self._cost(chi2, loss))
+        return Evaluation(poses, errors, chi2, self._cost(chi2, loss))
 
-    def reweighed(self, now: Estimate, loss: Loss) -> Estimate:
+    def reweighed(self, now: Evaluation, loss: Loss) -> Evaluation:
         """The same poses at the cost of another loss."""
-        return Estimate(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
+        return Evaluation(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same with some of the edges, kept (E,)."""
@@ -47,7 +105,7 @@ class Minimizer:
         result[self.loops] = loss.weight(chi2[self.loops])
         return result
 
-    def descend(self, now: Estimate, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
+    def descend(self, now: Evaluation, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
         """Step after step until nothing more is to be gained."""
         descent = descend(_Landscape(self, loss), now, self._rule, max_iterations, tolerance)
         weights = self.weights(descent.end.chi2, loss)
@@ -66,7 +124,7 @@ class _Landscape:
     def __init__(self, minimizer: Minimizer, loss: Loss) -> None:
         self._minimizer, self._loss = minimizer, loss
 
-    def model(self, now: Estimate) -> _Model:
+    def model(self, now: Evaluation) -> _Model:
         minimizer = self._minimizer
         weights = minimizer.weights(now.chi2, self._loss)
         equations = minimizer.problem.linearize(now.poses, now.errors, weights)
@@ -74,7 +132,7 @@ class _Landscape:
         curvature = full_curvature(minimizer.problem, now, equations) if is_full else equations.values
         return _Model(minimizer.problem, equations, curvature)
 
-    def moved(self, now: Estimate, step: Vector) -> Estimate:
+    def moved(self, now: Evaluation, step: Vector) -> Evaluation:
         return self._minimizer.evaluate(self._minimizer.problem.moved(now.poses, step), self._loss)
 
 

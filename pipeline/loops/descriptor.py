@@ -1,4 +1,4 @@
-"""What a place looks like from above, whichever way one came and a few meters aside."""
+"""Descriptor of a submap seen from above, the same for either heading and from a few meters aside."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter, map_coordinates
 
 from scanchain import lie
-from scanchain.data import Pose
+from scanchain.config import LocalMapConfig
+from scanchain.data import Keyframe, Pose
 from scanchain.kernels.search.descriptor import count_heights, mark_heights
-from scanchain.loops.local_map import LocalMap
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, PLANE, SHAPE
+from scanchain.loops.submaps import Submap
+from scanchain.registration import VoxelMap
 
-SIZE = 128  # cells along each side of a view
+SIZE = 128  # cells along each side of the image
 _ANGLES = 64  # steps of half a turn
-_FREQUENCIES = np.arange(2.0, 34.0)  # periods in a view
+_FREQUENCIES = np.arange(2.0, 34.0)  # periods in an image
 _BANDS, _HARMONICS = 16, 5  # of the key
 _WEIGHT_OF_MEAN = 0.3  # of the harmonic 0 in the key
 _BLUR = 0.7  # cells
 _STEPS = 16.0  # of an image in 8 bits, per unit
+_CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
+_MIN_GROUND_VOXELS = 10  # with such a normal, below which the lidar is assumed upright
 
 
 def _polar_grid() -> NDArray[np.float64]:
@@ -41,18 +46,18 @@ _INSIDE = (_RADIUS < 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A local map from above.
+class Descriptor:
+    """A submap from above.
 
     Attributes
     ----------
-    anchor : its keyframe
-    T_anchor_level : the upright frame that it is seen in, from the keyframe's
+    anchor : index of its keyframe
+    T_anchor_level : pose of the level frame that it is seen in, in the keyframe's
     cell_m : of the image
-    image : (SIZE, SIZE) uint8, how much stands in each cell, row along y
+    image : (SIZE, SIZE) uint8, root of the number of occupied heights in each cell, row along y
     spectrum : (F, A) magnitudes of the image's Fourier transform by frequency and direction, mean 0 in each row:
-        the same wherever in the image the place lies, turned as it is turned (Reddy & Chatterji 1996)
-    key : (K,) unit vector; the same however the place is turned, too
+        invariant to a shift of the image, turned as it is turned (Reddy & Chatterji 1996)
+    key : (K,) unit vector; invariant to a turn of the image, too
     """
 
     anchor: int
@@ -64,26 +69,26 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Likeness:
-    """How one place lies in another: pose between the anchors, and correlation of the images there, up to 1."""
+class Alignment:
+    """Relative pose of two descriptors' anchors, and the correlation of the images there, up to 1."""
 
     T_target_source: Pose
-    score: float
+    similarity: float
 
 
-def describe(surroundings: LocalMap, T_anchor_level: Pose) -> Place:
-    """The place of a local map; what stands in a cell is the root of the number of heights above its lowest."""
-    cell_m = 2.0 * surroundings.radius_m / SIZE
+def describe(submap: Submap, T_anchor_level: Pose) -> Descriptor:
+    """The descriptor of a submap; a cell holds the root of the number of heights above its lowest."""
+    cell_m = 2.0 * submap.radius_m / SIZE
     masks, counts = np.zeros((SIZE, SIZE), np.uint64), np.empty((SIZE, SIZE), np.uint8)
     T_level_anchor = lie.inverse(T_anchor_level)
-    for T_anchor_lidar, points in surroundings.views(len(surroundings.members)):
+    for T_anchor_lidar, points in submap.views(len(submap.members)):
         mark_heights(points, T_level_anchor @ T_anchor_lidar, cell_m, masks)
     count_heights(masks, counts)
     image = gaussian_filter(np.sqrt(counts, dtype=np.float32), _BLUR)
     magnitude = np.abs(fft.fftshift(fft.fft2(image * _WINDOW)))
     spectrum = np.log1p(map_coordinates(magnitude, _POLAR, order=1))
-    return Place(
-        anchor=surroundings.anchor.index,
+    return Descriptor(
+        anchor=submap.anchor.index,
         T_anchor_level=T_anchor_level,
         cell_m=cell_m,
         image=np.minimum(_STEPS * image + 0.5, 255.0).astype(np.uint8),
@@ -92,10 +97,35 @@ def describe(surroundings: LocalMap, T_anchor_level: Pose) -> Place:
     )
 
 
-def compare(source: Place, target: Place, *, expected_rad: float = 0.0, within_rad: float = np.pi) -> Likeness:
-    """Where the source lies in the target: heading by the spectra, which leave it open by half a turn, then shift.
+def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
+    """T_keyframe_level (4, 4), the frame with the same origin whose z axis is normal to the ground.
 
-    The heading is looked for within so many radians of the expected one.
+    The ground is what is planar and lies at less than 32° to the lidar's own horizon; where there is too little
+    of it, the lidar is assumed upright. The x axis is as near to the lidar's as it can be.
+    """
+    voxels = VoxelMap(3, config, keyframe.scale)
+    voxels.insert(keyframe.points, lie.identity(3))
+    cells = voxels.voxels.cells[: len(voxels)]
+    normals = cells[cells[:, SHAPE] == PLANE, DIRECTION : DIRECTION + 3]
+    up = np.array([0.0, 0.0, 1.0])
+    for cosine in _CONES:
+        along = normals @ up
+        chosen = np.abs(along) > cosine
+        if chosen.sum() < _MIN_GROUND_VOXELS:
+            break
+        up = _unit((normals[chosen] * np.sign(along[chosen])[:, None]).sum(axis=0))
+    T = lie.identity(3)
+    forward = _unit(np.array([1.0, 0.0, 0.0]) - up[0] * up)
+    T[:3, 0], T[:3, 1], T[:3, 2] = forward, np.cross(up, forward), up
+    return T
+
+
+def compare(
+    source: Descriptor, target: Descriptor, *, expected_rad: float = 0.0, within_rad: float = np.pi
+) -> Alignment:
+    """The source aligned to the target: heading by the spectra, which leave it open by half a turn, then shift.
+
+    The heading is searched within so many radians of the expected one.
     """
     heading, is_open = _heading(source.spectrum, target.spectrum, expected_rad, within_rad)
     fixed = target.image * _INSIDE
@@ -109,7 +139,7 @@ def compare(source: Place, target: Place, *, expected_rad: float = 0.0, within_r
             (correlation, x, y), heading = back, heading + np.pi
     T_level = lie.lift(lie.pose_2d(x * target.cell_m, y * target.cell_m, heading))
     T_target_source = target.T_anchor_level @ T_level @ lie.inverse(source.T_anchor_level)
-    return Likeness(T_target_source, correlation / norm)
+    return Alignment(T_target_source, correlation / norm)
 
 
 def _key_of(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -129,14 +159,14 @@ def _heading(
     A parabola refines the best of the steps.
     """
     product = fft.rfft(target, axis=1) * fft.rfft(source, axis=1).conj()
-    likeness = fft.irfft(product.sum(axis=0), _ANGLES)
-    off_rad = np.abs(lie.wrap(_HEADINGS - expected_rad)).reshape(2, _ANGLES)
-    best = int(np.where(off_rad.min(axis=0) <= within_rad, likeness, -np.inf).argmax())
-    left, middle, right = likeness[best - 1], likeness[best], likeness[(best + 1) % _ANGLES]
+    correlation = fft.irfft(product.sum(axis=0), _ANGLES)
+    error_rad = np.abs(lie.wrap(_HEADINGS - expected_rad)).reshape(2, _ANGLES)
+    best = int(np.where(error_rad.min(axis=0) <= within_rad, correlation, -np.inf).argmax())
+    left, middle, right = correlation[best - 1], correlation[best], correlation[(best + 1) % _ANGLES]
     bend = left - 2.0 * middle + right
     offset = 0.5 * (left - right) / bend if bend < min(-abs(left - right), 0.0) else 0.0
-    half = int(off_rad[:, best].argmin())
-    return float((half * _ANGLES + best + offset) * np.pi / _ANGLES), bool(off_rad[:, best].max() <= within_rad)
+    half = int(error_rad[:, best].argmin())
+    return float((half * _ANGLES + best + offset) * np.pi / _ANGLES), bool(error_rad[:, best].max() <= within_rad)
 
 
 def _turned(image: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
@@ -155,3 +185,7 @@ def _shift(correlation: NDArray[np.float64], offset: int) -> tuple[float, float,
     window = correlation[np.ix_((near - offset) % SIZE, (near - offset) % SIZE)]
     row, column = np.unravel_index(int(window.argmax()), window.shape)
     return float(window[row, column]), float(near[column]), float(near[row])
+
+
+def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return v / np.linalg.norm(v)

@@ -1,4 +1,4 @@
-"""Loop edges judged one by one against all the others, and the verdicts mended until they agree."""
+"""Inlier set of the loop edges, and how much each edge contradicts all the others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROUNDING = 1e-9  # keeps an edge without which its poses would be loose from a 
 
 
 @dataclass(frozen=True, slots=True)
-class Verdicts:
+class InlierSet:
     """Loop edges kept or not, as a loss: a kept edge costs its χ², another its price.
 
     Attributes

@@ -1,0 +1,75 @@
+"""Connectivity of keyframes in the pose graph: segments that no loop joins yet, and drift along shortest paths."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.graph.shortest_paths import shortest_paths
+
+_MIN_WEIGHT = 0.5  # robust weight of a loop edge, from which on it connects its keyframes
+_LOOP_LENGTH_M = 1e-3  # of a loop edge in the shortest path: it adds next to no drift
+
+
+class Segments:
+    """The segments of a trajectory; each ends where the motion to the next keyframe is unknown."""
+
+    def __init__(self) -> None:
+        self.starts = [0]
+
+    def start(self, keyframe: int) -> None:
+        """Start a new segment at this keyframe."""
+        self.starts.append(keyframe)
+
+    def of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Number of the segment of each keyframe."""
+        return np.searchsorted(self.starts, keyframes, side="right") - 1
+
+    def span(self, keyframe: int, count: int) -> tuple[int, int]:
+        """First keyframe and end of a keyframe's segment, of so many keyframes in all."""
+        number = int(self.of(np.array(keyframe)))
+        return self.starts[number], [*self.starts[1:], count][number]
+
+    def components(self, graph: PoseGraph) -> NDArray[np.int64]:
+        """Number of the connected component of each keyframe (K,): segments that loops join have the same one."""
+        segment = self.of(np.arange(len(graph)))
+        ends = segment[graph.edges[graph.is_loop & (graph.weight > _MIN_WEIGHT)]]
+        count = len(self.starts)
+        if count == 1:
+            return segment
+        links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        return connected_components(links, directed=False)[1].astype(np.int64)[segment]
+
+
+class Drift:
+    """Position uncertainty between keyframes: the drift of odometry along the shortest path that connects them.
+
+    An edge is as long as its translation or, where odometry was unsure, as a path along which it would have
+    drifted as far as the edge's standard deviation.
+    """
+
+    def __init__(self, drift: float) -> None:
+        """Drift : of odometry, meters a meter."""
+        self.drift = drift
+        self.lengths = GrowingArray((), np.float64)
+
+    def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
+        """Uncertainty (K,) of each keyframe of the graph relative to one of them, meters, at most the limit."""
+        self._measure_new_edges(graph)
+        is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
+        lengths = np.where(is_open, self.lengths.rows, np.inf)
+        meters = shortest_paths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
+        return np.minimum(self.drift * meters, limit_m)
+
+    def _measure_new_edges(self, graph: PoseGraph) -> None:
+        new = slice(len(self.lengths), len(graph.edges))
+        d = graph.dimension
+        translations_m = np.linalg.norm(graph.measurements[new][:, :d, d], axis=1)
+        covariances = np.linalg.inv(graph.information[new])
+        sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
+        lengths = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.maximum(translations_m, sigmas_m / self.drift))
+        self.lengths.extend(lengths)
