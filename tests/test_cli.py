@@ -542,6 +542,13 @@ def test_flags_about_times_or_wheels_that_a_log_of_clouds_lacks_are_told(call, t
     assert "no effect" not in call(command, path, "--log.point_times", "clockwise")[1]
 
 
+def test_leaving_out_point_times_that_a_log_has_is_an_effect(call, tmp_path):
+    call("simulate", "town", tmp_path / "town.mcap", "--duration", "0.5", "--sensor", "vlp-16")
+    code, output, _ = call("info", tmp_path / "town.mcap", "--log.point_times", "none")
+    assert code == 0
+    assert "no effect" not in output
+
+
 def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     says(

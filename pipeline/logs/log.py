@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain import lie
@@ -137,7 +138,8 @@ class Log:
         """Whether the first scan that has returns has times of its points; of a remote log it is taken to have."""
         if not all(isinstance(path, Path) for path in self.paths):
             return True
-        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(self.config)).decode)
+        config = replace(self.config, point_times="auto") if self.config.point_times == "none" else self.config
+        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(config)).decode)
         return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
