@@ -74,7 +74,7 @@ class ConfigKey:
         if parsed is None:
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
-            finite = " and finite" if text.lstrip("+").lower() == "inf" or value == math.inf else ""
+            finite = " and finite" if isinstance(value, float) and math.isinf(value) else ""
             raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{finite}{unit}")
         return parsed
 

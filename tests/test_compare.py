@@ -504,7 +504,9 @@ def test_errors_drawn_from_the_covariances_have_a_nees_of_one(k):
 @pytest.mark.parametrize(("degenerate", "told"), [(4, ""), (6, "6 of 10 scans are degenerate and 0 lost")])
 def test_a_method_most_of_whose_scans_are_degenerate_is_called_unreliable(tmp_path, degenerate, told):
     states = ["degenerate"] * degenerate + ["ok"] * (10 - degenerate)
-    pq.write_table(pa.table({"state": states, "scan_points": [300] * 10}), tmp_path / "steps.parquet")
+    pq.write_table(
+        pa.table({"state": states, "scan_points": [300] * 10, "fit": [0.9] * 10}), tmp_path / "steps.parquet"
+    )
     still = Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1)))
     outcome = Outcome(EndReport(Status.OK, ""), still.poses, still, np.ones(2), np.ones(2), tmp_path)
     assert unreliable_by_itself(outcome).startswith(told) and bool(unreliable_by_itself(outcome)) == bool(told)

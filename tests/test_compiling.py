@@ -43,7 +43,7 @@ def test_each_module_of_kernels_is_named_once_and_others_are_not():
         ):
             assert kernel(module)(2) == 4
     kernel("scanchain.kernels.geometry.eigen")(2)
-    assert told.lines == ["compiling, once after the installation:", "  kernels.voxels"]
+    assert told.lines == ["compiling, once after the installation:", "  kernels.voxels.voxel_shapes"]
 
 
 def test_what_is_compiled_already_is_not_told():

@@ -155,7 +155,10 @@ def test_a_rate_for_a_log_with_stamps_is_said_to_have_no_effect(tmp_path, capfd)
 def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
     words = ["convert", str(tmp_path), str(tmp_path / "out.mcap"), "--log.min_range_m", "1"]
     assert main(words) == 2
-    assert "--log.min_range_m has no meaning for convert; its keys are log.rate_hz" in capfd.readouterr().err
+    assert (
+        "--log.min_range_m has no meaning for convert; its keys are log.format, log.rate_hz"
+        in capfd.readouterr().err
+    )
 
 
 def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capfd):
