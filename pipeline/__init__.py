@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
+    from scanchain.evaluation.metrics import evaluate
     from scanchain.graph.files.g2o import read_g2o
     from scanchain.graph.files.g2o_write import write_g2o
     from scanchain.graph.pose_graph import PoseGraph
@@ -40,6 +41,7 @@ _HOMES = {
     "compare": "api",
     "create_matcher": "registration",
     "downsample": "api",
+    "evaluate": "evaluation.metrics",
     "load_settings": "settings",
     "open_log": "logs",
     "optimize": "api",
@@ -61,6 +63,7 @@ _COMPILED = {
     "compare",
     "create_matcher",
     "downsample",
+    "evaluate",
     "run",
     "simulate",
 }
@@ -83,6 +86,7 @@ __all__ = [
     "compare",
     "create_matcher",
     "downsample",
+    "evaluate",
     "load_settings",
     "open_log",
     "optimize",

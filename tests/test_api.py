@@ -7,6 +7,7 @@ import pytest
 from scenes import configured, kitti_scans, shared_data
 
 import scanchain as sc
+from scanchain import lie
 from scanchain.errors import InputError
 
 
@@ -74,6 +75,21 @@ def test_a_run_from_python_writes_what_the_command_writes(office, tmp_path):
     assert len(sc.read_tum(done.path / "trajectory.tum")) == 40
     with pytest.raises(InputError, match=r"did you mean loops\.drift\?"):
         sc.run(office, tmp_path / "again", loops__driff=0.1)
+
+
+def test_a_trajectory_is_evaluated_by_every_metric_it_allows(office, tmp_path):
+    truth = sc.read_tum(office.with_suffix(".tum"))
+    off = np.eye(4)
+    off[1, 3] = 0.3
+    moved = sc.Trajectory(truth.stamps_ns, off @ lie.lift(truth.poses))
+    found = sc.evaluate(moved, office.with_suffix(".tum"), align="none", rpe="1s,50m")
+    assert found.found["ate"].translation_m.rmse == pytest.approx(0.3, abs=1e-6)
+    assert found.found["rpe_1_s"].translation_m.maximum < 1e-6
+    assert "rpe_50_m" in found.missing
+    with pytest.raises(InputError, match="align is 'sim3'; it must be one of"):
+        sc.evaluate(moved, truth, align="sim3")
+    with pytest.raises(InputError, match="estimate is"):
+        sc.evaluate(truth.poses, truth)
 
 
 def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path):

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
+from dataclasses import fields, is_dataclass
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,10 +14,7 @@ from scanchain.commands.options import OnceCommand, max_gap_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.data import Trajectory
-    from scanchain.evaluation import AbsoluteError, KittiError, Pairs, RelationError, RelativeError
-
-    Result = AbsoluteError | RelativeError | KittiError | RelationError
+    from scanchain.evaluation.metrics import Results
 
 _PATH = click.Path(path_type=Path)
 
@@ -70,6 +64,8 @@ def evaluate(
       scanchain evaluate runs/log/trajectory.tum truth.tum --align first --rpe 5s,50m --json
     """
     from scanchain.evaluation import read_relations, read_truth, relation_error
+    from scanchain.evaluation.metrics import Results
+    from scanchain.evaluation.metrics import evaluate as evaluate_poses
     from scanchain.trajectory import read_kitti, read_tum
 
     if reference is None and relations is None:
@@ -78,81 +74,12 @@ def evaluate(
     results = Results({}, {})
     if reference is not None:
         truth = read_kitti(reference) if kitti else read_truth(reference).at(trajectory.stamps_ns)
-        results = _against(trajectory, truth, align, max_gap, _intervals(rpe))
+        results = evaluate_poses(trajectory, truth, align=align, max_gap_s=max_gap, rpe=rpe, source="--rpe")
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     for warning in results.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo(_json(results) if as_json else _text(results))
-
-
-@dataclass(frozen=True, slots=True)
-class Results:
-    """Metrics by name: those computed, and the reason for each that could not be.
-
-    ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
-    """
-
-    found: dict[str, Result]
-    missing: dict[str, str]
-    pairing: str = ""
-    warnings: Sequence[str] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Interval of an RPE in ``pose``, ``s`` or ``m``."""
-
-    size: float
-    unit: str
-
-    @property
-    def name(self) -> str:
-        """Key of its figures."""
-        return f"rpe_{self.size:g}_{self.unit}"
-
-    def error(self, pairs: Pairs) -> RelativeError:
-        """The RPE over it. Raises InputError where the trajectory is too short."""
-        from scanchain import evaluation as metrics
-
-        if self.unit == "pose":
-            return metrics.relative_error_over_frames(pairs, int(self.size))
-        if self.unit == "s":
-            return metrics.relative_error_over_time(pairs, self.size)
-        return metrics.relative_error_over_distance(pairs, self.size)
-
-
-_INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
-
-
-def _intervals(text: str) -> list[Interval]:
-    """Intervals of a list such as ``1pose,0.5s,10m``."""
-    found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
-    for word, match in found:
-        if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
-            raise InputError(f"--rpe has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
-    return [Interval(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
-
-
-def _against(
-    trajectory: Trajectory, reference: Trajectory, align: str, gap_s: float | None, intervals: list[Interval]
-) -> Results:
-    """Every metric that the trajectories allow."""
-    from scanchain.evaluation import Alignment, absolute_error, kitti_error_on_any_course, pair
-
-    pairs = pair(trajectory, reference, gap_s=gap_s)
-    metrics: dict[str, Callable[[], Result]] = {
-        **{interval.name: partial(interval.error, pairs) for interval in intervals},
-        "kitti": partial(kitti_error_on_any_course, pairs),
-    }
-    ate = absolute_error(pairs, Alignment(align))
-    results = Results({"ate": ate}, {}, pairs.description, [*filter(None, [ate.complaint]), *pairs.warnings])
-    for name, metric in metrics.items():
-        try:
-            results.found[name] = metric()
-        except InputError as error:
-            results.missing[name] = str(error)
-    return results
 
 
 def _text(results: Results) -> str:

@@ -95,12 +95,15 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     samples: list[RawPoints] = []
     wheels: list[StampedPose] = []
     malformed: list[str] = []
-    watch = RestWatch(log.dimension)
+    watch, read = RestWatch(log.dimension), 0
     for message in decoded_messages(
         log.indexes, decoders, log.span, ahead=log.config.prefetch_chunks, damage=damage
     ):
         match message.value:
             case ScanFacts() as facts:
+                read += 1
+                if (read - 1) % log.config.every:  # left out by a run
+                    continue
                 if len(scans) % max(1, log.scan_count // _SAMPLED) == 0 and facts.kept:
                     samples.append(facts.points)
                 scans.append(facts._replace(outline=_FORGOTTEN, points=_NO_POINTS))

@@ -1,0 +1,114 @@
+"""Every metric of a trajectory against the truth at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from scanchain import checks
+from scanchain.data import Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation.absolute import AbsoluteError, Alignment, absolute_error
+from scanchain.evaluation.pairing import Pairs, pair
+from scanchain.evaluation.reference import read_truth
+from scanchain.evaluation.relations import RelationError
+from scanchain.evaluation.relative import (
+    KittiError,
+    RelativeError,
+    kitti_error_on_any_course,
+    relative_error_over_distance,
+    relative_error_over_frames,
+    relative_error_over_time,
+)
+from scanchain.trajectory import read_tum
+
+Result = AbsoluteError | RelativeError | KittiError | RelationError
+
+_INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Metrics by name: those computed, and the reason for each that could not be.
+
+    ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
+    """
+
+    found: dict[str, Result]
+    missing: dict[str, str]
+    pairing: str = ""
+    warnings: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Interval of an RPE in ``pose``, ``s`` or ``m``."""
+
+    size: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """Key of its figures."""
+        return f"rpe_{self.size:g}_{self.unit}"
+
+    def error(self, pairs: Pairs) -> RelativeError:
+        """The RPE over it. Raises InputError where the trajectory is too short."""
+        if self.unit == "pose":
+            return relative_error_over_frames(pairs, int(self.size))
+        if self.unit == "s":
+            return relative_error_over_time(pairs, self.size)
+        return relative_error_over_distance(pairs, self.size)
+
+
+def evaluate(
+    estimate: Trajectory | str | Path,
+    truth: Trajectory | str | Path,
+    *,
+    align: str = "rigid",
+    max_gap_s: float | None = None,
+    rpe: str = "1pose,1s,10m,100m",
+    source: str = "rpe",
+) -> Results:
+    """Every metric that a trajectory and its ground truth allow: ATE, RPE over each interval, KITTI.
+
+    estimate : a trajectory or a TUM file
+    truth : a trajectory, a TUM file, or a KITTI file with one row a pose of the estimate
+    align : "rigid", "first" or "none", for the ATE
+    max_gap_s : truth is interpolated over at most this; by default five of its median intervals
+    rpe : intervals in poses, seconds or meters; ``source`` names them in errors
+    Returns ``found`` by name ("ate", "rpe_1_s", "kitti"), ``missing`` with reasons, ``warnings``.
+    Raises InputError where no pose has a true one, or an argument is none of these.
+    """
+    checks.one_of(align, tuple(each.value for each in Alignment), "align")
+    intervals = _intervals(rpe, source)
+    trajectory = read_tum(Path(estimate)) if isinstance(estimate, str | Path) else estimate
+    checks.instance(trajectory, Trajectory, "estimate", "read_tum(path)")
+    if isinstance(truth, str | Path):
+        truth = read_truth(Path(truth)).at(trajectory.stamps_ns)
+    checks.instance(truth, Trajectory, "truth", "read_tum(path)")
+    pairs = pair(trajectory, truth, gap_s=max_gap_s)
+    metrics: dict[str, Callable[[], Result]] = {
+        **{interval.name: partial(interval.error, pairs) for interval in intervals},
+        "kitti": partial(kitti_error_on_any_course, pairs),
+    }
+    ate = absolute_error(pairs, Alignment(align))
+    results = Results({"ate": ate}, {}, pairs.description, [*filter(None, [ate.complaint]), *pairs.warnings])
+    for name, metric in metrics.items():
+        try:
+            results.found[name] = metric()
+        except InputError as error:
+            results.missing[name] = str(error)
+    return results
+
+
+def _intervals(text: str, source: str) -> list[Interval]:
+    """Intervals of a list such as ``1pose,0.5s,10m``."""
+    found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
+    for word, match in found:
+        if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
+            raise InputError(f"{source} has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
+    return [Interval(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
