@@ -4,7 +4,8 @@ SHELL := /bin/bash
 BIN := .venv/bin
 RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
-DOCS := .venv/docs-installed
+# apart, for pip finds no versions that suit Sphinx and all that the tests need
+DOCS := .venv/docs/installed
 
 .PHONY: help demo test lint docs clean
 
@@ -36,7 +37,7 @@ lint: $(DEV)
 	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 
 docs: $(DOCS)
-	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
+	.venv/docs/bin/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
 	@echo "Open build/docs/index.html"
 
 $(RUNTIME): pyproject.toml setup.py
@@ -50,7 +51,8 @@ $(DEV): pyproject.toml setup.py $(RUNTIME)
 	touch $@
 
 $(DOCS): pyproject.toml setup.py $(RUNTIME)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(PYTHON) -m venv .venv/docs
+	.venv/docs/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 clean:

@@ -120,7 +120,7 @@ def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path)
 def test_the_scans_looked_at_are_those_that_a_run_would_take(tmp_path):
     simulate("town", tmp_path / "town.mcap", duration_s=3.0, sensor="vlp-16")
     found = diagnose(tmp_path / "town.mcap", every=4)["rate"]
-    assert "8 scans, 2.5 Hz" in found.found and "wide_reach_voxels" in found.remedy
+    assert found.found.startswith("8 scans, 2.5 Hz")
 
 
 def test_a_gap_is_found_where_it_is(tmp_path):
