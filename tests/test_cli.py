@@ -542,6 +542,13 @@ def test_flags_about_times_or_wheels_that_a_log_of_clouds_lacks_are_told(call, t
     assert "no effect" not in call(command, path, "--log.point_times", "clockwise")[1]
 
 
+def test_a_run_killed_before_its_first_checkpoint_is_named_when_it_starts_over(call, tmp_path, office):
+    (tmp_path / "a.partial-1").mkdir()
+    code, _, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", "--resume")
+    assert code == 0
+    says(errors, "a.partial-1: no checkpoint to resume from, this run starts over")
+
+
 def test_leaving_out_point_times_that_a_log_has_is_an_effect(call, tmp_path):
     call("simulate", "town", tmp_path / "town.mcap", "--duration", "0.5", "--sensor", "vlp-16")
     code, output, _ = call("info", tmp_path / "town.mcap", "--log.point_times", "none")

@@ -116,6 +116,12 @@ def resumable(destination: Path) -> Path | None:
     return latest if latest is None or not _writer(latest) else None
 
 
+def left_without_checkpoint(destination: Path) -> list[str]:
+    """Names of the directories that runs into ``destination`` left before their first checkpoint."""
+    left = destination.resolve().parent.glob(f"{escape(destination.name)}.partial-*")
+    return sorted(path.name for path in left if not (path / CHECKPOINT_FILE).is_file())
+
+
 def _latest_left(destination: Path) -> Path | None:
     destination = destination.resolve()
     left = [

@@ -18,7 +18,15 @@ from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.logs import Log, open_log
-from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, resumable
+from scanchain.runs.directory import (
+    CHECKPOINT_FILE,
+    POINTS_FILE,
+    RUN_FILE,
+    TRUTH_FILE,
+    RunDirectory,
+    left_without_checkpoint,
+    resumable,
+)
 from scanchain.runs.job import Job, OpenRecorder, Progress
 from scanchain.runs.metrics import GroundTruth, Metrics, judge, measure, summary
 from scanchain.runs.processing import TruePoses, process
@@ -114,6 +122,8 @@ def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
         progress.tell(
             f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over"
         )
+    elif job.resume and (partial_names := left_without_checkpoint(job.out)):
+        progress.tell(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
 
 
 def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> None:
