@@ -4,8 +4,7 @@ SHELL := /bin/bash
 BIN := .venv/bin
 RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
-# apart, for pip finds no versions that suit Sphinx and all that the tests need
-DOCS := .venv/docs/installed
+DOCS := .venv/docs-installed
 
 .PHONY: help demo test lint docs clean
 
@@ -37,7 +36,7 @@ lint: $(DEV)
 	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 
 docs: $(DOCS)
-	.venv/docs/bin/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
 	@echo "Open build/docs/index.html"
 
 $(RUNTIME): pyproject.toml setup.py
@@ -47,12 +46,11 @@ $(RUNTIME): pyproject.toml setup.py
 	touch $@
 
 $(DEV): pyproject.toml setup.py $(RUNTIME)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines,cluster,remote,dev]'
 	touch $@
 
 $(DOCS): pyproject.toml setup.py $(RUNTIME)
-	$(PYTHON) -m venv .venv/docs
-	.venv/docs/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
 clean:
