@@ -201,7 +201,7 @@ def test_a_key_like_none_there_is_points_to_the_list(key):
         ("log.every", "inf", "a whole number >= 1"),
         ("local_map.voxel_size_m", "inf", "a number > 0 and finite, in m"),
         ("log.start_s", "-0.1", "a number >= 0, in s"),
-        ("maps.slice_min_z_m", "-inf", "a number, in m"),
+        ("maps.slice_min_z_m", "-inf", "a number and finite, in m"),
     ],
 )
 def test_a_value_out_of_range_names_key_value_and_range(tmp_path, key, text, limit):
