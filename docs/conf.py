@@ -1,4 +1,4 @@
-"""How the documentation is built: ``make docs``. Nothing is fetched from the network."""
+"""Configuration of Sphinx: ``make docs``. Nothing is fetched from the network."""
 
 import sys
 from importlib.metadata import version as installed

@@ -39,7 +39,7 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What is read from the log.
+    """Reading of the log.
 
     format : log format: found automatically, a known one by name, or ``module:Class`` of your own
     topic : lidar topic; found automatically where empty
@@ -78,7 +78,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How a scan is prepared for matching: cropped, downsampled, deskewed.
+    """Preparation of a scan for matching: cropping, downsampling, deskewing.
 
     min_range_m : returns nearer than this are not used
     max_range_m : returns farther than this are not used
@@ -124,7 +124,7 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How a scan is aligned; the first scans, and those after a loss, are searched with the ``wide_`` limits.
+    """Scan-to-map alignment; the first scans, and those after a loss, are searched with the ``wide_`` limits.
 
     matcher : ``plicp``: point-to-plane or point-to-line by Levenberg-Marquardt; ``svd``: point-to-point in
         closed form
@@ -164,7 +164,7 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How motion is predicted, how wide a failed match is searched for, and when a keyframe is made.
+    """Motion prediction, search width after a failed match, and spacing of keyframes.
 
     prior : motion prediction: by wheel odometry, at constant velocity, or by the wheels where the log has them
     wheel_sigma_m : largest standard deviation of a translation predicted by the wheels; the usual one is
@@ -196,7 +196,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How revisits are found and verified.
+    """Loop closing: proposal and verification of revisits.
 
     enabled : whether loops are closed
     drift : drift of the odometry in meters a meter, which sets the search radius along the shortest path of
@@ -244,7 +244,7 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """How the pose graph is optimized.
+    """Pose graph optimization.
 
     optimizer : method of the nonlinear least squares
     max_iterations : limit of the iterations
@@ -286,7 +286,7 @@ class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
 
 class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):
-    """What goes into the rerun recording.
+    """Contents of the rerun recording.
 
     local_map_every : keyframes between two drawings of the local map
     max_map_points : points drawn of the local map, and at least as many of the final map

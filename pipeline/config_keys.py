@@ -111,11 +111,6 @@ class ConfigKey:
         is_known = self.kind == "str" or value in self.choices or (self.is_open and is_class_name(value))
         return value if is_known else None
 
-    @property
-    def _may_be_infinite(self) -> bool:
-        """Whether +∞ means that there is no limit."""
-        return self.name in _UNLIMITED
-
     def _number(self, value: object) -> Value | None:
         """The number if it is one and lies within the limits; −∞ and NaN never do, +∞ where it means no limit."""
         if isinstance(value, bool) or not isinstance(value, Real):
@@ -125,7 +120,7 @@ class ConfigKey:
         except OverflowError:  # an int of hundreds of digits
             return None
         above = number >= self.low if self.low_is_allowed else number > self.low
-        if not above or number > self.high or (math.isinf(number) and not self._may_be_infinite):
+        if not above or number > self.high or (math.isinf(number) and self.name not in _UNLIMITED):
             return None
         return number if self.kind == "float" else int(number) if number.is_integer() else None
 
@@ -146,7 +141,7 @@ def section_keys(section: type) -> tuple[ConfigKey, ...]:
 
 
 def _descriptions(docstring: str) -> dict[str, str]:
-    """What the lines ``name : description`` of a docstring say, those that continue them included."""
+    """Descriptions by name, from the lines ``name : description`` of a docstring and those that continue them."""
     entries = re.findall(r"^ *(\w+) : (.*(?:\n {8,}\S.*)*)", docstring, re.MULTILINE)
     return {name: " ".join(text.split()) for name, text in entries}
 

@@ -174,14 +174,9 @@ class Match:
         return self.inliers / max(self.points, 1)
 
     @property
-    def is_contradicted(self) -> bool:
-        """Whether the correspondences contradict the pose along a direction that they determine."""
-        return self.fit < LEAST_FIT
-
-    @property
     def is_fit(self) -> bool:
         """True if the pose is a minimum that the correspondences agree with, in every direction or not."""
-        return self.at_minimum and not self.is_contradicted
+        return self.at_minimum and self.fit >= LEAST_FIT
 
 
 @dataclass(frozen=True, slots=True)

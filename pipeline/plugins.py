@@ -16,12 +16,12 @@ def is_class_name(text: str) -> bool:
     return re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", text) is not None
 
 
-def load(name: str, verb: str = "") -> type:
+def load(name: str, *methods: str) -> type:
     """The class that ``module:Class`` names: installed, on PYTHONPATH or else in the working directory.
 
     The working directory joins the search path only for a module found nowhere else: until then nothing that
     happens to lie there is imported. Raises InputError where there is no such module or class, or the class lacks
-    the method ``verb``.
+    one of the methods.
     """
     module_name, _, class_name = name.partition(":")
     if not module_name or not class_name:
@@ -33,8 +33,12 @@ def load(name: str, verb: str = "") -> type:
         classes = [key for key in own if isinstance(vars(module)[key], type)]
         there = f"there are {', '.join(classes)}" if classes else "it defines none"
         raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
-    if verb and not callable(getattr(found, verb, None)):
-        raise InputError(f"{name}: the class has no method {verb}; see the documentation, Extending")
+    for method in methods:
+        if not callable(getattr(found, method, None)):
+            raise InputError(
+                f"{name}: the class has no method {method}; it needs {' and '.join(methods)} (documentation: "
+                "Extending)"
+            )
     return found
 
 

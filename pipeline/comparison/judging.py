@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.figures import Figures
 from scanchain.comparison.outcome import STEPS_FILE, Outcome
-from scanchain.data import LEAST_FIT, Matrix, Pose, State, Trajectory
+from scanchain.data import Matrix, Pose, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     RelationError,
@@ -27,7 +27,7 @@ from scanchain.evaluation import (
     relative_error_over_distance,
     relative_error_over_time,
 )
-from scanchain.runs.metrics import unreliable
+from scanchain.runs.metrics import count_contradicted, unreliable
 from scanchain.runs.step_table import COLUMNS, nees_of_steps
 
 Answer = TypeVar("Answer")
@@ -99,8 +99,7 @@ def unreliable_by_itself(outcome: Outcome) -> str:
         return ""
     table = pq.read_table(path, columns=["state", "scan_points", "fit"])
     states = [State(name) for name in table["state"].to_pylist()]
-    fits = table["fit"].to_pylist()
-    contradicted = sum(state is State.OK and fit < LEAST_FIT for state, fit in zip(states, fits, strict=True))
+    contradicted = count_contradicted(states, table["fit"].to_pylist())
     return unreliable(Counter(states), contradicted, table["scan_points"].to_pylist())
 
 

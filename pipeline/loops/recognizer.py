@@ -92,8 +92,4 @@ def create_recognizer(config: Config, dimension: int) -> Recognizer | None:
     if name not in RECOGNIZERS and ":" not in name:
         known = ", ".join(("auto", "none", *RECOGNIZERS))
         raise InputError(f"loops.recognizer is {name!r}; it must be one of {known}, or module:Class for your own")
-    kind = plugins.load(RECOGNIZERS.get(name, name))
-    for method in ("add", "query"):
-        if not callable(getattr(kind, method, None)):
-            raise InputError(f"loops.recognizer {name}: the class has no method {method}; it needs add and query")
-    return kind(config, dimension)
+    return plugins.load(RECOGNIZERS.get(name, name), "add", "query")(config, dimension)

@@ -11,6 +11,7 @@ from scanchain import lie
 from scanchain.config import MatchingConfig, PreprocessConfig
 from scanchain.data import Match, Points, Pose, Scan, State
 from scanchain.odometry.prediction import Prediction
+from scanchain.registration import with_source_frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,19 +90,10 @@ def blurred(match: Match, error: NDArray[np.float64]) -> Match:
 
 def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
     """The same scan as seen from another frame that moves with it: points, pose, information."""
-    T_old_new = lie.inverse(T_new_old)
-    match = tracked.match
-    direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
-    Ad_inverse = lie.adjoint(T_old_new)
     return replace(
         tracked,
         points=lie.transform(T_new_old, tracked.points),
         matched=lie.transform(T_new_old, tracked.matched),
-        T_odom_lidar=tracked.T_odom_lidar @ T_old_new,
-        match=replace(
-            match,
-            T_target_source=match.T_target_source @ T_old_new,
-            information=Ad_inverse.T @ match.information @ Ad_inverse,
-            degeneracy_direction=direction / np.linalg.norm(direction),
-        ),
+        T_odom_lidar=tracked.T_odom_lidar @ lie.inverse(T_new_old),
+        match=with_source_frame(tracked.match, T_new_old),
     )

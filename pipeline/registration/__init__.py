@@ -1,6 +1,6 @@
 """SVD-ICP and LM-PLICP against a voxel map."""
 
-from scanchain.registration.align import align
+from scanchain.registration.align import align, with_source_frame
 from scanchain.registration.correlative import CorrelativeMap, Seed
 from scanchain.registration.matcher import Matcher, create_matcher
 from scanchain.registration.plicp import PointToShapeMatcher
@@ -19,4 +19,5 @@ __all__ = [
     "align",
     "create_matcher",
     "rigid_transform",
+    "with_source_frame",
 ]

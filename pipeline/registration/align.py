@@ -108,20 +108,28 @@ def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> 
 
     With T = C_t T' C_s⁻¹ a right twist ξ' of T' is Ad(C_s) ξ' of T.
     """
-    d = len(at_source) - 1
-    k = len(match.information)
-    scale = np.ones(k)
-    scale[:d] = unit_m
-    turned = lie.adjoint(at_source) * scale
-    back = np.linalg.inv(turned)
-    direction = turned @ match.degeneracy_direction
-    return replace(
+    units = lie.by_component(len(match.information), unit_m, 1.0)
+    scaled = replace(
         match,
         reason=match.reason if match.converged else f"{match.reason} (lengths in units of {unit_m:.3g} m)",
-        T_target_source=at_target @ _scaled(match.T_target_source, unit_m) @ lie.inverse(at_source),
-        information=back.T @ match.information @ back,
+        T_target_source=at_target @ _scaled(match.T_target_source, unit_m),
+        information=match.information / np.outer(units, units),
         cost=match.cost * unit_m**2,
         residual_m=match.residual_m * unit_m,
+        degeneracy_direction=units * match.degeneracy_direction,
+    )
+    return with_source_frame(scaled, at_source)
+
+
+def with_source_frame(match: Match, T_new_old: Pose) -> Match:
+    """The same match with the source seen from another frame that moves with it."""
+    T_old_new = lie.inverse(T_new_old)
+    direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
+    Ad_inverse = lie.adjoint(T_old_new)
+    return replace(
+        match,
+        T_target_source=match.T_target_source @ T_old_new,
+        information=Ad_inverse.T @ match.information @ Ad_inverse,
         degeneracy_direction=direction / np.linalg.norm(direction),
     )
 

@@ -118,15 +118,19 @@ def resumable(destination: Path) -> Path | None:
 
 def left_without_checkpoint(destination: Path) -> list[str]:
     """Names of the directories that runs into ``destination`` left before their first checkpoint."""
-    left = destination.resolve().parent.glob(f"{escape(destination.name)}.partial-*")
-    return sorted(path.name for path in left if not (path / CHECKPOINT_FILE).is_file())
+    return sorted(path.name for path in _partial(destination) if not (path / CHECKPOINT_FILE).is_file())
+
+
+def _partial(destination: Path) -> Iterator[Path]:
+    """Directories that runs into ``destination`` left, or write now."""
+    destination = destination.resolve()
+    return destination.parent.glob(f"{escape(destination.name)}.partial-*")
 
 
 def _latest_left(destination: Path) -> Path | None:
-    destination = destination.resolve()
     left = [
         path
-        for path in destination.parent.glob(f"{escape(destination.name)}.partial-*")
+        for path in _partial(destination)
         if (path / CHECKPOINT_FILE).is_file() and (path / RUN_FILE).is_file()
     ]
     return max(left, key=lambda path: (path / CHECKPOINT_FILE).stat().st_mtime_ns, default=None)

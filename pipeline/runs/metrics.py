@@ -159,7 +159,7 @@ def measure(
     matches = [row.match for row in steps.rows]
     residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
-    contradicted = sum(row.state is State.OK and row.match.is_contradicted for row in steps.rows)
+    contradicted = count_contradicted([row.state for row in steps.rows], [match.fit for match in matches])
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
@@ -199,6 +199,11 @@ def measure(
         warnings=tuple(warnings),
         compile_s=compile_s,
     )
+
+
+def count_contradicted(states: Sequence[State], fits: Sequence[float]) -> int:
+    """Scans whose pose is observable, but contradicted by their correspondences."""
+    return sum(state is State.OK and fit < LEAST_FIT for state, fit in zip(states, fits, strict=True))
 
 
 def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[int]) -> str:

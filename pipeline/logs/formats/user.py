@@ -44,10 +44,7 @@ class ScanFormat(Protocol):
 
 def load_format(name: str) -> type[ScanFormat]:
     """The class that ``module:Class`` names. Raises InputError where there is none, or it is no log format."""
-    found = plugins.load(name)
-    if not callable(getattr(found, "scans", None)):
-        raise InputError(f"{name}: has no method scans(self), an iterator of {_TUPLE}; see the page Extending")
-    return found
+    return plugins.load(name, "scans")
 
 
 def index_scans(path: Path, number: int, name: str, source: Source | None = None) -> FileIndex:
