@@ -31,7 +31,7 @@ from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, Prepro
 from scanchain.evaluation import absolute_error, pair
 from tests.support.scenes import shared_data
 
-CALLS = 2000
+CALLS = 500
 
 
 def place(dimension, count, rng, unit=1.0):
@@ -322,7 +322,7 @@ def folder(tmp_path_factory):
 
 
 def fuzzed(*strategies):
-    """2,000 calls, the same each time; what is drawn twice is right as often as it is not."""
+    """So many calls, the same each time; what is drawn twice is right as often as it is not."""
     return lambda test: settings(max_examples=CALLS, derandomize=True)(given(*strategies)(test))
 
 

@@ -17,9 +17,9 @@ from scanchain.__main__ import main
 from scanchain.download import DownloadError, fetch
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from tests.logs.test_carmen import flaser, save
-from tests.logs.test_folders import kitti_raw
 from tests.support import recorders
+from tests.support.carmen_text import flaser, save
+from tests.support.folders import kitti_raw
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -10,6 +10,7 @@ from msgspec.structs import fields
 from scanchain.config import Config
 from scanchain.errors import InputError
 from scanchain.settings import Override, config_keys, dump, flatten, load_settings, preset_path, read_layer
+from tests.support.messages import says
 from tests.support.scenes import ROOT, configured
 
 
@@ -30,11 +31,6 @@ def complaint(**arguments):
     text = str(caught.value)
     assert "\n" not in text
     return text
-
-
-def says(text, *parts):
-    missing = [part for part in parts if part not in text]
-    assert not missing, f"{missing} not in: {text}"
 
 
 # what has no effect

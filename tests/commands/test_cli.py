@@ -25,6 +25,7 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum, write_kitti, write_tum
+from tests.support.messages import says
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -61,11 +62,6 @@ def refused(call, tmp_path):
         return errors
 
     return run
-
-
-def says(text, *parts):
-    missing = [str(part) for part in parts if str(part) not in text]
-    assert not missing, f"{missing} not in: {text}"
 
 
 def commands(group=scanchain, words=()):

@@ -72,9 +72,11 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
 
 
 def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
-    monkeypatch.setattr(subprocess, "Popen", None)
-    with announcing_compilation(Told().say, ("http.server", "0")):
-        pass
+    begun, told = [], Told()
+    monkeypatch.setattr(subprocess, "Popen", lambda *words, **options: begun.append(words))
+    with announcing_compilation(told.say, ("http.server", "0")):
+        kernel("numba.np.arrayobj")(2)
+    assert begun == told.lines == []
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

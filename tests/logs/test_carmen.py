@@ -11,13 +11,8 @@ from scanchain import lie
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser
+from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser, save
 from tests.support.scenes import shared_data
-
-
-def save(path, *lines):
-    path.write_text("# CARMEN\n" + "\n".join(lines) + "\n")
-    return path
 
 
 def read(path, **config):

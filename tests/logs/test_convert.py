@@ -12,9 +12,9 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
-from tests.logs.test_carmen import flaser, odom, save
-from tests.logs.test_folders import kitti_odometry, kitti_raw, xyzi
 from tests.support import recorders
+from tests.support.carmen_text import flaser, odom, save
+from tests.support.folders import kitti_odometry, kitti_raw, xyzi
 from tests.support.naive_logs import office, write
 from tests.support.scenes import shared_data
 

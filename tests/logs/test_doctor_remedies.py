@@ -177,7 +177,7 @@ def timed(rows, times_s):
 
 
 def a_wide_world(world):
-    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0)
+    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0, count=30)
 
 
 def a_narrow_world(world):

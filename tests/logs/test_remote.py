@@ -21,7 +21,7 @@ from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
 from scanchain.source import Address, source_of
-from tests.logs.test_carmen import flaser, save
+from tests.support.carmen_text import flaser, save
 from tests.support.scenes import shared_data
 from tests.support.web_server import serving
 

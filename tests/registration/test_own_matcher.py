@@ -12,10 +12,8 @@ from scanchain.comparison.table import read_table
 from scanchain.config import MatchingConfig
 from scanchain.errors import InputError
 from scanchain.registration import create_matcher
-from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.simulation import simulate
-from tests.comparison.test_compare import row
-from tests.support.killing import partial, same_result, steps_on_disk
+from tests.support.killing import same_result, wait_for_steps
 
 MATCHER = '''
 import numpy as np
@@ -86,8 +84,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     assert whole.wait() == 0, whole.stderr.read()
     assert NAME in (folder / "whole" / "config.toml").read_text()
     child = started(folder, *words, "--out", "run")
-    while steps_on_disk(folder / "run") < 40 or not (partial(folder / "run") / CHECKPOINT_FILE).exists():
-        assert child.poll() is None, child.stderr.read()
+    wait_for_steps(child, folder / "run", 40)
     child.kill()
     child.wait()
     again = started(folder, *words, "--out", "run", "--resume")
@@ -105,11 +102,11 @@ def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, 
     child = started(folder, *words, *again)
     _, errors = child.communicate()
     assert child.returncode == 0, errors
-    tables = [read_table(folder / name) for name in ("a", "b")]
-    own = [row(table, "PointToPoint") for table in tables]
+    a, b = ({row.name: row for row in read_table(folder / name).rows} for name in ("a", "b"))
+    own = [a["PointToPoint"], b["PointToPoint"]]
     assert own[0].status is Status.OK and NAME in own[0].description
     assert own[0].figures.ate_m == own[1].figures.ate_m < 0.1
-    assert own[0].figures.ate_m != row(tables[0], "svd").figures.ate_m
+    assert own[0].figures.ate_m != a["svd"].figures.ate_m
 
 
 def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeypatch):

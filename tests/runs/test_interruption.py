@@ -15,7 +15,7 @@ import pytest
 
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
+from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume.checkpoint import _CLASSES, Checkpoints, read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
@@ -23,9 +23,17 @@ from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
 from scanchain.viz.recording import entities
-from tests.support.killing import assert_readable, kill_at_random, partial, same_result, start, steps_on_disk
+from tests.support.killing import (
+    assert_readable,
+    kill_at_random,
+    partial,
+    same_result,
+    start,
+    steps_on_disk,
+    wait_for_steps,
+)
+from tests.support.recordings import column
 from tests.support.scenes import ROOT, configured, shared_data
-from tests.viz.test_recording import column
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
@@ -60,25 +68,24 @@ def undisturbed(request, office, whole, tmp_path_factory):
     return log, out
 
 
-def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(undisturbed, tmp_path):
+def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_recording(undisturbed, tmp_path):
     log, whole = undisturbed
-    rng, out = random.Random(1), tmp_path / "run"
+    out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
+    assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
-    for _ in range(3):
-        child = start(log, out, *LIVELY, "--resume")
-        enough = steps_on_disk(out) + rng.randrange(20, 60)
-        while steps_on_disk(out) < enough or not (partial(out) / CHECKPOINT_FILE).exists():
-            assert child.poll() is None
-        child.kill()
+    for interruption, share in ((signal.SIGKILL, 0.3), (signal.SIGINT, 0.5), (signal.SIGKILL, 0.7)):
+        child = start(log, out, *RECORDED, "--resume")
+        wait_for_steps(child, out, share * len(stamps_ns))
+        child.send_signal(interruption)
         child.wait()
-        table, _ = read_journal(partial(out))
-        reached.append(len(table))
-        np.testing.assert_array_equal(  # readable, and those of the undisturbed run
-            table.odometry.stamps_ns, read_tum(whole / "odometry.tum").stamps_ns[: len(table)]
-        )
+        reached.append(read_checkpoint(partial(out)).scans)
+        assert (partial(out) / RECORDING_FILE).exists()
+        table, _ = read_journal(partial(out))  # readable, and those of the undisturbed run
+        np.testing.assert_array_equal(table.odometry.stamps_ns, stamps_ns[: len(table)])
         table.write(tmp_path / "steps.parquet", table.best_known)
-        assert pq.read_metadata(tmp_path / "steps.parquet").num_rows == len(table)
-    assert start(log, out, *LIVELY, "--resume").wait() == 0
+        assert pq.read_metadata(tmp_path / "steps.parquet").num_rows == len(table) >= reached[-1]
+    assert 0 < reached[0] < reached[1] <= reached[2] < len(stamps_ns)
+    assert start(log, out, *RECORDED, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
     same_result(out, whole)
     assert "resumed after" in (out / "summary.txt").read_text()
@@ -92,26 +99,8 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
     seed = random.randrange(1000)
     print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
     longest_s = time.perf_counter() - began
-    killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=6, seed=seed, longest_s=longest_s))
-    assert len(killed) == 6
-
-
-def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was_not(undisturbed, tmp_path):
-    log, whole = undisturbed
-    out, count = tmp_path / "run", len(read_tum(whole / "trajectory.tum"))
-    assert pq.read_table(whole / "loops.parquet").num_rows > 0
-    reached = []
-    for interruption, share in ((signal.SIGKILL, 0.3), (signal.SIGINT, 0.5), (signal.SIGKILL, 0.7)):
-        child = start(log, out, *RECORDED, "--resume")
-        while steps_on_disk(out) < share * count or not (partial(out) / CHECKPOINT_FILE).exists():
-            assert child.poll() is None
-        child.send_signal(interruption)
-        child.wait()
-        reached.append(read_checkpoint(partial(out)).scans)
-        assert (partial(out) / RECORDING_FILE).exists()
-    assert 0 < reached[0] < reached[1] <= reached[2] < count
-    assert start(log, out, *RECORDED, "--resume").wait() == 0
-    same_result(out, whole)
+    killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=3, seed=seed, longest_s=longest_s))
+    assert len(killed) == 3
 
 
 @pytest.mark.parametrize(
@@ -126,8 +115,7 @@ def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
 ):
     out = tmp_path / "run"
     child = start(office, out, *RECORDED)
-    while steps_on_disk(out) < 100 or not (partial(out) / CHECKPOINT_FILE).exists():
-        assert child.poll() is None
+    wait_for_steps(child, out, 100)
     child.kill()
     child.wait()
     dying = f"""
@@ -151,8 +139,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
     out = tmp_path / "run"
     child = start(office, out, *LIVELY)
-    while steps_on_disk(out) < 150 or not (partial(out) / CHECKPOINT_FILE).exists():
-        assert child.poll() is None
+    wait_for_steps(child, out, 150)
     child.kill()
     child.wait()
     assert start(office, out, *RECORDED, "--resume").wait() == 0
@@ -227,8 +214,7 @@ def test_every_step_is_on_disk_within_a_second(office, tmp_path):
 def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path):
     out = tmp_path / "run"
     child = start(office, out, *LOOPING, "--checkpoint", "1000", "--rerun", "off", stderr=subprocess.PIPE)
-    while steps_on_disk(out) < 30:
-        assert child.poll() is None
+    wait_for_steps(child, out, 30, checkpoint=False)
     child.send_signal(signal.SIGINT)
     errors = child.communicate(timeout=60)[1].decode()
     assert child.returncode == 1 and errors.startswith("error: stopped by the user after ")
@@ -267,8 +253,7 @@ def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
     out, other = tmp_path / "run", tmp_path / "other.mcap"
     simulate("office", other, duration_s=30.0, seed=5)
     child = start(office, out, *LIVELY)
-    while not list(tmp_path.glob("*/state.checkpoint")):
-        assert child.poll() is None
+    wait_for_steps(child, out, 1)
 
     def refusal(log, *words):
         refused = start(log, out, *LIVELY, "--resume", *words, stderr=subprocess.PIPE)
@@ -323,8 +308,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_torn_journal_is_read_up_to_the_tear(office, tmp_path):
     out = tmp_path / "run"
     child = start(office, out, *LIVELY)
-    while steps_on_disk(out) < 20:
-        assert child.poll() is None
+    wait_for_steps(child, out, 20, checkpoint=False)
     child.kill()
     child.wait()
     journal = partial(out) / JOURNAL_FILE

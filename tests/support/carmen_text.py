@@ -22,3 +22,8 @@ def robotlaser(k, ranges, laser, robot, *, first=-1.0, step=0.25, reach=30.0, re
 
 def odom(k, x):
     return f"ODOM {x:.6f} 0.0 0.0 0.0 0.0 0.0 {BEGIN_S + 0.25 * k:.6f} nohost {0.25 * k:.6f}"
+
+
+def save(path, *lines):
+    path.write_text("# CARMEN\n" + "\n".join(lines) + "\n")
+    return path

@@ -4,6 +4,7 @@ import json
 import random
 import subprocess
 import sys
+import time
 import tomllib
 from dataclasses import dataclass
 
@@ -51,6 +52,13 @@ def steps_on_disk(out):
         return len(read_journal(partial(out) or out)[0])
     except FileNotFoundError:  # not there yet, or just taking another name
         return 0
+
+
+def wait_for_steps(child, out, steps, *, checkpoint=True):
+    """Return once a run has so many steps on disk, and a checkpoint."""
+    while steps_on_disk(out) < steps or (checkpoint and not (partial(out) / CHECKPOINT_FILE).exists()):
+        assert child.poll() is None, "the run ended before"
+        time.sleep(0.02)
 
 
 def same_result(a, b):
