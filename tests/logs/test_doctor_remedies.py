@@ -79,8 +79,11 @@ def planar(path, change):
             yield said
 
 
-def clouds(path, change, *, fields=ROW, scale=1.0, count=80):
-    """The messages of a cloud log, rows made by ``change(rows, seconds)``, the world shrunk or grown."""
+def clouds(path, change, *, fields=ROW, scale=1.0, count=80, every=1):
+    """The messages of a cloud log, rows made by ``change(rows, seconds)``, the world shrunk or grown.
+
+    ``count`` scans, of each every ``every``-th point.
+    """
     log = open_log(path)
     truth = log.ground_truth()
     for scan in log.scans():
@@ -90,10 +93,11 @@ def clouds(path, change, *, fields=ROW, scale=1.0, count=80):
         T[:3, 3] *= scale
         data = odometry_of(scan.stamp_ns, T)
         yield odometry_said(scan.stamp_ns, data, "/ground_truth")
-        rows = np.zeros(len(scan.points), fields)
+        points = scan.points[::every]
+        rows = np.zeros(len(points), fields)
         for axis, name in enumerate("xyz"):
-            rows[name] = scale * scan.points[:, axis]
-        change(rows, scan.times_s)
+            rows[name] = scale * points[:, axis]
+        change(rows, scan.times_s[::every])
         yield cloud_said(scan.stamp_ns + SECOND // 10, point_cloud(scan.stamp_ns, rows))
 
 
@@ -177,7 +181,7 @@ def timed(rows, times_s):
 
 
 def a_wide_world(world):
-    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0, count=30)
+    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0, count=55, every=3)
 
 
 def a_narrow_world(world):
