@@ -42,19 +42,6 @@ def complaint(*paths, **config):
 # bad input
 
 
-def test_no_such_file(tmp_path):
-    says(complaint(tmp_path / "absent.mcap"), "no such file")
-
-
-def test_a_directory(tmp_path):
-    says(complaint(tmp_path), "is a folder of no log", "give MCAP")
-
-
-def test_an_empty_file(tmp_path):
-    (tmp_path / "a.mcap").touch()
-    says(complaint(tmp_path / "a.mcap"), "empty")
-
-
 @pytest.mark.parametrize("content", [b"x", b"\x89MCAP", b"\x89MCAP0\r", b"{}", b"\0" * 100])
 def test_a_file_that_is_no_log(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
@@ -94,7 +81,7 @@ def test_a_bag_that_is_none(tmp_path, content, said):
 
 def test_the_magic_and_nothing_else(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
-    complaint(tmp_path / "a.mcap")
+    says(complaint(tmp_path / "a.mcap"), "no lidar topic")
 
 
 def test_a_second_file_that_is_bad_is_the_one_named(tmp_path):
@@ -125,8 +112,8 @@ def test_a_log_without_lidar_lists_what_it_holds(tmp_path):
 
 
 def test_a_log_without_messages(tmp_path):
-    complaint(write(tmp_path / "a.mcap", []))
-    complaint(write(tmp_path / "b.mcap", [], announced=[scan_said(0, b"")]))
+    says(complaint(write(tmp_path / "a.mcap", [])), "no lidar topic")
+    says(complaint(write(tmp_path / "b.mcap", [], announced=[scan_said(0, b"")])), "/scan")
 
 
 def test_a_topic_that_is_absent_lists_what_there_is(tmp_path):
@@ -317,20 +304,6 @@ def test_what_lies_before_the_cut_in_a_cut_chunk_is_recovered(tmp_path, compress
     assert 10 <= len(scans) < 40 and damage
     if compression == "none":
         assert len(scans) >= 28
-
-
-@pytest.mark.parametrize("crcs", [True, False])
-@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_bytes_changed_anywhere_give_scans_or_one_line_but_never_a_traceback(tmp_path, crcs, compression):
-    whole = write(tmp_path / "whole.mcap", office(), compression=compression, crcs=crcs).read_bytes()
-    path = tmp_path / "changed.mcap"
-    rng = np.random.default_rng(7)
-    for _ in range(120):
-        changed = bytearray(whole)
-        for at in rng.integers(8, len(whole), rng.integers(1, 4)):
-            changed[at] = rng.integers(256)
-        path.write_bytes(changed)
-        recover(path)
 
 
 LIES = [2**63, 2**40, 2**31 - 1, 2**64 - 1, 0]

@@ -306,7 +306,9 @@ def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind
     named = np.rec.fromarrays(list(cloud.T[::-1]), names="z,y,x")
     np.save(tmp_path / "2.0.npy", named)
     np.save(tmp_path / "3.0.npy", np.asfortranarray(cloud))
-    for scan in read(tmp_path)[1]:
+    scans = read(tmp_path)[1]
+    assert len(scans) == 3
+    for scan in scans:
         np.testing.assert_array_equal(scan.points, cloud[np.any(cloud, axis=1)].astype(np.float32))
 
 

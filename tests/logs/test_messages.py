@@ -219,9 +219,17 @@ def test_a_message_cut_at_any_byte_is_malformed_and_nothing_else(tmp_path, store
     said = ros.livox(recorders.clouds(1, 6)[0], "livox_ros_driver2") if "livox" in kind else None
     whole = ros.serialize(said or ros.multi_echo(recorders.planar(1, 13)[0]), kind)
     name = kind.replace("/msg/", "/") if ros.is_ros1 else kind
+
+    def log_of(data):
+        return open_log(one_message(tmp_path / "a.mcap", name, ros.language, ros.encoding, data))
+
+    (expected,) = log_of(whole).scans()
+    cut_off = 0
     for length in range(len(whole)):
-        path = one_message(tmp_path / "a.mcap", name, ros.language, ros.encoding, whole[:length])
         try:
-            list(open_log(path).scans())
+            (scan,) = log_of(whole[:length]).scans()
+            np.testing.assert_array_equal(scan.points, expected.points)  # what was cut off is not read
         except InputError as error:
             assert "malformed" in str(error) or "no valid point" in str(error)
+            cut_off += 1
+    assert 0.5 * len(whole) < cut_off <= len(whole)
