@@ -20,11 +20,8 @@ from scanchain.errors import InputError, shown
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
 _REVOLUTION_KEYS = ("log.revolution_s", "log.revolution_start_rad")
-_PLACE_KEYS = ("loops.place_radius_m", "loops.place_drift")
-_SUBMAP_KEYS = (
-    "loops.min_similarity", "loops.min_place_overlap", "loops.min_place_information", "loops.min_agreement",
-)  # fmt: skip
-_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m", *_SUBMAP_KEYS)
+_PLACE_KEYS = ("loops.place_radius_m",)
+_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m")
 _PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
 _NOTHING: Mapping[str, str] = {}
 _ORDERED = (
@@ -136,13 +133,11 @@ def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, 
     recognizer = str(values["loops.recognizer"])
     is_own = ":" in recognizer
     reasons = {
-        "loops.recognizer is none": (*_PLACE_KEYS, *_SUBMAP_KEYS) if recognizer == "none" else (),
-        "loops.recognizer is a class of your own": ("loops.min_similarity",) if is_own else (),
+        "loops.recognizer is none": _PLACE_KEYS if recognizer == "none" else (),
         "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
         "it is of 3D logs alone": (*_SPATIAL_KEYS, *(() if is_own else _PLACE_KEYS)) if dimension == 2 else (),
         "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
         "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
-        "preprocess.min_scale is 1": ("preprocess.range_voxels",) if values["preprocess.min_scale"] == 1.0 else (),
         "preprocess.match_voxel_m is not above preprocess.map_voxel_m": (
             ("preprocess.match_points",) if matches_all else ()
         ),

@@ -37,6 +37,7 @@ from scanchain.point_store import PointStore
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
+_OPTIMIZE_EVERY = 10  # keyframes between two optimizations, at least
 _GROWTH = 0.05  # of the graph, between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
@@ -253,7 +254,7 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = self.config.loops.optimize_every
+        enough = _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:

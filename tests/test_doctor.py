@@ -111,8 +111,8 @@ def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path)
     said = [cloud_said(STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, sweep(k))) for k in range(5)]
     path = saved(tmp_path, said)
     finding = diagnose(path)["rate"]
-    assert finding.remedy == "--matching.wide_reach_voxels 4 --matching.wide_max_distance_m 6"
-    wide = configured(3, {"matching.wide_reach_voxels": 4, "matching.wide_max_distance_m": 6.0})
+    assert finding.remedy == "--matching.wide_max_distance_m 8"
+    wide = configured(3, {"matching.wide_max_distance_m": 8.0})
     findings = examine([path], lambda _: wide, LogConfig()).findings
     assert next(each for each in findings if each.check == "rate").remedy == ""
 

@@ -13,7 +13,7 @@ from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.residuals import normal_equations
 from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels import downsample, hashing
-from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE, insert
 from scanchain.registration import VoxelMap
 
 SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}
@@ -29,8 +29,8 @@ def some_points(dimension, n=400, seed=0):
 
 
 def map_of(points, size=0.5, alone=8):
-    voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size, min_points_alone=alone))
-    voxel_map.insert(points, lie.identity(points.shape[1]))
+    voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size))
+    insert(voxel_map.voxels, points, lie.identity(points.shape[1]), 1, float(alone))
     return voxel_map
 
 

@@ -182,7 +182,7 @@ def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
     opened = []
     real = stream.read_block
     monkeypatch.setattr(stream, "read_block", lambda *args: opened.append(1) or real(*args))
-    iterator = open_log([path], LogConfig(prefetch_chunks=3)).scans()
+    iterator = open_log([path], LogConfig()).scans()
     next(iterator)
     iterator.close()
     assert 1 <= len(opened) <= 12

@@ -12,9 +12,7 @@ from scanchain.errors import InputError
 from scanchain.settings import load_settings
 from scanchain.source import Source
 
-_KEYS = tuple(
-    f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks")
-)
+_KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")

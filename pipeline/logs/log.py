@@ -300,5 +300,4 @@ class Log:
         return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
 
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
-        ahead = self.config.prefetch_chunks
-        return decoded_messages(self.indexes, decoders, self.span, ahead=ahead, damage=damage)
+        return decoded_messages(self.indexes, decoders, self.span, damage=damage)

@@ -213,7 +213,7 @@ def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[
         return (
             f"{contradicted:,} of {len(points):,} scans contradict the map where they were placed (fit below "
             f"{LEAST_FIT:g}): the motion between scans may be larger than the search (scanchain doctor; "
-            "--matching.wide_reach_voxels, --matching.wide_max_distance_m), or the log is at fault"
+            "--matching.wide_max_distance_m), or the log is at fault"
         )
     if 2 * (degenerate + lost) <= len(points):
         return ""

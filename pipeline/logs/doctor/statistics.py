@@ -96,9 +96,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     wheels: list[StampedPose] = []
     malformed: list[str] = []
     watch, read = RestWatch(log.dimension), 0
-    for message in decoded_messages(
-        log.indexes, decoders, log.span, ahead=log.config.prefetch_chunks, damage=damage
-    ):
+    for message in decoded_messages(log.indexes, decoders, log.span, damage=damage):
         match message.value:
             case ScanFacts() as facts:
                 read += 1

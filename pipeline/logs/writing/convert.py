@@ -76,13 +76,13 @@ def _messages(
     indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
-    span, ahead = chosen_span(whole_span(indexes), config), config.prefetch_chunks
+    span = chosen_span(whole_span(indexes), config)
     fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith("tf_static")}
-    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, ahead=ahead, damage=[]):
+    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
     scans = Counter[str]()
-    for message in decoded_messages(indexes, others, span, ahead=ahead, damage=damage):
+    for message in decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
         if not message.value:  # of a file that could not be read
             continue
