@@ -4,11 +4,11 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from scenes import configured, kitti_scans, shared_data
 
 import scanchain as sc
 from scanchain import lie
 from scanchain.errors import InputError
+from tests.support.scenes import configured, kitti_scans, shared_data
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import shared_data
 
 from scanchain import (
     Config,
@@ -30,6 +29,7 @@ from scanchain import (
 )
 from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
 from scanchain.evaluation import absolute_error, pair
+from tests.support.scenes import shared_data
 
 CALLS = 2000
 

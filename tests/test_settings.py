@@ -6,11 +6,11 @@ import tomllib
 import msgspec
 import pytest
 from msgspec.structs import fields
-from scenes import ROOT, configured
 
 from scanchain.config import Config
 from scanchain.errors import InputError
 from scanchain.settings import Override, config_keys, dump, flatten, load_settings, preset_path, read_layer
+from tests.support.scenes import ROOT, configured
 
 
 def flag(key, text):
