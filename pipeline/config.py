@@ -57,7 +57,8 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
         points are timed by azimuth
     revolution_s : duration of a revolution, for points timed by azimuth
     revolution_start_rad : azimuth at which a revolution begins, at the stamp; π is the rear
-    prefetch_chunks : chunks of an MCAP file decompressed ahead of use
+    prefetch_chunks : chunks of an MCAP file, scans of other formats, decoded ahead of use; no result depends on
+        it
     """
 
     format: str = "auto"

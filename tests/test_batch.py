@@ -21,6 +21,7 @@ from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.processes import resident_mib
+from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate
 from scanchain.source import Address
 from scanchain.viz.report.batch import names_of
@@ -91,6 +92,17 @@ def test_of_24_logs_two_are_poison_and_22_have_results_and_a_second_call_runs_on
 
     assert main(words) == 1  # only the two are tried again
     assert made(out) == first and "22 results from before" in capfd.readouterr()[0]
+
+
+def test_logs_of_the_longest_names_have_directories_of_their_own_and_keep_their_names(drawers, tmp_path):
+    names = [f"{'ä' * 121}{k}.mcap" for k in range(2)]
+    for k, name in enumerate(names):
+        (tmp_path / name).write_bytes((drawers / f"log_0{k}.mcap").read_bytes())
+    out = tmp_path / "out"
+    assert main(["batch", f"{tmp_path}/*.mcap", "--out", str(out), "--end", "1"]) == 0
+    rows = table(out)
+    assert sorted(rows) == names and len({row["run"] for row in rows.values()}) == 2
+    assert directory_name("log") == "log" and directory_name("a" * 240 + "b") != directory_name("a" * 240 + "c")
 
 
 def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(drawers, tmp_path, capfd):

@@ -10,7 +10,7 @@ import numpy as np
 
 from scanchain.batch.task import Row, State
 from scanchain.runs.metrics import Metrics
-from scanchain.words import counted
+from scanchain.words import counted, duration
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
@@ -90,7 +90,7 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
         sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
     )
     path = _distance(sum(each.traveled_m for each in results))
-    time = _duration(sum(each.log_span_s for each in results))
+    time = duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
     yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {path} and {time}"
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
@@ -105,13 +105,6 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
 
 def _distance(length_m: float) -> str:
     return f"{length_m:.1f} m" if length_m < 1000.0 else f"{1e-3 * length_m:.2f} km"
-
-
-def _duration(time_s: float) -> str:
-    for unit, seconds in (("h", 3600.0), ("min", 60.0)):
-        if time_s >= seconds:
-            return f"{time_s / seconds:.1f} {unit}"
-    return f"{time_s:.1f} s"
 
 
 def _cells(row: Row) -> dict[str, object]:
