@@ -17,6 +17,7 @@ _NUMBERS = (
     "scans",
     "dimension",
     "ok",
+    "contradicted",
     "degenerate",
     "lost",
     "keyframes",
@@ -65,7 +66,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 def summary(rows: Sequence[Row]) -> str:
     """Totals, each log without a result and its reason, each log with warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
-    lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
+    lines += [f"{row.state:<14} {row.log}: {row.why}" for row in rows if row.state is not State.DONE]
     lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
     return "\n".join(lines) + "\n"
 
@@ -86,13 +87,17 @@ def _first_warning(row: Row) -> str:
 
 
 def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
-    scans, degenerate, lost = (
-        sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
+    scans, contradicted, degenerate, lost = (
+        sum(getattr(each, name) for each in results) for name in ("scans", "contradicted", "degenerate", "lost")
     )
     path = _distance(sum(each.traveled_m for each in results))
     time = duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
-    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {path} and {time}"
+    yield (
+        "scans",
+        f"{scans:,}, {contradicted:,} contradicted, {degenerate:,} degenerate, {lost:,} lost, "
+        f"over {path} and {time}",
+    )
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimized.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:

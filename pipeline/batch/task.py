@@ -37,7 +37,7 @@ class State(StrEnum):
 
     @property
     def has_result(self) -> bool:
-        """True if there is a run directory, even if most of its scans are degenerate or lost."""
+        """True if there is a run directory, even if its result is unreliable."""
         return self in (State.DONE, State.UNRELIABLE)
 
 
@@ -103,6 +103,11 @@ class Row(Struct, frozen=True):
     def warnings(self) -> int:
         """Number of warnings of its run."""
         return 0 if self.metrics is None else len(self.metrics.warnings)
+
+    @property
+    def why(self) -> str:
+        """The reason without the name of the log, behind which it stands."""
+        return self.reason.removeprefix(f"{self.log}: ")
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""

@@ -23,7 +23,7 @@ _KEYS = tuple(
 @click.option(
     "--rate", metavar="HZ", help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz."
 )
-@part_options()
+@part_options(topic="all of them")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context

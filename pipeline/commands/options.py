@@ -97,20 +97,25 @@ LOG = _LogType()
 
 
 _PART = (
-    ("topic", "TOPIC", "log.topic", "Lidar topic{of}. [default: the only one that fits]"),
+    ("topic", "TOPIC", "log.topic", "Lidar topic{of}. [default: {topic}]"),
     ("start", "SECONDS", "log.start_s", "Skip {log} up to this time, counted from its first message."),
     ("end", "SECONDS", "log.end_s", "Skip {log} after this time."),
     ("every", "N", "log.every", "Take every N-th scan."),
 )
 
 
-def part_options(log: str = "the log") -> Callable[[Any], Any]:
-    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log; ``part_of`` reads them."""
+def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
+    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log; ``part_of`` reads them.
+
+    log, topic : in words, what is cut and which lidar is taken without ``--topic``
+    """
 
     def decorate(command: Any) -> Any:
         for name, metavar, _, text in reversed(_PART):
             of = "" if log == "the log" else f" of {log}"
-            command = click.option(f"--{name}", metavar=metavar, help=text.format(log=log, of=of))(command)
+            command = click.option(f"--{name}", metavar=metavar, help=text.format(log=log, of=of, topic=topic))(
+                command
+            )
         return command
 
     return decorate

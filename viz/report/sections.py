@@ -113,7 +113,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     along = Drawing(
         "Observability",
         "Information along the least constrained direction over the minimum required, least of neighboring scans. "
-        "Below 1 (thin line) a scan is degenerate.",
+        "Below 1 (dotted) a scan is degenerate.",
         figures.observability("observability", told),
     )
     whose = f" of {told[0].name}" if len(told) > 1 else ""
@@ -131,7 +131,7 @@ def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) ->
     if judged:
         yield Drawing(
             "Covariance consistency",
-            "Squared error of each motion over its covariance. Thin line: exact covariances; to the left of it "
+            "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
             "they are too large, to the right too small.",
             figures.consistency("nees", judged, 3 if is_planar else 6),
         )
