@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,55 @@ class _LogType(click.ParamType):
 
 
 LOG = _LogType()
+
+
+_PART = (
+    ("topic", "TOPIC", "log.topic", "Lidar topic{of}. [default: {topic}]"),
+    ("start", "SECONDS", "log.start_s", "Skip {log} up to this time, counted from its first message."),
+    ("end", "SECONDS", "log.end_s", "Skip {log} after this time."),
+    ("every", "N", "log.every", "Take every N-th scan."),
+)
+
+
+def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
+    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log; ``part_of`` reads them.
+
+    log, topic : in words, what is cut and which lidar is taken without ``--topic``
+    """
+
+    def decorate(command: Any) -> Any:
+        for name, metavar, _, text in reversed(_PART):
+            of = "" if log == "the log" else f" of {log}"
+            command = click.option(f"--{name}", metavar=metavar, help=text.format(log=log, of=of, topic=topic))(
+                command
+            )
+        return command
+
+    return decorate
+
+
+def part_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
+    """The keys that ``part_options`` set."""
+    return tuple(each for name, _, key, _ in _PART for each in alias(key, options[name], f"--{name}"))
+
+
+def matcher_options(command: Callable[..., None]) -> Callable[..., None]:
+    """``--matcher`` and ``--no-loops``; ``method_of`` reads them."""
+    command = click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")(command)
+    return click.option(
+        "--matcher",
+        metavar="plicp|svd|MODULE:CLASS",
+        help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
+    )(command)
+
+
+def method_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
+    """The keys that ``matcher_options`` set."""
+    no_loops = "false" if options["no_loops"] else None
+    return (
+        *alias("matching.matcher", options["matcher"], "--matcher"),
+        *alias("loops.enabled", no_loops, "--no-loops"),
+    )
 
 
 def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:

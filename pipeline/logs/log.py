@@ -19,7 +19,7 @@ from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import chosen_span, count_scans, whole_span
+from scanchain.logs.mcap.selection import chosen_span, count_scans, notes_on, whole_span
 from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
@@ -89,6 +89,8 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
+        is_untimed = config.point_times == "none"  # told from scans that have no times at all
+        self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
@@ -96,7 +98,7 @@ class Log:
         self.span = chosen_span(whole, config)
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
-        self.notes += self._mounting_notes()
+        self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
@@ -135,11 +137,12 @@ class Log:
         return idle
 
     def _has_point_times(self) -> bool:
-        """Whether the first scan that has returns has times of its points; of a remote log it is taken to have."""
+        """Whether the first scan has times of its points; a laser scan of a remote log is taken to have."""
+        if not is_scan(self.lidar):
+            return self._sampled_times.are_found
         if not all(isinstance(path, Path) for path in self.paths):
             return True
-        config = replace(self.config, point_times="auto") if self.config.point_times == "none" else self.config
-        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(config)).decode)
+        returns = first_messages(self.indexes, self.topic, self.decoder(self._sampled_times).decode)
         return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
@@ -230,11 +233,10 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
-        times = PointTimes(self.config)
-        if not is_scan(self.lidar):
-            returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
-            next((each for each in returns if len(each.points)), None)
-        return "" if is_scan(self.lidar) else times.assumed
+        if is_scan(self.lidar):
+            return ""
+        is_untimed = self.config.point_times == "none"
+        return PointTimes(self.config).assumed if is_untimed else self._sampled_times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
@@ -283,9 +285,9 @@ class Log:
         return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
-        """The height of all points of the first clouds, None where it is not one."""
+        """The height of all points of the first clouds, None where it is not one; learns of their point times."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        decoder = PointCloudDecoder(limits, PointTimes(self.config), cloud_reader(self.lidar))
+        decoder = PointCloudDecoder(limits, self._sampled_times, cloud_reader(self.lidar))
         height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
         if height_m is not None:
             self.notes.append(

@@ -442,6 +442,17 @@ def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd)
     assert diagnose(saved(tmp_path, drive()))["sensors"].found == "no IMU, GNSS or ground truth"
 
 
+def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
+    said = drive(wheels=True)
+    other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
+    truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
+    path = saved(tmp_path, [*said, *other, truth])
+    assert main(["info", str(path)]) == 0
+    text = capfd.readouterr().out
+    assert "several lidar topics" in text and "wheels    /odom\n" in text
+    assert "sensor    ground truth /ground_truth: judges the result, is not used for it\n" in text
+
+
 # The whole
 
 

@@ -10,7 +10,14 @@ from pathlib import Path
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import EVERYTHING, chosen_span, whole_span
+from scanchain.logs.mcap.selection import (
+    EVERYTHING,
+    chosen_span,
+    count_messages,
+    notes_on,
+    nothing_in_part,
+    whole_span,
+)
 from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, HAS_STAMPS, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
@@ -51,9 +58,14 @@ def convert(
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
     is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
     if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part and config.format == AUTO:
-        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
+        raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
+    span = chosen_span(whole_span(indexes), config)
+    if span != EVERYTHING and not any(
+        count_messages(indexes, topic, span) for topic in counts if not _is_fixed(topic)
+    ):
+        raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
     with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
         for message in _messages(indexes, counts, config, damage):
@@ -66,7 +78,7 @@ def convert(
             raise InputError(
                 f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
             )
-    notes = tuple(line for index in indexes for line in index.notes)
+    notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
     if config.rate_hz and not any(index.takes_rate for index in indexes):
         notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
     return Converted(destination, counts, notes, tuple(damage))
@@ -77,7 +89,7 @@ def _messages(
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
     span = chosen_span(whole_span(indexes), config)
-    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith("tf_static")}
+    fixed = set() if span == EVERYTHING else {topic for topic in topics if _is_fixed(topic)}
     for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
@@ -88,6 +100,10 @@ def _messages(
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message
+
+
+def _is_fixed(topic: str) -> bool:
+    return topic.endswith("tf_static")
 
 
 def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
