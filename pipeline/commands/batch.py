@@ -36,7 +36,9 @@ _DAY_S = 86_400.0
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
 @click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
-@click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
+@click.option(
+    "--gt", metavar="TOPIC|none", help="Ground truth in every log; none to ignore it. [default: /ground_truth]"
+)
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
@@ -114,11 +115,11 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
 
 
 def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
+    """A file, or a topic or "none" as an override; what is neither a file nor looks like a topic is a file."""
     if text is None:
         return None, ()
     path = Path(text)
-    if text.startswith("/") and not path.exists() and not path.suffix:
+    if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
         return None, (Override("log.ground_truth_topic", text, "--gt"),)
     return path, ()
 

@@ -50,14 +50,20 @@ _WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
     """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+    named = sources_of(sources)
+    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
+    return Log(index_files(named, config), config)
+
+
+def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, ...]:
+    """The files or addresses of one log. Raises InputError for what is neither, and for none."""
     named = [sources] if isinstance(sources, Source | str) else sources
     is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
     if not is_named:
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
-    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
-    return Log(index_files([source_of(each) for each in named], config), config)
+    return tuple(source_of(each) for each in named)
 
 
 class Log:
@@ -83,7 +89,12 @@ class Log:
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
+        wheels = find_odometry(
+            indexes,
+            config.odometry_topic,
+            (config.ground_truth_topic, _DEFAULTS.ground_truth_topic),
+            self.notes,
+        )
         truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
@@ -84,7 +84,7 @@ def read_g2o(
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
     """
-    path = Path(path)
+    path = checks.path(path, "path")
     lines = sort_lines(path)
     dimension = lines.dimension
     pose_ids, poses = _vertices(path, lines)

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError, shown
-from scanchain.graph.edge_checks import LARGEST
 from scanchain.words import counted
 
 TORO_VERTICES = {2: "VERTEX2", 3: "VERTEX3"}
