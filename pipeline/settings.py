@@ -225,8 +225,8 @@ def _check_dimension(values: Mapping[str, Value], dimension: int, source: str, r
     foreign = sum(values[key] == others[key] for key in differing)
     if 2 * foreign > len(differing):
         raise InputError(
-            f"{source} is made for {other}D scans: of the {len(differing)} settings in which the presets of 2D and "
-            f"3D differ it has {foreign} as in {other}D; these scans are {dimension}D: {remedy}"
+            f"{source} is made for {other}D scans: of the {len(differing)} settings in which the presets of "
+            f"2D and 3D differ it has {foreign} as in {other}D; these scans are {dimension}D: {remedy}"
         )
 
 

@@ -50,7 +50,7 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
     d = 2 if _is_planar(estimate) and _is_planar(reference) else 3
     if len(estimate) < d:
         raise InputError(
-            f"rigid alignment takes 2 paired poses in the plane and 3 in space, here {'is' if len(estimate) == 1 else 'are'} "
+            "rigid alignment takes 2 paired poses in the plane and 3 in space, not "
             f"{len(estimate)}; align by the first pose or not at all"
         )
     try:

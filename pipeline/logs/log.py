@@ -39,7 +39,7 @@ from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.source import Source, source_of
-from scanchain.words import counted
+from scanchain.words import counted, grouped
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
@@ -79,7 +79,6 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
-    damage : what could not be read; complete once ``scans`` is through or closed
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -111,7 +110,7 @@ class Log:
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        self.damage: list[str] = [line for index in indexes for line in index.damage]
+        self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.pose_decoders: Decoders = {
             channel.topic: pose_reader(channel, self.dimension)
             for channel in (wheels, truth)
@@ -124,6 +123,11 @@ class Log:
         self.scans_with_wheels = 0
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    @property
+    def damage(self) -> list[str]:
+        """What could not be read; complete once ``scans`` is through or closed."""
+        return grouped(self._damage)
 
     @property
     def has_odometry(self) -> bool:
@@ -160,7 +164,7 @@ class Log:
         counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
         than ``log.max_bad_scans_percent`` allows.
         """
-        self.damage = [line for index in self.indexes for line in index.damage]
+        self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self.mounting)
         counts = ScanCounts(self.topic, self.odometry_topic)
@@ -186,13 +190,13 @@ class Log:
                 asked = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
-            self.damage += [*counts.losses(), *poses.complaints()]
+            self._damage += [*counts.losses(), *poses.complaints()]
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
-        if self.damage:
+        if self._damage:
             scans = counted(count - counts.bad, "scan")
-            self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
+            self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _scan(self, index: int, message: Decoded, poses: PosesAtScan, *, waited_s: float) -> Scan:
         returns = message.value
@@ -274,7 +278,7 @@ class Log:
         """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-        for message in self._messages(decoders, self.damage):
+        for message in self._messages(decoders, self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:

@@ -56,7 +56,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 def find_odometry(
     indexes: Sequence[FileIndex], wanted: str, no_wheels: Container[str], notes: list[str]
 ) -> Channel | None:
-    """The wheel odometry's channel: the topic asked for, else the only one apart from ``no_wheels``, true poses."""
+    """The wheel odometry's channel: the topic asked for, else the only one apart from those of true poses."""
     if wanted:
         return _chosen(indexes, wanted, "log.odometry_topic")
     channels = topics_of(indexes).values()

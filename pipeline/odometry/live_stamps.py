@@ -1,4 +1,4 @@
-"""Stamps and point times of scans that a driver gives one by one: no clock of a log tells which of them are wrong."""
+"""Stamps and point times of scans that a driver gives one by one, and which of them are certainly wrong."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain import checks, lie
+from scanchain import checks
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter

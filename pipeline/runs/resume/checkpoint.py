@@ -61,8 +61,8 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics, Recovery,
-        MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
+        Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
+        Recovery, MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
         PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift,
         PoseGraph, GrowingArray, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
