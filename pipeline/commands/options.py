@@ -104,7 +104,7 @@ def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
-        help="Longest gap between true poses to interpolate. [default: 5 times their usual interval, at most 0.6]",
+        help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
     )(command)
 
 
