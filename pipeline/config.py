@@ -20,6 +20,8 @@ Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
+NO_TRUTH = "none"  # of ``log.ground_truth_topic``
+
 MATCHERS = {
     "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
     "svd": "scanchain.registration.svd_icp:SvdMatcher",
@@ -44,7 +46,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     format : log format: found automatically, a known one by name, or ``module:Class`` of your own
     topic : lidar topic; found automatically where empty
     odometry_topic : wheel odometry, ``nav_msgs/Odometry`` or stamped poses; found automatically where empty
-    ground_truth_topic : true poses, used for evaluation only
+    ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
     start_s : what comes before is left out, counted from the first message
     end_s : what comes after is left out
     every : every N-th scan is taken

@@ -32,7 +32,7 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.loops import LoopCloser, refined, spread
-from scanchain.odometry import FrontEnd, Located, checked_start
+from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
@@ -97,6 +97,7 @@ class Slam:
         self.moves_map = False
         self.lost_scans = 0
         self.optimized_at = 0
+        self.live_stamps = LiveStamps()
         self.is_finished = False
 
     def track(
@@ -107,9 +108,12 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes; arguments as in ``Scan.of``."""
-        scans = self.front_end.scans
-        return self.process(Scan.of(points, stamp_s, times_s, index=scans, T_odom_base=T_odom_base))
+        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does."""
+        scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
+        self.live_stamps.check(scan)
+        step = self.process(scan)
+        self.live_stamps.take(scan)
+        return step
 
     def process(self, scan: Scan) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""

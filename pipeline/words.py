@@ -1,7 +1,11 @@
-"""Numbers in sentences."""
+"""Numbers in sentences, and sentences that differ in numbers alone."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+
+_SHOWN = 3  # of lines that are alike
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
 
@@ -16,3 +20,16 @@ def duration(time_s: float) -> str:
         if time_s > seconds:
             return f"{time_s / seconds:.1f} {unit}"
     return f"{time_s:.1f} s"
+
+
+def grouped(lines: Iterable[str]) -> list[str]:
+    """The lines in order; of many that differ in numbers alone the first ones, and how many more there are."""
+    kinds: dict[str, list[str]] = {}
+    for line in lines:
+        kinds.setdefault(re.sub(r"\d+", "#", line), []).append(line)
+    result: list[str] = []
+    for alike in kinds.values():
+        result += alike[:_SHOWN]
+        if len(alike) > _SHOWN:
+            result[-1] += f" (and {len(alike) - _SHOWN:,} more like this)"
+    return result

@@ -288,7 +288,14 @@ def test_what_is_dumped_loads_as_the_same_configuration(tmp_path, dimension):
     config = load_settings(dimension, overrides=changes).config
     assert config.matching.tolerance_m == 1.25e-7
     file = written(tmp_path, dump(config))
-    assert load_settings(2, file=file).config == load_settings(3, file=file).config == config
+    assert load_settings(file=file).config == load_settings(dimension or 3, file=file).config == config
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_file_made_for_the_other_dimension_is_refused(tmp_path, dimension):
+    file = written(tmp_path, dump(load_settings(5 - dimension, overrides=[flag("loops.drift", "0.02")]).config))
+    with pytest.raises(InputError, match=rf"made for {5 - dimension}D scans.*dump --lidar {dimension}d"):
+        load_settings(dimension, file=file)
 
 
 def test_a_dump_holds_every_key_and_nothing_else():

@@ -37,7 +37,9 @@ _DAY_S = 86_400.0
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
 @part_options("each log")
 @matcher_options
-@click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
+@click.option(
+    "--gt", metavar="TOPIC|none", help="Ground truth in every log; none to ignore it. [default: /ground_truth]"
+)
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )

@@ -32,7 +32,11 @@ _PATH = click.Path(path_type=Path)
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
+@click.option(
+    "--gt",
+    metavar="FILE|TOPIC|none",
+    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
+)
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )

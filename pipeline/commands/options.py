@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
@@ -152,7 +153,7 @@ def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
-        help="Longest gap between true poses to interpolate. [default: 5 times their usual interval, at most 0.6]",
+        help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
     )(command)
 
 
@@ -163,11 +164,11 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
 
 
 def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic as an override; what is neither a file nor looks like a topic is taken for a file."""
+    """A file, or a topic or "none" as an override; what is neither a file nor looks like a topic is a file."""
     if text is None:
         return None, ()
     path = Path(text)
-    if text.startswith("/") and not path.exists() and not path.suffix:
+    if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
         return None, (Override("log.ground_truth_topic", text, "--gt"),)
     return path, ()
 

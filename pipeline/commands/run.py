@@ -45,7 +45,11 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look throu
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
 @matcher_options
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
+@click.option(
+    "--gt",
+    metavar="FILE|TOPIC|none",
+    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
+)
 @max_gap_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")

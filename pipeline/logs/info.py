@@ -15,6 +15,7 @@ from scanchain.logs.messages.readers import kind
 from scanchain.logs.opening import index_files
 from scanchain.logs.topics import OtherSensor, find_ground_truth, find_odometry, other_sensors, topics_of
 from scanchain.source import Source
+from scanchain.words import grouped
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,7 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
         idle_keys={} if log is None else log.idle_keys(),
         notes=tuple(notes if log is None else log.notes),
-        damage=tuple(line for index in indexes for line in index.damage),
+        damage=tuple(grouped(line for index in indexes for line in index.damage)),
         problem=problem,
     )
 

@@ -39,7 +39,7 @@ from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.source import Source, source_of
-from scanchain.words import counted
+from scanchain.words import counted, grouped
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
@@ -50,14 +50,20 @@ _WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
     """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+    named = sources_of(sources)
+    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
+    return Log(index_files(named, config), config)
+
+
+def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, ...]:
+    """The files or addresses of one log. Raises InputError for what is neither, and for none."""
     named = [sources] if isinstance(sources, Source | str) else sources
     is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
     if not is_named:
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
-    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
-    return Log(index_files([source_of(each) for each in named], config), config)
+    return tuple(source_of(each) for each in named)
 
 
 class Log:
@@ -73,7 +79,6 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
-    damage : what could not be read; complete once ``scans`` is through or closed
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -83,7 +88,12 @@ class Log:
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
+        wheels = find_odometry(
+            indexes,
+            config.odometry_topic,
+            (config.ground_truth_topic, _DEFAULTS.ground_truth_topic),
+            self.notes,
+        )
         truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
@@ -102,7 +112,7 @@ class Log:
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        self.damage: list[str] = [line for index in indexes for line in index.damage]
+        self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.pose_decoders: Decoders = {
             channel.topic: pose_reader(channel, self.dimension)
             for channel in (wheels, truth)
@@ -115,6 +125,11 @@ class Log:
         self.scans_with_wheels = 0
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    @property
+    def damage(self) -> list[str]:
+        """What could not be read; complete once ``scans`` is through or closed."""
+        return grouped(self._damage)
 
     @property
     def has_odometry(self) -> bool:
@@ -152,7 +167,7 @@ class Log:
         counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
         than ``log.max_bad_scans_percent`` allows.
         """
-        self.damage = [line for index in self.indexes for line in index.damage]
+        self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self.mounting)
         counts = ScanCounts(self.topic, self.odometry_topic)
@@ -178,13 +193,13 @@ class Log:
                 asked = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
-            self.damage += [*counts.losses(), *poses.complaints()]
+            self._damage += [*counts.losses(), *poses.complaints()]
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
-        if self.damage:
+        if self._damage:
             scans = counted(count - counts.bad, "scan")
-            self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
+            self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _scan(self, index: int, message: Decoded, poses: PosesAtScan, *, waited_s: float) -> Scan:
         returns = message.value
@@ -265,7 +280,7 @@ class Log:
         """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-        for message in self._messages(decoders, self.damage):
+        for message in self._messages(decoders, self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:

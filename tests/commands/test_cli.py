@@ -639,6 +639,8 @@ def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_p
     sources = {"log": [], "/ground_truth": ["--gt", "/ground_truth"], "/odom": ["--gt", "/odom"]}
     sources["other"] = ["--gt", tmp_path / "other.tum"]
     sources["same"] = ["--gt", office.with_suffix(".tum")]
+    call("run", office, "--out", tmp_path / "none", "--rerun", "off", "--gt", "none")
+    assert metrics(tmp_path / "none")["ground_truth"] is None
     ate_m, named = {}, {}
     for name, flags in sources.items():
         out = tmp_path / name.strip("/")

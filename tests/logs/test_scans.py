@@ -705,5 +705,11 @@ def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own(tmp_path):
     np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
 
 
+def test_the_truth_of_a_log_can_be_left_unused_and_does_not_become_wheels(tmp_path):
+    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)])
+    log = open_log([path], LogConfig(ground_truth_topic="none"))
+    assert log.ground_truth() is None and not log.ground_truth_topic and not log.has_odometry
+
+
 def test_a_log_without_truth_has_none(tmp_path):
     assert open_log([write(tmp_path / "a.mcap", office(3))], LogConfig()).ground_truth() is None

@@ -23,6 +23,7 @@ from scanchain.logs.opening import AUTO, HAS_STAMPS, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.source import Source
+from scanchain.words import grouped
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
@@ -76,12 +77,13 @@ def convert(
                 progress(sum(counts.values()), total)
         if not sum(counts.values()):
             raise InputError(
-                f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+                f"{name_of(indexes)}: holds no message that could be read: "
+                f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
     notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
     if config.rate_hz and not any(index.takes_rate for index in indexes):
         notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
-    return Converted(destination, counts, notes, tuple(damage))
+    return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
 def _messages(
