@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,9 +105,8 @@ class State(StrEnum):
     LOST = "lost"
 
 
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """Prior of a pose before it is matched.
+class Prior(NamedTuple):
+    """Prior of a pose before it is matched; a tuple, which compiled code takes as it is.
 
     Attributes
     ----------

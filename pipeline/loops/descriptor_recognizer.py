@@ -20,6 +20,7 @@ from scanchain.loops.submaps import Submap
 _MAX_COMPARED = 10  # compared in full, of the descriptors with the most similar keys
 _MAX_NEAREST = 3  # compared in full, of those nearest to the expected pose
 _MAX_HEADING_ERROR_RAD = 0.5  # of odometry, in the search near the expected pose
+_MIN_SIMILARITY = 0.45  # from which on a place is verified by matching
 _RIVAL = 0.9  # of the best similarity, from which on a candidate elsewhere makes it ambiguous
 _MIN_APART = 0.25  # radii between two poses that are not the same
 _GROWTH = 1.25  # of the database between two builds of its tree
@@ -53,7 +54,7 @@ class DescriptorRecognizer:
         if not similar:
             return []
         best = self._best(descriptor, similar, query)
-        candidates = [best] if best.score >= self.config.loops.min_similarity else []
+        candidates = [best] if best.score >= _MIN_SIMILARITY else []
         near = database.nearest(query.T_world, query.T_world_anchor[:3, 3], _MAX_NEAREST)
         return candidates + self._best_nearby(descriptor, near, query)
 

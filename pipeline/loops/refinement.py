@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config, MatchingConfig
+from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points
-from scanchain.kernels.registration.refinement import refine
+from scanchain.kernels.registration.icp import refine
 from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
-from scanchain.registration.plicp import terms_of
+from scanchain.registration.plicp import settings_of
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
 _THREADS = 2
@@ -52,14 +52,15 @@ def refined(
     spans : (N, 2) first row and number of each scan's points in the store
     """
     surfaces, least_share = _map_of(poses, keyframes, config), config.matching.min_inlier_share
-    terms = terms_of(_briefly(config), surfaces, wide=False)
+    settings = settings_of(config.matching, surfaces, wide=False)
+    settings = settings._replace(reach=1, last_reach=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
-    prior = np.diag(sigma**-2.0) * terms.variance
+    prior = np.diag(sigma**-2.0) * settings.variance
     result = poses.copy()
 
     def refine_part(part: slice, points: Points) -> None:
         starts = np.append(0, np.cumsum(spans[part, 1]))
-        refine(surfaces.voxels, points, starts, result[part], prior, least_share, terms)
+        refine(surfaces.voxels, points, starts, result[part], prior, least_share, settings)
 
     with ThreadPoolExecutor(_THREADS) as pool:  # no scan depends on another, and kernels let others run
         for first in range(0, len(poses), _THREADS * _MAX_SCANS):
@@ -82,10 +83,3 @@ def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> Vox
     for keyframe in keyframes:
         result.insert(keyframe.points, poses[keyframe.scan_index])
     return result
-
-
-def _briefly(config: Config) -> MatchingConfig:
-    """Matching with few steps and correspondences nearby, for poses that are good already."""
-    return msgspec.structs.replace(
-        config.matching, reach_voxels=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD
-    )

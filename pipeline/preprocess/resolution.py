@@ -10,6 +10,7 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.preprocess.sweep import Sweep, sweep_of
 
+_RANGE_VOXELS = 14.0  # of the local map that the median range spans, at least
 _HYSTERESIS = 0.75  # powers of two between the present scale and the wanted one, from which on it changes
 _STEP = 2.0  # by which the voxels of matching shrink or grow from one scan to the next, at most
 _LOOKS = 8  # at the first scan, at most
@@ -22,7 +23,7 @@ class Resolution:
     Attributes
     ----------
     scale : 1, ½, ¼ …, what all voxel sizes of the configuration are multiplied with: small in narrow places, so
-        that the median range spans about ``preprocess.range_voxels`` voxels of the local map, or more
+        that the median range spans about _RANGE_VOXELS voxels of the local map, or more
     match_voxel_m : what scans are thinned out with to be matched, so that about ``preprocess.match_points`` remain
     """
 
@@ -62,7 +63,7 @@ class Resolution:
         return before == (self.scale, self.match_voxel_m)
 
     def _scale_for(self, median_range_m: float) -> float:
-        wanted = math.log2(median_range_m / (self.config.range_voxels * self.voxel_size_m))
+        wanted = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
         if abs(wanted - math.log2(self.scale)) <= _HYSTERESIS:
             return self.scale
         return min(max(2.0 ** round(wanted), self.config.min_scale), 1.0)

@@ -9,11 +9,10 @@ from scanchain import lie
 from scanchain.config import MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
 from scanchain.kernels.registration import icp
-from scanchain.kernels.registration.association import associate
-from scanchain.kernels.registration.cross_covariance import weighted_pairs
-from scanchain.kernels.registration.icp import SHRINK, Outcome
-from scanchain.kernels.registration.match import judge
-from scanchain.registration.plicp import aligned, match_of, terms_of
+from scanchain.kernels.registration.association import associate, weighted_pairs
+from scanchain.kernels.registration.icp import SHRINK, Fit
+from scanchain.kernels.registration.match import assess
+from scanchain.registration.plicp import checked, match_of, settings_of
 from scanchain.registration.svd import DegeneratePairsError, rigid_transform
 from scanchain.registration.voxel_map import VoxelMap
 
@@ -32,39 +31,37 @@ class SvdMatcher:
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """
         del prior
-        points, T_first = aligned(points, target, T_first)
-        terms = terms_of(self.config, target, wide=wide)
-        T, scale_m = T_first.copy(), terms.first_scale_m
-        partner = np.empty(len(points), np.int32)
+        points, T_first = checked(points, target, T_first)
+        settings = settings_of(self.config, target, wide=wide)
+        T, scale_m = T_first.copy(), settings.first_scale_m
+        correspondence = np.empty(len(points), np.int32)
         source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
         ending, iterations, pairs = icp.OUT_OF_ITERATIONS, 0, 0
-        for _ in range(terms.max_iterations):
+        for _ in range(settings.max_iterations):
             iterations += 1
-            associate(target.voxels, points, T, terms.reach, terms.max_distance_m, partner)
-            pairs = weighted_pairs(target.voxels, points, T, partner, scale_m, source, nearest, weight)
+            associate(target.voxels, points, T, settings.reach, settings.max_distance_m, correspondence)
+            pairs = weighted_pairs(target.voxels, points, T, correspondence, scale_m, source, nearest, weight)
             try:
                 correction = rigid_transform(source[:pairs], nearest[:pairs], weight[:pairs])
             except DegeneratePairsError:
-                ending = icp.SINGULAR if pairs else icp.NO_PARTNERS
+                ending = icp.SINGULAR if pairs else icp.NO_CORRESPONDENCES
                 break
             T = lie.normalize(correction @ T)
-            if scale_m <= terms.scale_m and self._stands_still(correction, T):
+            if scale_m <= settings.scale_m and self._is_small(correction, T):
                 ending = icp.CONVERGED
                 break
-            scale_m = max(terms.scale_m, SHRINK * scale_m)
-        outcome = self._outcome(
-            T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending
-        )
-        answer = judge(target.voxels, points, T, outcome, terms)
-        return match_of(answer, len(points), target, self.config)
+            scale_m = max(settings.scale_m, SHRINK * scale_m)
+        fit = self._fit(T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending)
+        result = assess(target.voxels, points, T, fit, settings)
+        return match_of(result, len(points), target, self.config)
 
-    def _stands_still(self, correction: Pose, T: Pose) -> bool:
+    def _is_small(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]
         shift = lie.transform(correction, position[None])[0] - position
         turn = lie.rotation_angle(correction)
         return float(shift @ shift) < self.config.tolerance_m**2 and float(turn) < self.config.tolerance_rad
 
-    def _outcome(
+    def _fit(
         self,
         T: Pose,
         source: Points,
@@ -73,24 +70,21 @@ class SvdMatcher:
         tried: int,
         iterations: int,
         ending: int,
-    ) -> Outcome:
+    ) -> Fit:
         """Normal equations of the point-to-point residuals about the lidar: J = [I, −p×]."""
         errors = source - nearest
         squares = np.einsum("ij,ij->i", errors, errors)
         s2 = self.config.kernel_scale_m**2
         cost = 0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (tried - len(source))
-        return Outcome(
+        return Fit(
             H=_information(source - T[:-1, -1], weight),
             unweighted=np.empty((0, 0)),
             cost=cost,
-            weights=float(weight.sum()),
+            total_weight=float(weight.sum()),
             squares=float(weight @ squares),
             pairs=len(source),
             iterations=iterations,
             ending=ending,
-            origin=np.zeros(3),
-            partner=np.empty(0, np.int32),
-            trust=np.empty(0),
         )
 
 

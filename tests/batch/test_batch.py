@@ -18,6 +18,7 @@ from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.processes import resident_mib
+from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate
 from scanchain.source import Address
 from scanchain.viz.report.batch import names_of
@@ -93,6 +94,17 @@ def test_of_8_logs_two_are_poison_and_6_have_results_and_a_second_call_runs_only
     assert made(out) == first and "6 results from before" in capfd.readouterr()[0]
 
 
+def test_logs_of_the_longest_names_have_directories_of_their_own_and_keep_their_names(drawers, tmp_path):
+    names = [f"{'ä' * 121}{k}.mcap" for k in range(2)]
+    for k, name in enumerate(names):
+        (tmp_path / name).write_bytes((drawers / f"log_0{k}.mcap").read_bytes())
+    out = tmp_path / "out"
+    assert main(["batch", f"{tmp_path}/*.mcap", "--out", str(out), "--end", "1"]) == 0
+    rows = table(out)
+    assert sorted(rows) == names and len({row["run"] for row in rows.values()}) == 2
+    assert directory_name("log") == "log" and directory_name("a" * 240 + "b") != directory_name("a" * 240 + "c")
+
+
 def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())
@@ -122,7 +134,7 @@ def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run
     assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("unreliable", "done")
     assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
     assert len(first) == 2 and "2: 1 done, 1 unreliable" in output
-    assert errors == f"error: of 1 most scans are degenerate or lost; {out}/summary.txt says why\n"
+    assert errors == f"error: 1 of 2 logs are unreliable; {out}/summary.txt says why\n"
     assert f"{radar} is unreliable" in (out / "report.html").read_text()
     assert main(words) == 1
     assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
@@ -350,8 +362,8 @@ def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_ever
     page = (out / "report.html").read_text(encoding="utf-8")
     cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
     blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
-    assert blind[0] == ("", "20") and blind[1] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
-    assert fine[1] == fine[2] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    assert blind[0] == ("", "20") and blind[2] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
+    assert fine[1] == fine[2] == fine[3] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
     links = re.findall(r'<a href="([^"]+)">', page)
     assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
     assert links[0].endswith("/report.html") and links[2].startswith("rows/")

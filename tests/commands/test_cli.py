@@ -492,6 +492,22 @@ def test_start_end_and_every_choose_scans(call, tmp_path, office):
     assert (values["log.start_s"], values["log.end_s"], values["log.every"]) == (1.0, 3.0, 2)
 
 
+def test_an_end_beyond_that_of_the_log_is_a_note_and_a_start_beyond_it_an_error(call, tmp_path, office):
+    code, output, _ = call("run", office, "--end", "99", "--rerun", "off", "--out", tmp_path / "a")
+    assert code == 0
+    says(output, "note           --end 99 s has no effect: the log ends at ")
+    code, _, errors = call("run", office, "--start", "99", "--out", tmp_path / "b")
+    assert code == 2 and errors.count("\n") == 1
+    says(errors, "no scan of /scan lies after --start 99 s; the log is ")
+
+
+def test_info_and_compare_take_the_part_that_run_takes(call, tmp_path, office):
+    part = ("--topic", "/scan", "--start", "1", "--end", "3", "--every", "2")
+    says(call("info", office, *part)[1], "/scan: 2D, 11 scans")
+    code, output, _ = call("compare", office, *part, "--methods", "plicp", "--out", tmp_path / "c", "--json")
+    assert code == 0 and json.loads(output)["scans"] == 11
+
+
 def test_the_short_flags_stand_for_keys(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     assert call("run", office, *out, "--matcher", "svd", "--no-loops", "--topic", "/scan")[0] == 0
@@ -621,6 +637,8 @@ def test_ground_truth_is_taken_from_the_file_named_else_from_the_log(call, tmp_p
     sources = {"log": [], "/ground_truth": ["--gt", "/ground_truth"], "/odom": ["--gt", "/odom"]}
     sources["other"] = ["--gt", tmp_path / "other.tum"]
     sources["same"] = ["--gt", office.with_suffix(".tum")]
+    call("run", office, "--out", tmp_path / "none", "--rerun", "off", "--gt", "none")
+    assert metrics(tmp_path / "none")["ground_truth"] is None
     ate_m, named = {}, {}
     for name, flags in sources.items():
         out = tmp_path / name.strip("/")
@@ -878,7 +896,10 @@ def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tmp_path):
     short = quarter(tmp_path / "gt.tum", 0.1)
     code, output, _ = call("evaluate", short, short)
     assert code == 0
-    says(output, "ATE rmse", "rpe_10_m: none: ", "kitti: none: ")
+    says(
+        output, "ATE rmse", "not computed: RPE over 10 m along the reference: no stretch of that length fits",
+        "not computed: KITTI metric: no stretch of 10 m fits into a path of ",
+    )  # fmt: skip
     assert json.loads(call("evaluate", short, short, "--json")[1])["kitti"] is None
 
 

@@ -282,3 +282,29 @@ def test_the_projected_matrix_is_the_nearest_semidefinite_one():
     # optimal: what is left over is negative semidefinite and orthogonal to the projection
     assert np.linalg.eigvalsh(A - nearest)[:, -1].max() < 1e-12
     assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11
+
+
+def test_angles_beyond_a_turn_are_asked_about(call, tmp_path):
+    lines = ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1 0 90", "EDGE_SE2 0 1 1 0 90 1 0 0 1 0 1"]
+    (tmp_path / "a.g2o").write_text("\n".join(lines))
+    with pytest.warns(
+        UserWarning, match="2 lines have an angle beyond a whole turn, up to 90 in line 2; degrees?"
+    ):
+        assert "degrees?" in read_g2o(tmp_path / "a.g2o").note
+    assert "degrees?" in call("optimize", tmp_path / "a.g2o")[1]
+
+
+def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call, tmp_path):
+    lines = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(8)]
+    lines += [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 100" for k in range(7)]
+    lines += [f"EDGE_SE2 {k} {k + 2} 2 0 0 100 0 0 100 0 100" for k in range(6)]
+    lines.append("EDGE_SE2 0 7 0 0 0 1000 0 0 1000 0 1000")
+    (tmp_path / "false.g2o").write_text("\n".join(lines))
+    _, output, _ = call("optimize", tmp_path / "false.g2o")
+    assert "per degree of freedom, where 1 is expected" in output and "--robust truncated" in output
+    for loss in ("truncated", "huber"):
+        out = tmp_path / f"{loss}.g2o"
+        _, output, _ = call("optimize", tmp_path / "false.g2o", "--robust", loss, "--out", out)
+        assert "where 1 is expected" not in output
+        assert "on 7 loop edges; the other 7 edges (odometry, points) in full weight" in output
+        assert read_g2o(out).graph.poses[-1][0, 2] == pytest.approx(7.0, abs=0.01)

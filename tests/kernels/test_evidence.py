@@ -1,4 +1,4 @@
-"""What an alignment is worth, as compiled: every kernel equals its slow, clear twin."""
+"""Observability of a pose: every kernel equals its slow, clear twin."""
 
 import math
 
@@ -10,10 +10,10 @@ from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.kernels.geometry import poses
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.registration import observability
-from scanchain.kernels.registration.match import root_mean_square_range
+from scanchain.kernels.registration.icp import root_mean_square_range
 from scanchain.registration import VoxelMap
-from scanchain.registration.plicp import terms_of
-from tests.support.naive_evidence import hold, seen_from_source, spectrum
+from scanchain.registration.plicp import settings_of
+from tests.support.naive_evidence import seen_from_source, spectrum, weak_prior
 
 
 def definite(k, spread=1.0, seed=0):
@@ -59,16 +59,16 @@ def test_the_spectrum_counts_turns_as_lengths(k):
 @pytest.mark.parametrize("k", [3, 6])
 @pytest.mark.parametrize("min_information", [1e-9, 1e-4, 1e-2, 1.0])
 @pytest.mark.parametrize("signal", [0.5, 2.9, 3.1, 29.0, 31.0, np.inf])
-def test_weak_directions_are_held_and_no_others(k, min_information, signal):
+def test_weak_directions_have_a_prior_and_no_others(k, min_information, signal):
     H, expected = definite(k, 1.5), definite(k, 0.5, seed=1)
-    terms = terms_of(
+    settings = settings_of(
         MatchingConfig(min_information=min_information, min_signal=3.0), VoxelMap(3, LocalMapConfig()), wide=False
     )
     found = observability.spectrum_of(H, 2.0, 5.0)
     found.signals[1] = signal
-    held = observability.hold(found, 2.0, expected, terms)
-    wanted = hold(H, 2.0, 5.0, expected, found.signals, (min_information, 3.0))
-    np.testing.assert_allclose(held, wanted, rtol=1e-9, atol=1e-9)
+    prior = observability.weak_prior(found, 2.0, expected, settings)
+    wanted = weak_prior(H, 2.0, 5.0, expected, found.signals, (min_information, 3.0))
+    np.testing.assert_allclose(prior, wanted, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("k", [3, 6])

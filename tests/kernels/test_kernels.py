@@ -7,12 +7,12 @@ from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
 from scanchain.kernels.graph.shortest_paths import shortest_paths
-from scanchain.kernels.registration import descent
+from scanchain.kernels.registration import optimizers
 from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.residuals import normal_equations
 from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels import downsample, hashing
-from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE, insert
 from scanchain.registration import VoxelMap
 from tests.support import naive
 
@@ -29,8 +29,8 @@ def some_points(dimension, n=400, seed=0):
 
 
 def map_of(points, size=0.5, alone=8):
-    voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size, min_points_alone=alone))
-    voxel_map.insert(points, lie.identity(points.shape[1]))
+    voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size))
+    insert(voxel_map.voxels, points, lie.identity(points.shape[1]), 1, float(alone))
     return voxel_map
 
 
@@ -42,13 +42,13 @@ def adjacent(a, b):
     return max(abs(i - j) for i, j in zip(a, b, strict=True)) <= 1
 
 
-def paired(voxel_map, partner):
+def paired(voxel_map, correspondence):
     """Pairs as naive.py takes them."""
     d = voxel_map.dimension
     cells = voxel_map.voxels.cells
     return [
         (i, cells[j, :d], SHAPES[cells[j, SHAPE]], cells[j, DIRECTION : DIRECTION + d])
-        for i, j in enumerate(partner)
+        for i, j in enumerate(correspondence)
         if j >= 0
     ]
 
@@ -129,60 +129,60 @@ def test_association_finds_the_nearest_mean(dimension, reach):
     voxel_map = map_of(points)
     means = dict(zip(keys_of(voxel_map), voxel_map.points(), strict=True))
     T = lie.exp(np.array([0.1, -0.2, 0.1] if dimension == 2 else [0.1, -0.2, 0.1, 0.02, 0.03, 0.1]))
-    partner = np.empty(len(points), np.int32)
-    found = associate(voxel_map.voxels, points, T, reach, 0.6, partner)
+    correspondence = np.empty(len(points), np.int32)
+    found = associate(voxel_map.voxels, points, T, reach, 0.6, correspondence)
     keys = keys_of(voxel_map)
     expected = [naive.nearest_mean(p, means, 0.5, reach, 0.6) for p in lie.transform(T, points)]
-    assert [keys[j] if j >= 0 else None for j in partner] == expected
+    assert [keys[j] if j >= 0 else None for j in correspondence] == expected
     assert found == sum(key is not None for key in expected)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("alone", [8, 10**6])
-def test_trust_is_the_sensors_variance_over_the_residuals(dimension, alone):
+def test_the_weight_is_the_sensors_variance_over_the_residuals(dimension, alone):
     points = some_points(dimension)
     voxel_map = map_of(points, alone=alone)
     groups = naive.group(points, 0.5)
     T = lie.exp(np.array([0.1, -0.2, 0.1] if dimension == 2 else [0.1, -0.2, 0.1, 0.02, 0.03, 0.1]))
-    partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
-    associate(voxel_map.voxels, points, T, 1, 0.6, partner)
+    correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, T, 1, 0.6, correspondence)
     variance = 0.02**2
-    weigh(voxel_map.voxels, points, T, partner, variance, trust)
+    weigh(voxel_map.voxels, points, T, correspondence, variance, weight)
     keys, moved = keys_of(voxel_map), lie.transform(T, points)
-    assert np.array_equal(trust == 0.0, partner < 0)
-    for i, mean, kind, direction in paired(voxel_map, partner):
-        key = keys[partner[i]]
+    assert np.array_equal(weight == 0.0, correspondence < 0)
+    for i, mean, kind, direction in paired(voxel_map, correspondence):
+        key = keys[correspondence[i]]
         near = [members for other, members in groups.items() if other != key and adjacent(other, key)]
         members = naive.members_of(groups[key], near, alone, 0.5)
-        expected = naive.trust(moved[i], T, mean, kind, direction, members, 0.5, variance)
-        assert trust[i] == pytest.approx(expected, rel=1e-6)
+        expected = naive.weight_of(moved[i], T, mean, kind, direction, members, 0.5, variance)
+        assert weight[i] == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_plane_seen_edge_on_is_not_trusted():
+def test_a_plane_seen_edge_on_has_little_weight():
     rng = np.random.default_rng(0)
     slab = np.column_stack(
         [rng.uniform(20.0, 23.0, 600), rng.uniform(-1.5, 1.5, 600), 0.001 * rng.normal(size=600)]
     )
     wall = slab[:, [2, 1, 0]] + np.array([20.0, 0.0, -21.5])
-    trusted = []
+    weights = []
     for points in (slab, wall):
         voxel_map = map_of(points, size=1.0)
-        partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
-        associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, partner)
-        weigh(voxel_map.voxels, points, np.eye(4), partner, 0.02**2, trust)
-        trusted.append(np.median(trust))
-    assert trusted[0] < 0.001 and trusted[1] > 0.8
+        correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+        associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, correspondence)
+        weigh(voxel_map.voxels, points, np.eye(4), correspondence, 0.02**2, weight)
+        weights.append(np.median(weight))
+    assert weights[0] < 0.001 and weights[1] > 0.8
 
 
-def trust_of(points, *, size=1.0, noise_m=0.02, passes=1):
-    """Median trust of points in a map of themselves, inserted so many times, seen from the origin."""
+def weight_of(points, *, size=1.0, noise_m=0.02, passes=1):
+    """Median weight of points in a map of themselves, inserted so many times, seen from the origin."""
     voxel_map = VoxelMap(3, LocalMapConfig(voxel_size_m=size))
     for _ in range(passes):
         voxel_map.insert(points, np.eye(4))
-    partner, trust = np.empty(len(points), np.int32), np.empty(len(points))
-    associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, partner)
-    weigh(voxel_map.voxels, points, np.eye(4), partner, noise_m**2, trust)
-    return float(np.median(trust[partner >= 0]))
+    correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, correspondence)
+    weigh(voxel_map.voxels, points, np.eye(4), correspondence, noise_m**2, weight)
+    return float(np.median(weight[correspondence >= 0]))
 
 
 def ring_on(surface_m, elevation, n=4000, noise_m=0.02, seed=0):
@@ -199,7 +199,7 @@ def test_a_ring_seen_over_and_over_is_no_surface(passes):
     """Neither the arc on a smooth wall nor the sheet that a ragged hedge makes of it."""
     arc = ring_on(lambda azimuth: 15.0 / np.cos(azimuth), 0.1)
     hedge = ring_on(lambda azimuth: 15.0 + np.sin(40.0 * azimuth), 0.1)
-    assert max(trust_of(arc, passes=passes), trust_of(hedge, passes=passes)) < 0.05
+    assert max(weight_of(arc, passes=passes), weight_of(hedge, passes=passes)) < 0.05
 
 
 def test_a_pole_counts_and_a_ring_on_a_rail_does_not():
@@ -208,7 +208,7 @@ def test_a_pole_counts_and_a_ring_on_a_rail_does_not():
     length = rng.uniform(-0.5, 0.5, 300)
     pole = np.column_stack([12.5 + thin[:, 0], 0.5 + thin[:, 1], length])
     rail = np.column_stack([12.5 + thin[:, 0], 0.5 + length, 0.5 + thin[:, 1]])
-    assert trust_of(pole) > 0.5 > 0.01 > trust_of(rail)
+    assert weight_of(pole) > 0.5 > 0.01 > weight_of(rail)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -218,13 +218,13 @@ def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     k = 3 if dimension == 2 else 6
     T = lie.exp(np.linspace(0.05, -0.08, k))
     origin = np.array([0.7, -0.4, 0.3]) * ([1, 1, 0] if dimension == 2 else 1)
-    partner = np.empty(len(points), np.int32)
-    associate(voxel_map.voxels, points, T, 1, 1.0, partner)
-    pairs = paired(voxel_map, partner)
+    correspondence = np.empty(len(points), np.int32)
+    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
+    pairs = paired(voxel_map, correspondence)
     assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
     H, b = np.empty((k, k)), np.empty(k)
     scale, weight = 0.2, np.random.default_rng(3).uniform(0.1, 1.0, len(points))
-    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, partner, weight, scale, False, H, b)
+    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, correspondence, weight, scale, False, H, b)
     assert total == pytest.approx(naive.cost(points, pairs, T, scale, weight), rel=1e-12)
     np.testing.assert_allclose(
         H, naive.gauss_newton_hessian(points, pairs, T, origin[:dimension], scale, weight), rtol=1e-6, atol=1e-5
@@ -244,18 +244,18 @@ def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimensio
     voxel_map = map_of(points)
     k = 3 if dimension == 2 else 6
     T = lie.exp(np.linspace(0.05, -0.08, k))
-    origin, partner = np.zeros(3), np.empty(len(points), np.int32)
-    associate(voxel_map.voxels, points, T, 1, 1.0, partner)
+    origin, correspondence = np.zeros(3), np.empty(len(points), np.int32)
+    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
     huge, full = 1e4, np.ones(len(points))  # every weight is one, the cost plain least squares
     H, b = np.empty((k, k)), np.empty(k)
-    normal_equations(voxel_map.voxels, points, T, origin, partner, full, huge, True, H, b)
+    normal_equations(voxel_map.voxels, points, T, origin, correspondence, full, huge, True, H, b)
     h, moved, gradients = 1e-5, np.empty_like(T), []
     for axis in range(k):
         ends = []
         for sign in (h, -h):
             perturb(sign * np.eye(k)[axis], T.copy(), origin, moved)
             normal_equations(
-                voxel_map.voxels, points, moved, origin, partner, full, huge, False, np.empty((k, k)), b
+                voxel_map.voxels, points, moved, origin, correspondence, full, huge, False, np.empty((k, k)), b
             )
             ends.append(b.copy())
         gradients.append((ends[0] - ends[1]) / (2 * h))
@@ -292,23 +292,23 @@ def test_damped_solve_equals_numpy(damping):
     rng = np.random.default_rng(5)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
     H, x = B.T @ B, np.empty(6)
-    assert descent.solve(H, b, damping, np.empty((6, 6)), x)
+    assert optimizers.solve(H, b, damping, np.empty((6, 6)), x)
     np.testing.assert_allclose(x, -np.linalg.solve(H + damping * np.diag(np.diag(H)), b), rtol=1e-9)
 
 
 def test_solve_says_so_where_the_system_is_singular():
-    assert not descent.solve(np.diag([1.0, 0.0, 1.0]), np.ones(3), 0.5, np.empty((3, 3)), np.empty(3))
+    assert not optimizers.solve(np.diag([1.0, 0.0, 1.0]), np.ones(3), 0.5, np.empty((3, 3)), np.empty(3))
 
 
-@pytest.mark.parametrize("optimizer", [descent.NEWTON, descent.GAUSS_NEWTON, descent.GRADIENT_DESCENT])
+@pytest.mark.parametrize("optimizer", [optimizers.NEWTON, optimizers.GAUSS_NEWTON, optimizers.GRADIENT_DESCENT])
 def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
     rng = np.random.default_rng(6)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
     H, x = B.T @ B, np.empty(6)
-    assert descent.step(optimizer, H, b, 0.0, np.empty((6, 6)), x)
+    assert optimizers.step(optimizer, H, b, 0.0, np.empty((6, 6)), x)
     decrease = -(b @ x + 0.5 * x @ H @ x)
     assert decrease > 0.0
-    assert descent.predicted_decrease(H, b, x) == pytest.approx(decrease)
+    assert optimizers.predicted_decrease(H, b, x) == pytest.approx(decrease)
     assert b @ x < 0.0
 
 

@@ -1,4 +1,4 @@
-"""What pairs tell over what errors of normals would feign: the kernel equals its twin and tells who is blind."""
+"""Signal-to-noise ratio along a twist: the kernel equals its slow twin, and degenerate scenes are found."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ import pytest
 from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
-from scanchain.kernels.registration import icp, signal_to_noise
+from scanchain.kernels.registration import icp, observability
 from scanchain.registration import VoxelMap, create_matcher
-from scanchain.registration.plicp import terms_of
+from scanchain.registration.plicp import settings_of
 from tests.support.naive_evidence import signal_along
 
 LIMITS = MatchingConfig(max_distance_m=1.0, sensor_noise_m=0.02)
@@ -51,27 +51,26 @@ def test_the_signal_is_that_of_its_slow_twin(twist, scans):
     voxel_map, points = map_of(200, scans), walls(99, 30)[::5]
     voxel_map.insert(points + np.array([0.0, 0.0, 0.4]), lie.identity(3))  # voxels that are young
     T = lie.exp(np.array([0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
-    terms = terms_of(LIMITS, voxel_map, wide=False)
-    outcome = icp.align(
-        voxel_map.voxels, points, T, np.zeros(6), np.zeros((6, 6)), 5.0, terms.first_scale_m, terms
-    )
-    found = signal_to_noise.signal_along(voxel_map.voxels, points, T, outcome, twist, voxel_map.insertions)
-    assert found == pytest.approx(signal_along(voxel_map, points, T, outcome, twist), rel=1e-9)
+    settings = settings_of(LIMITS, voxel_map, wide=False)
+    problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((6, 6)), settings)
+    icp.align(problem, T, np.zeros(6), 5.0, settings.first_scale_m)
+    found = observability.signal_along(problem, T, twist)
+    assert found == pytest.approx(signal_along(voxel_map, problem, T, twist), rel=1e-9)
 
 
-def test_a_corridor_without_ends_tells_no_more_than_noise():
+def test_a_corridor_without_ends_has_the_signal_of_noise():
     match = aligned(map_of(), walls(99)[::2])
     assert match.observability < 1.0 / 3.0
     assert abs(match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
 
 
-def test_a_fiftieth_of_the_points_on_a_face_across_the_corridor_tells_where_one_is():
+def test_a_fiftieth_of_the_points_on_a_face_across_the_corridor_makes_it_observable():
     match = aligned(map_of(ends=90), walls(99, ends=90)[::2])
     assert match.degeneracy_eigenvalue < 0.02
     assert match.observability > 5.0
 
 
-def test_one_surface_is_no_witness():
+def test_one_surface_alone_is_not_enough():
     """As much information as in the fiftieth above, all by points on one voxel."""
     voxel_map = map_of()
     face = np.array([[6.0, y, z] for y in np.linspace(-0.4, 0.4, 4) for z in np.linspace(0.1, 0.4, 4)])
@@ -83,7 +82,7 @@ def test_one_surface_is_no_witness():
     assert match.observability < 0.5
 
 
-def test_a_wall_that_just_came_up_is_no_witness():
+def test_a_wall_that_is_new_in_the_map_is_not_enough():
     voxel_map = map_of()
     voxel_map.insert(walls(98, ends=90), lie.identity(3))
     match = aligned(voxel_map, walls(99, ends=90)[::2])
@@ -91,7 +90,7 @@ def test_a_wall_that_just_came_up_is_no_witness():
     assert match.observability < 0.5
 
 
-def test_where_nothing_is_told_the_prediction_stands():
+def test_along_a_degenerate_direction_the_pose_stays_at_the_prediction():
     shifted = lie.exp(np.array([0.04, 0.0, 0.0, 0.0, 0.0, 0.0]))
     prior = Prior(lie.identity(3), np.diag(np.full(6, 0.01)), np.full(6, 0.5))
     blind = aligned(map_of(), lie.transform(shifted, walls(99))[::2], prior)

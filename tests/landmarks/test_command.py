@@ -9,6 +9,7 @@ import pytest
 
 from scanchain.landmarks.solvers import ESTIMATOR, METHODS
 from scanchain.trajectory import read_tum
+from tests.support.browser import look
 from tests.support.scenes import shared_data
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
@@ -53,13 +54,21 @@ def test_a_problem_gives_table_pictures_page_and_estimate(call, small, tmp_path)
         assert re.search(rf"^  {method} .* \d\.\de[+-]\d\d$", output, re.MULTILINE), method
     page = (out / "report.html").read_text()
     assert "a&lt;b&gt;&amp;c" in page and "<b>" not in page
-    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     with (out / "a_b_c_landmarks.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 5 and 0.0 < float(rows[0]["cov_x_m_x_m"]) < 0.01
     pixels = image.imread(out / "a_b_c.png")
     assert np.mean(np.all(np.abs(pixels[..., :3] - [0.25, 0.47, 0.84]) < 0.1, axis=-1)) > 0.001
     assert json.loads((out / "run.json").read_text())["complete"]
+
+
+def test_the_page_can_be_read_on_a_narrow_screen(call, small, tmp_path):
+    assert call("landmarks", small, "--out", tmp_path / "out")[0] == 0
+    seen = look(tmp_path / "out" / "report.html", tmp_path, width=500)
+    assert seen["wide"] <= seen["width"] and seen["outside"] == [] and len(seen["svgs"]) == 3
+    for drawing in seen["svgs"]:
+        assert drawing["width"] > 300 and drawing["cut"] == drawing["overlapping"] == []
 
 
 def test_one_solver_runs_unless_more_are_asked_for(call, small, tmp_path):

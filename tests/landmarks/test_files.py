@@ -199,3 +199,18 @@ def test_stated_odometry_noise_that_is_far_too_small_is_told():
         Options(("schur",), 1, 1, OdometryNoise(0.003, 0.001, 0.005, 0.01), "odometry", "levenberg-marquardt"),
     )
     assert "off by a factor" in {fact.label: fact.value for fact in study.facts}["odometry noise"]
+
+
+def test_bearings_in_degrees_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    poses, landmarks = rng.uniform(-9.0, 9.0, (20, 2)), rng.uniform(-9.0, 9.0, (6, 2))
+    pairs = np.stack(np.meshgrid(np.arange(20), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    x, y = (landmarks[pairs[:, 1]] - poses[pairs[:, 0]]).T
+    given = {"gt_traj": poses, "gt_landmarks": landmarks, "odom": np.diff(poses, axis=0)}
+    given |= {"sigma_odom": np.eye(2), "sigma_landmark": np.eye(2)}
+    bearings = np.arctan2(y, x)
+    for name, angles in (("radians", bearings), ("degrees", np.degrees(bearings))):
+        np.savez(tmp_path / name, observations=np.column_stack([pairs, angles, np.hypot(x, y)]), **given)
+    assert read_landmark_data(tmp_path / "radians.npz").kind == "bearing-range"
+    with pytest.raises(InputError, match=r"bearings of observations reach 1\d\d.*: degrees\? give radians"):
+        read_landmark_data(tmp_path / "degrees.npz")

@@ -161,6 +161,17 @@ def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
     )
 
 
+def test_an_mcap_file_is_cut_by_the_short_flags(tmp_path, capfd):
+    source, cut = write(tmp_path / "in.mcap", office(40)), tmp_path / "out.mcap"
+    assert main(["convert", str(source), str(cut), "--start", "1", "--end", "2", "--every", "2"]) == 0
+    chosen = open_log(source, LogConfig(start_s=1.0, end_s=2.0, every=2)).scans()
+    assert [scan.stamp_ns for scan in open_log(cut).scans()] == [scan.stamp_ns for scan in chosen]
+    before, _ = cut.read_bytes(), capfd.readouterr()
+    assert main(["convert", str(source), str(cut), "--start", "99", "--force"]) == 2
+    assert "no message lies after --start 99 s; the log is " in capfd.readouterr().err
+    assert cut.read_bytes() == before
+
+
 def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capfd):
     folder = clouds(tmp_path)
     (folder / "1700000000500000000.bin").write_bytes(b"xyz")

@@ -111,8 +111,8 @@ def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path)
     said = [cloud_said(STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, sweep(k))) for k in range(5)]
     path = saved(tmp_path, said)
     finding = diagnose(path)["rate"]
-    assert finding.remedy == "--matching.wide_reach_voxels 4 --matching.wide_max_distance_m 6"
-    wide = configured(3, {"matching.wide_reach_voxels": 4, "matching.wide_max_distance_m": 6.0})
+    assert finding.remedy == "--matching.wide_max_distance_m 8"
+    wide = configured(3, {"matching.wide_max_distance_m": 8.0})
     findings = examine([path], lambda _: wide, LogConfig()).findings
     assert next(each for each in findings if each.check == "rate").remedy == ""
 
@@ -440,6 +440,17 @@ def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd)
         "GNSS", "ground truth", "IMU",
     ]  # fmt: skip
     assert diagnose(saved(tmp_path, drive()))["sensors"].found == "no IMU, GNSS or ground truth"
+
+
+def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
+    said = drive(wheels=True)
+    other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
+    truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
+    path = saved(tmp_path, [*said, *other, truth])
+    assert main(["info", str(path)]) == 0
+    text = capfd.readouterr().out
+    assert "several lidar topics" in text and "wheels    /odom\n" in text
+    assert "sensor    ground truth /ground_truth: judges the result, is not used for it\n" in text
 
 
 # The whole

@@ -277,7 +277,7 @@ def test_every_flag_that_a_check_can_print_is_tried():
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 printed |= set(re.findall(r"--[a-z][a-z_.]*[a-z]", node.value))
     assert printed == {
-        "--matching.wide_reach_voxels", "--matching.wide_max_distance_m", "--end", "--start", "--every",
+        "--matching.wide_max_distance_m", "--end", "--start", "--every",
         "--log.max_range_m", "--odometry.prior", "--log.point_times", "--log.revolution_s",
         "--log.revolution_start_rad", "--preprocess.max_range_m", "--preprocess.min_range_m",
         "--log.max_bad_scans_percent",

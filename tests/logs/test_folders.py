@@ -7,6 +7,7 @@ from scanchain import lie
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from scanchain.logs.doctor.statistics import survey
 from scanchain.logs.formats.cloud_folder import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
@@ -361,3 +362,14 @@ def test_a_folder_of_parts_of_a_log_says_which_other_files_it_left_out(tmp_path)
     (tmp_path / "notes.txt").touch()
     (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
     assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .npy;")
+
+
+def test_many_bad_files_are_told_by_the_first_and_their_number(tmp_path):
+    for k in range(40):
+        np.save(tmp_path / f"{k:03}.npy", np.random.default_rng(k).uniform(-9.0, 9.0, (50, 3)))
+    for k in range(1, 31):
+        (tmp_path / f"{k:03}.npy").write_bytes(b"no array")
+    log = open_log(tmp_path, LogConfig(rate_hz=10.0, max_bad_scans_percent=100.0))
+    assert len(list(log.scans())) == 10
+    assert len(log.damage) < 6 and any("003.npy" in line and "27 more like this" in line for line in log.damage)
+    assert len("; ".join(survey(log).damage)) < 600

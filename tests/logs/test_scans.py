@@ -15,6 +15,7 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.opening import index_files
 from scanchain.simulation import simulate
 from tests.support.naive_logs import (
@@ -175,6 +176,31 @@ def test_the_log_can_be_read_again_and_closed_early(tmp_path):
     assert len(list(log.scans())) == len(list(log.scans())) == 400
 
 
+def test_a_long_gap_between_two_files_of_a_log_is_a_note(tmp_path):
+    hour_ns = 3600 * SECOND
+    paths = [
+        write(tmp_path / name, office(40, begin_ns=begin_ns))
+        for name, begin_ns in (("a.mcap", STAMP_NS + 26 * hour_ns), ("b.mcap", STAMP_NS))
+    ]
+    note = next(note for note in open_log(paths).notes if note.startswith("no message for "))
+    assert note.startswith("no message for 1.1 days from 3.9 s on between b.mcap and a.mcap: read as one log ")
+    for config in (LogConfig(end_s=3.0), LogConfig(start_s=26 * 3600.0)):
+        assert not any("no message" in note for note in open_log(paths, config).notes)
+    write(paths[0], office(40, begin_ns=STAMP_NS + 10 * SECOND))
+    assert not any("no message" in note for note in open_log(paths).notes)
+
+
+def test_opening_decodes_no_scan_twice(tmp_path, monkeypatch):
+    rows = np.array([(1, 2, 3), (2, 3, 5)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = [cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)) for k in range(5)]
+    path, decoded = write(tmp_path / "a.mcap", said), []
+    real = PointCloudDecoder.decode
+    monkeypatch.setattr(PointCloudDecoder, "decode", lambda *args: decoded.append(1) or real(*args))
+    log = open_log(path)
+    assert "preprocess.deskew" in log.idle_keys() and log.assumed_point_times().startswith("no point times")
+    assert len(decoded) == 1
+
+
 def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
     from scanchain.logs.mcap import stream
 
@@ -182,7 +208,7 @@ def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
     opened = []
     real = stream.read_block
     monkeypatch.setattr(stream, "read_block", lambda *args: opened.append(1) or real(*args))
-    iterator = open_log([path], LogConfig(prefetch_chunks=3)).scans()
+    iterator = open_log([path], LogConfig()).scans()
     next(iterator)
     iterator.close()
     assert 1 <= len(opened) <= 12
@@ -677,6 +703,12 @@ def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own(tmp_path):
     log, _ = read(path)
     np.testing.assert_array_equal(log.ground_truth().poses, alone.poses)
     np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
+
+
+def test_the_truth_of_a_log_can_be_left_unused_and_does_not_become_wheels(tmp_path):
+    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)])
+    log = open_log([path], LogConfig(ground_truth_topic="none"))
+    assert log.ground_truth() is None and not log.ground_truth_topic and not log.has_odometry
 
 
 def test_a_log_without_truth_has_none(tmp_path):

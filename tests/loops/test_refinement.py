@@ -5,11 +5,11 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Keyframe
-from scanchain.kernels.registration.refinement import refine
+from scanchain.kernels.registration.icp import refine
 from scanchain.loops import refined
 from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
-from scanchain.registration.plicp import terms_of
+from scanchain.registration.plicp import settings_of
 from tests.support import naive_loops
 from tests.support.scenes import configured
 
@@ -82,7 +82,7 @@ def test_the_kernel_is_one_alignment_after_the_other(least_share):
     for keyframe in keyframes:
         surfaces.insert(keyframe.points, truth[keyframe.scan_index])
     points, starts = store.read(0, store.rows).astype(float), np.append(0, np.cumsum(spans[:, 1]))
-    prior, terms = np.diag([2.0, 2.0, 40.0]), terms_of(config.matching, surfaces, wide=False)
+    prior, terms = np.diag([2.0, 2.0, 40.0]), settings_of(config.matching, surfaces, wide=False)
     fast = shaken(truth, 0.05, 0.02)
     slow = fast.copy()
     refine(surfaces.voxels, points, starts, fast, prior, least_share, terms)

@@ -283,8 +283,8 @@ def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, wh
     same_result(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize("limit_kib", [64, 400])
-def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib):
+@pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, LIVELY), (400, RECORDED)])
+def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
     full = f"""
 import resource, signal, sys
 from scanchain.__main__ import main
@@ -293,7 +293,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10)
 sys.exit(main(sys.argv[1:]))
 """
     out = tmp_path / "run"
-    words = ["run", str(office), "--out", str(out), *LIVELY]
+    words = ["run", str(office), "--out", str(out), *words]
     child = subprocess.run([sys.executable, "-c", full, *words], cwd=ROOT, capture_output=True, text=True)
     assert child.returncode == 1 and child.stderr.startswith("error: ") and child.stderr.count("\n") == 1
     assert "File too large" in child.stderr and not out.exists()

@@ -41,7 +41,7 @@ def shape(members):
     return "point", None
 
 
-def trust(p, T, mean, kind, direction, members, size, variance):
+def weight_of(p, T, mean, kind, direction, members, size, variance):
     """Sensor variance over the variance of the residual of a point p of the map's frame, the lidar at T."""
     d = len(p)
     if kind == "plane" and d == 2:
@@ -75,27 +75,27 @@ def nearest_mean(point, means, size, reach, max_distance):
     return chosen
 
 
-def residual(p, mean, kind, direction, trusted):
+def residual(p, mean, kind, direction, weight):
     """Residual vector whose squared length the cost counts."""
     e = p - mean
     if kind == "plane":
         e = np.array([direction @ e])
     if kind == "line":
         e = e - direction * (direction @ e)
-    return np.sqrt(trusted) * e
+    return np.sqrt(weight) * e
 
 
-def cost(points, pairs, T, scale, trusted):
+def cost(points, pairs, T, scale, weight):
     """Σ ½ s²r²/(s²+r²) over pairs (index, mean, kind, direction)."""
     total = 0.0
     moved = lie.transform(T, points)
     for i, mean, kind, direction in pairs:
-        r2 = float((residual(moved[i], mean, kind, direction, trusted[i]) ** 2).sum())
+        r2 = float((residual(moved[i], mean, kind, direction, weight[i]) ** 2).sum())
         total += 0.5 * scale**2 * r2 / (scale**2 + r2)
     return total
 
 
-def gauss_newton_hessian(points, pairs, T, origin, scale, trusted):
+def gauss_newton_hessian(points, pairs, T, origin, scale, weight):
     """Σ w JᵀJ with J by central differences of the residual under a left twist about the origin."""
     k = 3 if points.shape[1] == 2 else 6
     shift = lie.identity(points.shape[1])
@@ -106,7 +106,7 @@ def gauss_newton_hessian(points, pairs, T, origin, scale, trusted):
     moved = [lie.transform(step, points) for step in steps]
     here = lie.transform(T, points)
     for i, mean, kind, direction in pairs:
-        args = (mean, kind, direction, trusted[i])
+        args = (mean, kind, direction, weight[i])
         J = np.stack(
             [(residual(moved[a][i], *args) - residual(moved[a + k][i], *args)) / (2 * h) for a in range(k)], axis=1
         )

@@ -1,4 +1,4 @@
-"""Slow, clear twins of the kernels that say what an alignment is worth."""
+"""Slow, clear twins of the observability kernels."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def spectrum(H, weights, range_m):
     return scale, values, vectors
 
 
-def hold(H, weights, range_m, expected, signals, limits):
+def weak_prior(H, weights, range_m, expected, signals, limits):
     """limits : the least information and the least signal"""
     scale, values, vectors = spectrum(H, weights, range_m)
     total = np.zeros(H.shape)
@@ -46,27 +46,27 @@ def seen_from_source(T, T_first, H, worst, variance):
     return lie.adjoint(centered).T @ H @ lie.adjoint(centered) / variance, lie.adjoint(turned).T @ worst
 
 
-def signal_along(voxel_map, points, T, outcome, twist):
-    """What pairs tell along a twist over what errors of normals feign, but for one surface and young ones."""
+def signal_along(voxel_map, problem, T, twist):
+    """Signal-to-noise ratio along a twist, without the dominant surface and young ones."""
     voxels = voxel_map.voxels
     youngest = voxel_map.insertions - min(2, voxel_map.insertions - 1)
-    told, places, feigned = [], [], 0.0
-    for point, j, weight in zip(points, outcome.partner, outcome.trust, strict=True):
+    informative, cells, noise = [], [], 0.0
+    for point, j, weight in zip(problem.points, problem.correspondence, problem.weight, strict=True):
         if j < 0 or weight == 0.0:
             continue
         cell = voxels.cells[j]
         n, u, is_plane = cell[DIRECTION : DIRECTION + 3], cell[ACROSS : ACROSS + 3], cell[SHAPE] == PLANE
-        p = lie.transform(T, point[None])[0] - outcome.origin
+        p = lie.transform(T, point[None])[0] - problem.origin
         d = twist[:3] + np.cross(twist[3:], p)
         if is_plane:
             m = 1.0 / cell[MEAN_TERM]
             spread = cell[SLOPE_ACROSS] * np.outer(u, u) + cell[SLOPE_ALONG] * np.outer(
                 np.cross(n, u), np.cross(n, u)
             )
-            feigned += weight * cell[THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
+            noise += weight * cell[THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
         if voxels.history[j, BORN] <= youngest:
-            told.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
-            places.append(unpack(voxels.keys[j]))
-    loudest = np.array(places[int(np.argmax(told))])
-    is_away = np.abs(np.array(places) - loudest).max(axis=1) > 1
-    return np.array(told)[is_away].sum() / feigned
+            informative.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
+            cells.append(unpack(voxels.keys[j]))
+    dominant = np.array(cells[int(np.argmax(informative))])
+    is_away = np.abs(np.array(cells) - dominant).max(axis=1) > 1
+    return np.array(informative)[is_away].sum() / noise

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from scanchain import lie
-from scanchain.kernels.registration.icp import CONVERGED, align
+from scanchain.kernels.registration.icp import CONVERGED, align, problem_of
 
 
 def heights(points, T, cell_m, size):
@@ -44,12 +44,13 @@ def agreement(seen, points, T, shape, margin_m, margin_share):
     return yes, no
 
 
-def refine(voxels, points, starts, poses, prior, least_share, terms):
+def refine(voxels, points, starts, poses, prior, least_share, settings):
     """Each scan aligned by itself."""
     for k, (first, last) in enumerate(pairwise(starts)):
         T = poses[k].copy()
         scan = points[first:last]
         range_m = np.sqrt((scan**2).sum(axis=1).mean())
-        outcome = align(voxels, scan, T, np.zeros(len(prior)), prior, range_m, terms.first_scale_m, terms)
-        if outcome.ending == CONVERGED and outcome.pairs >= least_share * (last - first):
+        problem = problem_of(voxels, scan, T, prior, settings)
+        fit = align(problem, T, np.zeros(len(prior)), range_m, settings.first_scale_m)
+        if fit.ending == CONVERGED and fit.pairs >= least_share * (last - first):
             poses[k] = T

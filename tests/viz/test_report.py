@@ -259,7 +259,8 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
 def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_told_apart():
     states = ["ok"] * 10 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
     keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
-    steps = pa.table({"state": states, "keyframe": keyframes})
+    fits = [0.3] * 2 + [0.9] * 38
+    steps = pa.table({"state": states, "keyframe": keyframes, "fit": fits})
     closures = pa.table(
         {
             "target_scan": [0, 5, 0], "source_scan": [30, 35, 20], "rejected_by": ["", "back end", "verification"],
@@ -271,7 +272,8 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
-        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 10 scans", "ground truth",
+        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans",
+        "at closures rejected by the back end: 10 scans", "ground truth",
     ]  # fmt: skip
     told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
     assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})

@@ -1,4 +1,4 @@
-"""The nearest voxel mean of every point, among the voxels around it."""
+"""Correspondences: the nearest voxel mean of every point, and the weighted pairs of the closed form."""
 
 import numpy as np
 from numba import njit
@@ -8,13 +8,14 @@ from scanchain.kernels.voxels.voxel_shapes import move
 
 
 @njit(cache=True, nogil=True)
-def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
-    """Fill ``partner`` (N,) with the row of the nearest voxel mean, −1 where none is near enough.
+def associate(voxels, points, T, reach: int, max_distance_m: float, correspondence):
+    """Number of points with a voxel mean within the distance; the row of the nearest in ``correspondence`` (N,).
 
     points : (N, d) meters; T moves them into the map's frame
     reach : voxels searched to each side: the 2ʳᵉᵃᶜʰ-fold of each axis around the point, (2·reach)ᵈ voxels
+    correspondence : −1 where no mean is near enough
     A ring of voxels is searched only if a mean in it could be nearer than those found within: r rings hold all
-    that lies nearer than r − ½ voxels. Returns the number of points with a partner.
+    that lies nearer than r − ½ voxels.
     """
     scale = 1.0 / voxels.size_m
     flat = points.shape[1] == 2
@@ -45,6 +46,31 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, partner):
             covered = (ring - 0.5) * voxels.size_m
             if nearest <= covered * covered:
                 break
-        partner[i] = chosen
+        correspondence[i] = chosen
         found += chosen >= 0
     return found
+
+
+@njit(cache=True, nogil=True)
+def weighted_pairs(voxels, points, T, correspondence, scale_m: float, source, target, weight):
+    """Number of pairs; the moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))² of each, one row a pair.
+
+    points : (N, d) meters, source frame; correspondence : (N,) rows of the map, −1 for none
+    source, target : (N, d) and weight : (N,), room for the pairs
+    """
+    pairs = 0
+    s2 = scale_m * scale_m
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0:
+            continue
+        moved = move(T, points, i)
+        r2 = 0.0
+        for axis in range(points.shape[1]):
+            source[pairs, axis] = moved[axis]
+            target[pairs, axis] = voxels.cells[voxel, axis]
+            r2 += (source[pairs, axis] - target[pairs, axis]) ** 2
+        ratio = s2 / (s2 + r2)
+        weight[pairs] = ratio * ratio
+        pairs += 1
+    return pairs

@@ -1,4 +1,4 @@
-"""Point-to-shape ICP against a voxel map: associate, linearize, step, until the pose stands still."""
+"""Point-to-shape ICP against a voxel map: associate, linearize, step, until the pose is at a minimum."""
 
 from typing import NamedTuple
 
@@ -8,180 +8,352 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
 from scanchain.kernels.registration.association import associate
-from scanchain.kernels.registration.descent import LEVENBERG_MARQUARDT, predicted_decrease, relax, step
-from scanchain.kernels.registration.linearization import (
-    COST,
-    DAMPING,
-    SQUARES,
-    WEIGHTS,
-    Estimate,
-    Problem,
-    leave_out_points,
-    linearize,
-    pull,
-    take,
-    weigh_up,
+from scanchain.kernels.registration.optimizers import (
+    LEVENBERG_MARQUARDT,
+    NEWTON,
+    predicted_decrease,
+    relax,
+    step,
 )
-from scanchain.kernels.registration.residuals import information
+from scanchain.kernels.registration.residuals import information, normal_equations, robust_sums
 from scanchain.kernels.registration.weights import weigh
+from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE, Voxels
 
-CONVERGED, OUT_OF_ITERATIONS, NO_PARTNERS, SINGULAR = 0, 1, 2, 3
+CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
-SHRINK = 0.6  # of the kernel's scale from one association to the next
-SLACK = 0.02  # voxels that points may move before they look for new partners
-PATIENCE = 20  # steps at the last scale
+SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
+SLACK = 0.02  # voxels that points may move before they are associated anew
+PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
+_COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
 
 
-class Outcome(NamedTuple):
-    """How an alignment ended.
+class Settings(NamedTuple):
+    """Settings of a registration.
 
-    H (k, k) : Σ w JᵀJ over planes and lines alone, twists about the first value's position, map axes; the mean
-        of a voxel without a shape holds a pose in every direction, whether the surface there does or not
+    reach, max_distance_m : of the search for correspondences while the pose moves
+    last_reach, last_distance_m : of the correspondences that the result is judged by
+    first_scale_m, widest_scale_m, scale_m : of the robust kernel, at first where the prediction is certain, at
+        most where it is not, and at last
+    variance : of a range, σ² in m²
+    min_information, min_signal : eigenvalue of the information per weight, and its signal-to-noise ratio, below
+        which a direction is degenerate
+    insertions : into the map so far
+    tolerance_m, tolerance_rad : of a step at a minimum
+    """
+
+    optimizer: int
+    max_iterations: int
+    reach: int
+    max_distance_m: float
+    last_reach: int
+    last_distance_m: float
+    first_scale_m: float
+    widest_scale_m: float
+    scale_m: float
+    variance: float
+    min_information: float
+    min_signal: float
+    insertions: int
+    tolerance_m: float
+    tolerance_rad: float
+
+
+class Problem(NamedTuple):
+    """Points (N, d) to be aligned to a map.
+
+    origin : (3,), map frame, that twists rotate about
+    prior : (k, k) information of the predicted pose times the variance of a residual, along the map's axes
+    correspondence, weight : (N,) of the last association
+    """
+
+    voxels: Voxels
+    points: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    correspondence: NDArray[np.int32]
+    weight: NDArray[np.float64]
+    settings: Settings
+
+
+class Iterate(NamedTuple):
+    """A pose, its twist ``offset`` (k,) from the predicted one, and the normal equations there.
+
+    sums : (4,) cost in m², Σ w, Σ w r² in m², damping
+    """
+
+    T: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    sums: NDArray[np.float64]
+
+
+class Fit(NamedTuple):
+    """Residuals of a problem at a pose.
+
+    H (k, k) : Σ w JᵀJ over planes and lines, twists about the problem's origin, map axes; the mean of a voxel
+        without a shape constrains a pose in every direction, whether the surface there does or not
     unweighted (k, k) : the same without robust weights
-    cost : robust cost in m², every unpaired point at its limit ½s²
-    weights, squares : Σ w and Σ w r² (m²)
-    pairs, iterations, ending : points with a partner, linearizations, one of the codes above
-    origin (3,), partner (N,), trust (N,) : what twists turn about, and the last pairs, points without a shape
-        out of trust
+    cost : robust cost in m², every point without a correspondence at its limit ½s²
+    total_weight, squares : Σ w and Σ w r² (m²)
+    pairs, iterations, ending : correspondences, linearizations, one of the codes above
     """
 
     H: NDArray[np.float64]
     unweighted: NDArray[np.float64]
     cost: float
-    weights: float
+    total_weight: float
     squares: float
     pairs: int
     iterations: int
     ending: int
-    origin: NDArray[np.float64]
-    partner: NDArray[np.int32]
-    trust: NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
-def align(voxels, points, T, away, prior, range_m: float, first_scale_m: float, terms):
-    """Move T (d+1, d+1), in place, to where the points (N, d) fit the map best near its first value.
+def problem_of(voxels, points, T_first, prior, settings):
+    """``Problem`` of points (N, d), twists about the position of T_first (d+1, d+1)."""
+    origin, N = np.zeros(3), points.shape[0]
+    for axis in range(points.shape[1]):
+        origin[axis] = T_first[axis, points.shape[1]]
+    return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), settings)
 
-    The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, where ξ is the twist away from the
-    prediction, ``away`` (k,) for the first value: prior (k, k) is the information of the prediction times the
-    variance of a residual. Twists turn about the first value's position, along the map's axes.
-    Points find new partners when they have moved by more than SLACK, until PATIENCE steps were taken with the
-    kernel at its last scale: pairs that flip to and fro would go on for ever. From then on the pairs stay.
+
+@njit(cache=True, nogil=True)
+def align(problem, T, offset, range_m: float, first_scale_m: float):
+    """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
+
+    The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, ξ being the twist from the predicted
+    pose, ``offset`` (k,) at first. Points are associated anew when they have moved by more than SLACK, until
+    PATIENCE steps were taken with the kernel at its last scale: correspondences may alternate without end.
     range_m : root mean square of the points' ranges; first_scale_m : that the kernel's scale shrinks from
-    Returns an ``Outcome``.
     """
-    k = 3 if points.shape[1] == 2 else 6
-    origin = position_of(T)
-    partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
-    problem = Problem(voxels, points, origin, prior, partner, trust, terms)
-    now = Estimate(T, away.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
-    trial = Estimate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
+    settings, size_m, k = problem.settings, problem.voxels.size_m, offset.shape[0]
+    now = Iterate(T, offset.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
+    trial = Iterate(T.copy(), np.zeros(k), np.zeros((k, k)), np.zeros(k), np.zeros(4))
     x, factor = np.zeros(k), np.zeros((k, k))
-    now.sums[DAMPING] = _FIRST_DAMPING
-    scale_m, last_scale_m, settled = first_scale_m, 0.0, 0
+    now.sums[_DAMPING] = _FIRST_DAMPING
+    scale_m, last_scale_m, steps_at_last = first_scale_m, 0.0, 0
     moved_m = np.inf
     pairs, iterations, ending = 0, 0, OUT_OF_ITERATIONS
-    while iterations < terms.max_iterations:
+    while iterations < settings.max_iterations:
         iterations += 1
-        if settled < PATIENCE and moved_m > SLACK * voxels.size_m:
+        if steps_at_last < PATIENCE and moved_m > SLACK * size_m:
             moved_m = 0.0
-            pairs = associate(voxels, points, T, terms.reach, terms.max_distance_m, partner)
+            pairs = correspond(problem, T, settings.reach, settings.max_distance_m)
             if pairs == 0:
-                ending = NO_PARTNERS
+                ending = NO_CORRESPONDENCES
                 break
-            weigh(voxels, points, T, partner, terms.variance, trust)
         if moved_m == 0.0 or scale_m != last_scale_m:
-            linearize(problem, scale_m, now)
+            _linearize(problem, scale_m, now)
         slack_m = -1.0  # a scale that shrinks changes all weights
-        if scale_m <= terms.scale_m:
-            slack_m = SLACK * voxels.size_m - moved_m if settled + 1 < PATIENCE else np.inf
+        if scale_m <= settings.scale_m:
+            slack_m = SLACK * size_m - moved_m if steps_at_last + 1 < PATIENCE else np.inf
         if not _descend(problem, scale_m, range_m, slack_m, now, trial, x, factor):
             ending = SINGULAR
             break
-        if scale_m <= terms.scale_m:
-            if _is_small(x, terms):
+        if scale_m <= settings.scale_m:
+            if _is_small(x, settings):
                 ending = CONVERGED
                 break
-            settled += 1
+            steps_at_last += 1
         moved_m += _largest_move(x, range_m)
-        last_scale_m, scale_m = scale_m, max(terms.scale_m, SHRINK * scale_m)
+        last_scale_m, scale_m = scale_m, max(settings.scale_m, SHRINK * scale_m)
     orthonormalize(T)
-    cost = now.sums[COST] - pull(prior, now.away) + 0.5 * terms.scale_m**2 * (points.shape[0] - pairs)
-    leave_out_points(voxels, partner, trust)
-    information(voxels, points, T, origin, partner, trust, terms.scale_m, now.H, trial.H)
-    return Outcome(
-        now.H,
-        trial.H,
-        cost,
-        now.sums[WEIGHTS],
-        now.sums[SQUARES],
-        pairs,
-        iterations,
-        ending,
-        origin,
-        partner,
-        trust,
-    )
+    cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
+    cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
+    H, unweighted = shape_information(problem, T)
+    return Fit(H, unweighted, cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
 
 
 @njit(cache=True, nogil=True)
-def position_of(T):
-    """Of a pose (d+1, d+1), as (3,); z is 0 in the plane."""
-    out, d = np.zeros(3), T.shape[0] - 1
-    for axis in range(d):
-        out[axis] = T[axis, d]
-    return out
+def fit_at(problem, T, fit):
+    """``Fit`` at the pose T itself, by correspondences within the last distance; cost and ending of ``fit``."""
+    settings = problem.settings
+    pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
+    _, total_weight, squares = robust_sums(
+        problem.voxels, problem.points, T, problem.correspondence, problem.weight, settings.scale_m
+    )
+    H, unweighted = shape_information(problem, T)
+    return Fit(H, unweighted, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
+
+
+@njit(cache=True, nogil=True)
+def correspond(problem, T, reach: int, max_distance_m: float):
+    """Number of correspondences of the problem at the pose T, which are associated and weighted anew."""
+    pairs = associate(problem.voxels, problem.points, T, reach, max_distance_m, problem.correspondence)
+    if pairs:
+        weigh(problem.voxels, problem.points, T, problem.correspondence, problem.settings.variance, problem.weight)
+    else:
+        problem.weight.fill(0.0)
+    return pairs
+
+
+@njit(cache=True, nogil=True)
+def shape_information(problem, T):
+    """Information (k, k) of planes and lines at the pose T, with and without robust weights.
+
+    Correspondences with a voxel that has no shape lose their weight.
+    """
+    k = 3 if problem.points.shape[1] == 2 else 6
+    for i in range(problem.correspondence.shape[0]):
+        voxel = problem.correspondence[i]
+        if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
+            problem.weight[i] = 0.0
+    H, unweighted = np.empty((k, k)), np.empty((k, k))
+    information(
+        problem.voxels,
+        problem.points,
+        T,
+        problem.origin,
+        problem.correspondence,
+        problem.weight,
+        problem.settings.scale_m,
+        H,
+        unweighted,
+    )
+    return H, unweighted
+
+
+@njit(cache=True, nogil=True)
+def refine(voxels, points, starts, poses, prior, least_share, settings):
+    """Align many scans to one map, each pose in place, unless the scan does not fit.
+
+    points : (N, d) meters of all scans, each in its own lidar frame; starts : (K + 1,) scan k is points[starts[k]
+    : starts[k + 1]]; poses : (K, d+1, d+1)
+    prior : (k, k) information of each pose as it is, twists along the map's axes, times the variance of a residual
+    least_share : of a scan's points with a correspondence, below which it does not fit
+    """
+    offset = np.zeros(prior.shape[0])
+    for k in range(poses.shape[0]):
+        scan = points[starts[k] : starts[k + 1]]
+        T = poses[k].copy()
+        problem = problem_of(voxels, scan, T, prior, settings)
+        fit = align(problem, T, offset, root_mean_square_range(scan), settings.first_scale_m)
+        if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
+            for i in range(T.shape[0]):
+                for j in range(T.shape[0]):
+                    poses[k, i, j] = T[i, j]
+
+
+@njit(cache=True, nogil=True)
+def root_mean_square_range(points) -> float:
+    """Of points (N, d) in the lidar frame; meters."""
+    total = 0.0
+    for i in range(points.shape[0]):
+        for axis in range(points.shape[1]):
+            total += points[i, axis] * points[i, axis]
+    return np.sqrt(total / max(points.shape[0], 1))
 
 
 @njit(cache=True, nogil=True)
 def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial, x, factor) -> bool:
-    """Take one step x (k,) with the present pairs; False where the equations determine none.
+    """True if one step x (k,) was taken with the present correspondences; False where H is singular.
 
     Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
     that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more. After a step by which
-    a point moves further than slack_m the normal equations are due to be made anew: none are made here.
+    a point moves further than slack_m, the normal equations are left as they are: the caller associates anew.
     """
-    terms = problem.terms
+    settings = problem.settings
     growth = 2.0
-    while step(terms.optimizer, now.H, now.b, now.sums[DAMPING], factor, x):
+    while step(settings.optimizer, now.H, now.b, now.sums[_DAMPING], factor, x):
         perturb(x, now.T, problem.origin, trial.T)
         for i in range(x.shape[0]):
-            trial.away[i] = now.away[i] + x[i]
+            trial.offset[i] = now.offset[i] + x[i]
         if _largest_move(x, range_m) > slack_m:
-            weigh_up(problem, scale_m, trial)
+            _evaluate(problem, scale_m, trial)
         else:
-            linearize(problem, scale_m, trial)
-        lowered = now.sums[COST] - trial.sums[COST]
-        if terms.optimizer != LEVENBERG_MARQUARDT or lowered >= 0.0:
+            _linearize(problem, scale_m, trial)
+        lowered = now.sums[_COST] - trial.sums[_COST]
+        if settings.optimizer != LEVENBERG_MARQUARDT or lowered >= 0.0:
             gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
-            trial.sums[DAMPING] = max(relax(now.sums[DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
-            take(now, trial)
+            trial.sums[_DAMPING] = max(relax(now.sums[_DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
+            _accept(now, trial)
             return True
-        if _is_small(x, terms) or now.sums[DAMPING] > _MOST_DAMPING:
+        if _is_small(x, settings) or now.sums[_DAMPING] > _MOST_DAMPING:
             x.fill(0.0)
             return True
-        now.sums[DAMPING] *= growth
+        now.sums[_DAMPING] *= growth
         growth *= 2.0
     return False
 
 
+@njit(cache=True, nogil=True)
+def _linearize(problem, scale_m: float, iterate):
+    """Fill the iterate's normal equations and sums at its pose, the prior included."""
+    settings = problem.settings
+    cost, total_weight, squares = normal_equations(
+        problem.voxels,
+        problem.points,
+        iterate.T,
+        problem.origin,
+        problem.correspondence,
+        problem.weight,
+        scale_m,
+        1.0 if settings.optimizer == NEWTON else 0.0,
+        iterate.H,
+        iterate.b,
+    )
+    for i in range(iterate.b.shape[0]):
+        gradient = 0.0
+        for j in range(iterate.b.shape[0]):
+            gradient += problem.prior[i, j] * iterate.offset[j]
+            iterate.H[i, j] += problem.prior[i, j]
+        iterate.b[i] += gradient
+        cost += 0.5 * gradient * iterate.offset[i]
+    iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
+
+
+@njit(cache=True, nogil=True)
+def _evaluate(problem, scale_m: float, iterate):
+    """Fill the iterate's sums at its pose, and leave its normal equations as they are."""
+    cost, total_weight, squares = robust_sums(
+        problem.voxels, problem.points, iterate.T, problem.correspondence, problem.weight, scale_m
+    )
+    cost += _prior_cost(problem.prior, iterate.offset)
+    iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
+
+
+@njit(cache=True, nogil=True)
+def _accept(now, trial):
+    """Copy the trial to the present iterate."""
+    for i in range(now.T.shape[0]):
+        for j in range(now.T.shape[0]):
+            now.T[i, j] = trial.T[i, j]
+    for i in range(now.b.shape[0]):
+        now.offset[i], now.b[i] = trial.offset[i], trial.b[i]
+        for j in range(now.b.shape[0]):
+            now.H[i, j] = trial.H[i, j]
+    for i in range(now.sums.shape[0]):
+        now.sums[i] = trial.sums[i]
+
+
+@njit(cache=True, nogil=True)
+def _prior_cost(prior, offset) -> float:
+    """½ ξᵀ prior ξ."""
+    total = 0.0
+    for i in range(offset.shape[0]):
+        for j in range(offset.shape[0]):
+            total += offset[i] * prior[i, j] * offset[j]
+    return 0.5 * total
+
+
 @njit(cache=True, inline="always")
 def _largest_move(x, range_m: float) -> float:
-    """How far a step x moves a point at that range, at most; meters."""
+    """Largest distance that a step x moves a point at that range; meters."""
     shift, turn = _squares(x)
     return np.sqrt(shift) + np.sqrt(turn) * range_m
 
 
 @njit(cache=True, inline="always")
-def _is_small(x, terms) -> bool:
+def _is_small(x, settings) -> bool:
     shift, turn = _squares(x)
-    return shift < terms.tolerance_m**2 and turn < terms.tolerance_rad**2
+    return shift < settings.tolerance_m**2 and turn < settings.tolerance_rad**2
 
 
 @njit(cache=True, inline="always")
 def _squares(x):
-    """Squared length of the shift and of the turn in a step x (k,)."""
+    """Squared length of the translation and of the rotation in a step x (k,)."""
     d = 2 if x.shape[0] == 3 else 3
     shift = turn = 0.0
     for i in range(x.shape[0]):

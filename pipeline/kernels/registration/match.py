@@ -1,4 +1,4 @@
-"""A scan matched near a prediction: aligned, held where the data tell little, and what the answer is worth."""
+"""Registration of a scan near its predicted pose, and the reliability of the result."""
 
 import math
 from typing import NamedTuple
@@ -9,61 +9,35 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.geometry.pose_log import twist_3d
 from scanchain.kernels.geometry.poses import adjoint, between, centered, inverse, twist_2d
-from scanchain.kernels.registration.association import associate
-from scanchain.kernels.registration.icp import NO_PARTNERS, align, position_of
-from scanchain.kernels.registration.linearization import leave_out_points
+from scanchain.kernels.registration.icp import (
+    NO_CORRESPONDENCES,
+    align,
+    fit_at,
+    problem_of,
+    root_mean_square_range,
+)
 from scanchain.kernels.registration.observability import (
     WEAK,
-    add,
+    add_signals,
+    agreement,
     congruent,
     definite_inverse,
-    fit_of,
-    hold,
     is_below,
     seen_from_source,
     spectrum_of,
+    weak_prior,
+    weakest_signal,
     worst,
 )
-from scanchain.kernels.registration.residuals import information, robust_sums
-from scanchain.kernels.registration.signal_to_noise import listen, weakest_signal
-from scanchain.kernels.registration.weights import weigh
 
-_DOUBTS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
+_SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
 
-class Expectation(NamedTuple):
-    """Where a scan should be: a ``Prior`` for kernels; ``is_known`` is 0 where there is none."""
-
-    T: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    widest: NDArray[np.float64]
-    is_known: int
-
-
-class Quality(NamedTuple):
-    """How well points fit a map at a pose, by the correspondences within the last gate of the search.
-
-    pairs, on_surfaces : points with a correspondence, and those of them on a plane or line
-    residual_m, fit : as in ``Match``
-    H (k, k), weights : information of planes and lines, and the sum of all weights
-    origin (3,), partner (N,), trust (N,) : as in ``Outcome``
-    """
-
-    pairs: int
-    on_surfaces: int
-    residual_m: float
-    fit: float
-    H: NDArray[np.float64]
-    weights: float
-    origin: NDArray[np.float64]
-    partner: NDArray[np.int32]
-    trust: NDArray[np.float64]
-
-
-class Answer(NamedTuple):
-    """How a matching ended; fields as in ``Match``, ``range_m`` of the points, a code of ``registration``.
+class Result(NamedTuple):
+    """Result of a registration; fields as in ``Match``, ``range_m`` of the points, ``ending`` a code of ``icp``.
 
     surface_signal : along the weakest direction, where ``signal`` does not judge it; infinite where that is strong
+    on_surfaces : correspondences with a plane or line
     """
 
     T: NDArray[np.float64]
@@ -83,144 +57,106 @@ class Answer(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def match(voxels, points, T_first, expected, terms):
-    """The ``Answer`` of points (N, d) aligned to a map from T_first (d+1, d+1), near an ``Expectation``.
+def match(voxels, points, T_first, expected, settings):
+    """``Result`` of points (N, d) aligned to a map from T_first (d+1, d+1), near a predicted pose.
 
-    The prediction counts with what holds whatever happens; where the data determine a direction weakly, the scan
-    is aligned once more, and there it counts with its own information.
+    The prior counts with its largest standard deviations. Where the scan constrains a direction weakly, it is
+    aligned once more, and along that direction the prior counts with its covariance.
+
+    expected : T_target_source (d+1, d+1), covariance (k, k) and widest (k,) as in ``Prior``; without a prediction
+        T_first, zeros and infinite
     """
     k = 3 if points.shape[1] == 2 else 6
     range_m = root_mean_square_range(points)
-    information, away, doubt_m = np.zeros((k, k)), np.zeros(k), 0.0
-    if expected.is_known:
-        for i in range(k):
-            information[i, i] = expected.widest[i] ** -2.0
-        information = _turned(information, T_first, terms.variance)
-        away = _twist_between(expected.T, T_first)
-        doubt_m = _doubt_of(expected, range_m)
-    first_scale_m = min(max(terms.first_scale_m, _DOUBTS * doubt_m), terms.widest_scale_m)
+    prior = np.zeros((k, k))
+    for i in range(k):
+        prior[i, i] = expected.widest[i] ** -2.0
+    prior = _about_target(prior, T_first, settings.variance)
+    offset = _twist_between(expected.T_target_source, T_first)
+    uncertainty_m = _uncertainty_of(expected.covariance, range_m)
+    first_scale_m = min(max(settings.first_scale_m, _SIGMAS * uncertainty_m), settings.widest_scale_m)
+    problem = problem_of(voxels, points, T_first, prior, settings)
     T = T_first.copy()
-    is_held = False
+    is_remapped = False
     while True:
-        outcome = align(voxels, points, T, away, information, range_m, first_scale_m, terms)
-        spectrum = spectrum_of(outcome.H, outcome.weights, range_m)
+        fit = align(problem, T, offset, range_m, first_scale_m)
+        spectrum = spectrum_of(fit.H, fit.total_weight, range_m)
         if points.shape[1] == 3:
-            listen(voxels, points, T, outcome, spectrum, terms)
-        if is_held or not is_below(spectrum, 0, WEAK, terms):
+            add_signals(problem, T, spectrum)
+        if is_remapped or not is_below(spectrum, 0, WEAK, settings):
             break
-        is_held = True
-        believed = information
-        if expected.is_known:
-            believed = _turned(definite_inverse(expected.covariance), T_first, terms.variance)
-        add(information, hold(spectrum, outcome.weights, believed, terms))
+        is_remapped = True
+        believed = _about_target(definite_inverse(expected.covariance), T_first, settings.variance)
+        remapped = weak_prior(spectrum, fit.total_weight, believed, settings)
+        for i in range(k):
+            for j in range(k):
+                prior[i, j] += remapped[i, j]
         T = T_first.copy()
-    quality = _quality_of(voxels, points, T, outcome, range_m, terms)
+    last = fit
+    if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
+        last = fit_at(problem, T, fit)
     surface_signal = np.inf
     if points.shape[1] == 2:
-        surface_signal = weakest_signal(voxels, points, T, quality, spectrum, terms)
-    return answer_of(T, T_first, outcome, spectrum, surface_signal, quality, range_m, terms.variance)
+        surface_signal = weakest_signal(problem, T, spectrum)
+    return _result(problem, T, T_first, fit, last, spectrum, surface_signal, range_m)
 
 
 @njit(cache=True, nogil=True)
-def judge(voxels, points, T, outcome, terms):
-    """The ``Answer`` of an outcome whose information is about T (d+1, d+1) itself.
+def assess(voxels, points, T, fit, settings):
+    """``Result`` of a fit by another method at T (d+1, d+1), its information about T itself.
 
-    The means of voxels constrain a pose in every direction, whether the surfaces do or not: what is determined is
-    therefore judged by the surfaces.
+    The means of voxels constrain a pose in every direction, whether the surfaces do or not; observability is
+    therefore that of the surfaces.
     """
-    range_m = root_mean_square_range(points)
-    quality = _quality_at(voxels, points, T, position_of(T), range_m, terms)
-    spectrum = spectrum_of(quality.H, quality.weights, range_m)
-    surface_signal = weakest_signal(voxels, points, T, quality, spectrum, terms)
-    return answer_of(T, T, outcome, spectrum, surface_signal, quality, range_m, terms.variance)
-
-
-@njit(cache=True, nogil=True)
-def _quality_of(voxels, points, T, outcome, range_m: float, terms):
-    """The ``Quality`` of an outcome: by its own correspondences, or by closer ones where the search was wider."""
-    if terms.reach != terms.last_reach or terms.max_distance_m != terms.last_distance_m:
-        return _quality_at(voxels, points, T, outcome.origin, range_m, terms)
-    residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
-    fit = fit_of(outcome.H, outcome.unweighted, range_m)
-    return Quality(
-        outcome.pairs,
-        _positive(outcome.trust),
-        residual_m,
-        fit,
-        outcome.H,
-        outcome.weights,
-        outcome.origin,
-        outcome.partner,
-        outcome.trust,
-    )
-
-
-@njit(cache=True, nogil=True)
-def _quality_at(voxels, points, T, origin, range_m: float, terms):
-    """The ``Quality`` of points (N, d) at the pose T (d+1, d+1), twists about an origin (3,)."""
     k = 3 if points.shape[1] == 2 else 6
-    partner, trust = np.empty(points.shape[0], np.int32), np.empty(points.shape[0])
-    pairs = associate(voxels, points, T, terms.last_reach, terms.last_distance_m, partner)
-    weigh(voxels, points, T, partner, terms.variance, trust)
-    _, weights, squares = robust_sums(voxels, points, T, partner, trust, terms.scale_m)
-    leave_out_points(voxels, partner, trust)
-    H, unweighted = np.empty((k, k)), np.empty((k, k))
-    information(voxels, points, T, origin, partner, trust, terms.scale_m, H, unweighted)
-    residual_m = math.sqrt(squares / weights) if weights > 0.0 else math.inf
-    fit = fit_of(H, unweighted, range_m)
-    return Quality(pairs, _positive(trust), residual_m, fit, H, weights, origin, partner, trust)
+    range_m = root_mean_square_range(points)
+    problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
+    last = fit_at(problem, T, fit)
+    spectrum = spectrum_of(last.H, last.total_weight, range_m)
+    surface_signal = weakest_signal(problem, T, spectrum)
+    return _result(problem, T, T, fit, last, spectrum, surface_signal, range_m)
 
 
-@njit(cache=True, inline="always")
-def _positive(values) -> int:
-    """How many of the values (N,) are above 0."""
-    count = 0
-    for i in range(values.shape[0]):
-        count += values[i] > 0.0
-    return count
-
-
-@njit(cache=True, inline="always")
-def answer_of(T, T_first, outcome, spectrum, surface_signal: float, quality, range_m: float, variance: float):
-    """The ``Answer`` that an outcome amounts to, turned into the source's own frame.
+@njit(cache=True, nogil=True)
+def _result(problem, T, T_first, fit, last, spectrum, surface_signal: float, range_m: float):
+    """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
     """
     m = worst(spectrum)
-    residual_m = math.sqrt(outcome.squares / outcome.weights) if outcome.weights > 0.0 else math.inf
+    residual_m = _residual_of(fit)
     information, direction = seen_from_source(
-        T, T_first, outcome.H, spectrum.vectors[:, m], max(variance, residual_m**2)
+        T, T_first, fit.H, spectrum.vectors[:, m], max(problem.settings.variance, residual_m**2)
     )
-    return Answer(
+    on_surfaces = 0
+    for i in range(problem.weight.shape[0]):
+        on_surfaces += problem.weight[i] > 0.0
+    return Result(
         T,
         information,
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
         surface_signal,
-        quality.fit,
+        agreement(last.H, last.unweighted, range_m),
         range_m,
-        quality.residual_m,
-        outcome.cost,
-        quality.pairs,
-        quality.on_surfaces,
-        outcome.iterations,
-        outcome.ending if quality.pairs else NO_PARTNERS,
+        _residual_of(last),
+        fit.cost,
+        last.pairs,
+        on_surfaces,
+        fit.iterations,
+        fit.ending if last.pairs else NO_CORRESPONDENCES,
     )
 
 
 @njit(cache=True, nogil=True)
-def root_mean_square_range(points) -> float:
-    """Of points (N, d) as the lidar sees them; meters."""
-    total = 0.0
-    for i in range(points.shape[0]):
-        for axis in range(points.shape[1]):
-            total += points[i, axis] * points[i, axis]
-    return math.sqrt(total / max(points.shape[0], 1))
+def _residual_of(fit) -> float:
+    """Root of the weighted mean squared residual, meters; infinite without correspondences."""
+    return math.sqrt(fit.squares / fit.total_weight) if fit.total_weight > 0.0 else math.inf
 
 
 @njit(cache=True, nogil=True)
-def _turned(information, T, variance: float):
+def _about_target(information, T, variance: float):
     """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
     out = congruent(adjoint(inverse(centered(T, T))), information)
     for i in range(out.shape[0]):
@@ -241,12 +177,12 @@ def _twist_between(T_from, T_to):
 
 
 @njit(cache=True, nogil=True)
-def _doubt_of(expected, range_m: float) -> float:
-    """How far a point at that range may be from where it is expected: one standard deviation, meters."""
-    k = expected.widest.shape[0]
+def _uncertainty_of(covariance, range_m: float) -> float:
+    """Standard deviation of a point at that range, by the covariance (k, k) of its pose; meters."""
+    k = covariance.shape[0]
     d = 2 if k == 3 else 3
     variance = 0.0
     for i in range(k):
         share = 1.0 / d if i < d else range_m * range_m / (k - d)
-        variance += share * expected.covariance[i, i]
+        variance += share * covariance[i, i]
     return math.sqrt(variance)

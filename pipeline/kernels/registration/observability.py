@@ -1,4 +1,4 @@
-"""What the data of an alignment determine, by direction, and what is held where they do not."""
+"""Observability of a pose: which directions its residuals constrain, and the prior where they do not."""
 
 from typing import NamedTuple
 
@@ -8,21 +8,35 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.geometry.poses import adjoint, centered
-from scanchain.kernels.registration.descent import solve
+from scanchain.kernels.registration.optimizers import solve
+from scanchain.kernels.voxels.hashing import unpack
+from scanchain.kernels.voxels.voxel_shapes import (
+    ACROSS,
+    BORN,
+    DIRECTION,
+    MEAN_TERM,
+    PLANE,
+    SHAPE,
+    SLOPE_ACROSS,
+    SLOPE_ALONG,
+    THICKNESS,
+    move,
+)
 
-WEAK = 10.0  # times the limits, below which the data alone are not believed
-_FIRM = 1e3  # times what all residuals together know of a direction
-_NOTHING = 1e-12  # of the largest eigenvalue, below which one is rounding
+WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
+_FIXED = 1e3  # times the information of all residuals, of the prior along a degenerate direction
+_ROUNDING = 1e-12  # of the largest eigenvalue, below which one is zero
+_NEVER_NOISE = 0.1  # information per weight above which a direction is not noise-induced
+_OLD = 2  # insertions since a voxel's first, from which on it counts as independent of the present scan
 
 
 class Spectrum(NamedTuple):
-    """What the data determine, by direction, about the first position and in the map's axes.
+    """Observability by direction, about the problem's origin and along the map's axes.
 
-    scale : (k,) that evens out the units: rotations count as the lengths they move a point at the scan's root mean
-        square range
+    scale : (k,) of units: rotations count as the lengths they move a point at the scan's root mean square range
     values : (k,) eigenvalues, ascending, of the information per weight; 1 is a direction that every residual sees
-    vectors : (k, k) unit eigenvectors, a column each, in evened units
-    signals : (k,) what is told along each over what errors of the normals would feign; infinite where unknown
+    vectors : (k, k) unit eigenvectors, a column each, in scaled units
+    signals : (k,) signal-to-noise ratio along each; infinite where not computed
     """
 
     scale: NDArray[np.float64]
@@ -32,26 +46,33 @@ class Spectrum(NamedTuple):
 
 
 @njit(cache=True, inline="always")
-def spectrum_of(H, weights: float, range_m: float):
-    """The spectrum of the information H (k, k) that residuals of these weights amount to."""
+def spectrum_of(H, total_weight: float, range_m: float):
+    """``Spectrum`` of the information H (k, k) of residuals with this sum of weights."""
     k = H.shape[0]
     scale = np.ones(k)
     for i in range(2 if k == 3 else 3, k):
         scale[i] = 1.0 / max(range_m, 1e-9)
-    evened, values, vectors = np.empty((k, k)), np.empty(k), np.empty((k, k))
+    scaled, values, vectors = np.empty((k, k)), np.empty(k), np.empty((k, k))
     for i in range(k):
         for j in range(k):
-            evened[i, j] = H[i, j] * scale[i] * scale[j] / max(weights, 1e-300)
-    eigensystem(evened, values, vectors)
+            scaled[i, j] = H[i, j] * scale[i] * scale[j] / max(total_weight, 1e-300)
+    eigensystem(scaled, values, vectors)
     return Spectrum(scale, values, vectors, np.full(k, np.inf))
 
 
+@njit(cache=True, inline="always")
+def _twist_of(spectrum, m: int, twist):
+    """Write direction m of the spectrum to ``twist`` (k,), in meters and radians."""
+    for i in range(twist.shape[0]):
+        twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
+
+
 @njit(cache=True, nogil=True)
-def fit_of(H, unweighted, range_m: float) -> float:
+def agreement(H, unweighted, range_m: float) -> float:
     """Share of the information that the robust kernel leaves to the direction that loses most, 0 to 1.
 
     The smallest eigenvalue of H x = λ U x, with H and U (k, k) the information with and without robust weights:
-    near 1 where the correspondences along every direction agree with the pose, low where those that determine a
+    near 1 where the correspondences along every direction agree with the pose, low where those that constrain a
     direction contradict it, however many others (the ground, as a rule) fit. Directions without information are
     left out; 0 where there is none at all.
     """
@@ -62,10 +83,10 @@ def fit_of(H, unweighted, range_m: float) -> float:
         return 0.0
     whitened, values, vectors = np.eye(k), np.empty(k), np.empty((k, k))
     for m in range(k):
-        if plain.values[m] <= _NOTHING * largest:
+        if plain.values[m] <= _ROUNDING * largest:
             continue
         for n in range(k):
-            if plain.values[n] <= _NOTHING * largest:
+            if plain.values[n] <= _ROUNDING * largest:
                 continue
             total = 0.0
             for i in range(k):
@@ -79,7 +100,7 @@ def fit_of(H, unweighted, range_m: float) -> float:
 
 @njit(cache=True, inline="always")
 def worst(spectrum) -> int:
-    """The direction that the data tell least of, above what would be feigned."""
+    """Index of the direction with the lowest signal-to-noise ratio."""
     m = 0
     for other in range(1, spectrum.values.shape[0]):
         if spectrum.signals[other] < spectrum.signals[m]:
@@ -88,38 +109,140 @@ def worst(spectrum) -> int:
 
 
 @njit(cache=True, inline="always")
-def is_below(spectrum, m: int, times: float, terms) -> bool:
-    """Whether the data tell less along a direction than so many times the least."""
-    return spectrum.values[m] < times * terms.min_information or spectrum.signals[m] < times * terms.min_signal
+def is_below(spectrum, m: int, times: float, settings) -> bool:
+    """True if direction m lies below so many times the limits of a degenerate one."""
+    return (
+        spectrum.values[m] < times * settings.min_information or spectrum.signals[m] < times * settings.min_signal
+    )
 
 
 @njit(cache=True, nogil=True)
-def hold(spectrum, weights: float, expected, terms):
-    """Information (k, k), in the kernel's units, that keeps a pose near the prediction where the data tell little.
+def weak_prior(spectrum, total_weight: float, believed, settings):
+    """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
 
-    Along directions of which the data tell nothing the pose does not move at all (Zhang, Kaess & Singh 2016). Up
-    to WEAK times the limits the information ``expected`` (k, k) of the prediction counts, against that of the data
-    without what is feigned: the share 1 − 1/signal; beyond, a vehicle that brakes may contradict any experience.
+    Along degenerate directions the pose does not move at all (solution remapping; Zhang, Kaess & Singh 2016).
+    Up to WEAK times the limits the prior's own information ``believed`` (k, k) counts, against that of the
+    residuals without its noise-induced part: the share 1 − 1/signal. Stronger directions have no prior: a vehicle
+    that brakes may contradict any prediction.
     """
-    k = expected.shape[0]
-    anchor, twist = np.zeros((k, k)), np.empty(k)
+    k = believed.shape[0]
+    prior, twist = np.zeros((k, k)), np.empty(k)
     for m in range(k):
-        if not is_below(spectrum, m, WEAK, terms):
+        if not is_below(spectrum, m, WEAK, settings):
             continue
+        _twist_of(spectrum, m, twist)
         strength = 0.0
         for i in range(k):
-            twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
-        for i in range(k):
             for j in range(k):
-                strength += twist[i] * expected[i, j] * twist[j]
+                strength += twist[i] * believed[i, j] * twist[j]
         real = 1.0 - 1.0 / max(spectrum.signals[m], 1e-300)
-        if is_below(spectrum, m, 1.0, terms) or strength > real * _FIRM * weights:
-            strength, real = _FIRM * weights, 1.0
+        if is_below(spectrum, m, 1.0, settings) or strength > real * _FIXED * total_weight:
+            strength, real = _FIXED * total_weight, 1.0
         for i in range(k):
             for j in range(k):
                 along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                anchor[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
-    return anchor
+                prior[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
+    return prior
+
+
+@njit(cache=True, inline="always")
+def add_signals(problem, T, spectrum):
+    """Fill the spectrum's signals, from the weakest direction on to the first that is not weak."""
+    twist = np.empty(spectrum.values.shape[0])
+    for m in range(spectrum.values.shape[0]):
+        _twist_of(spectrum, m, twist)
+        spectrum.signals[m] = signal_along(problem, T, twist)
+        if not is_below(spectrum, m, WEAK, problem.settings):
+            break
+
+
+@njit(cache=True, inline="always")
+def weakest_signal(problem, T, spectrum) -> float:
+    """Signal-to-noise ratio along the direction of least information; infinite where that is far from weak."""
+    if spectrum.values[0] > _NEVER_NOISE:
+        return np.inf
+    twist = np.empty(spectrum.values.shape[0])
+    _twist_of(spectrum, 0, twist)
+    return signal_along(problem, T, twist)
+
+
+@njit(cache=True, nogil=True)
+def signal_along(problem, T, twist) -> float:
+    """Signal-to-noise ratio of the information along a twist (k,) (after Hatleskog & Alexis 2024).
+
+    A normal n that was fitted to m points, of variance τ² about their plane and with eigenvalues λ' along u and λ
+    along v, is off by some δ. A correspondence of weight w, which the twist displaces by d, then has, on average,
+    the noise-induced information
+        w τ²/m ((u·d)²/λ' + (v·d)²/λ)
+    whether the direction is observable or not: where it is not, the ratio is about 1, or below.
+    The informative voxels must be independent of the scan and of each other. Where the field of view ends, the
+    points of a few rings form walls that face the lidar and move along with it. So the voxel with most information
+    does not count, nor its neighbors, nor voxels that are new in the map, as far as it has older ones.
+
+    T (d+1, d+1) : pose at which the problem's points were associated
+    """
+    voxels, points, insertions = problem.voxels, problem.points, problem.settings.insertions
+    parameters = 2.0 if points.shape[1] == 2 else 3.0
+    informative = np.zeros(points.shape[0])
+    total, noise, most, dominant = 0.0, 0.0, 0.0, -1
+    youngest = insertions - min(_OLD, insertions - 1)
+    for i in range(points.shape[0]):
+        voxel, weight = problem.correspondence[i], problem.weight[i]
+        if voxel < 0 or weight == 0.0:
+            continue
+        cell = voxels.cells[voxel]
+        dx, dy, dz = _displacement(T, points, i, problem.origin, twist)
+        along = cell[DIRECTION] * dx + cell[DIRECTION + 1] * dy + cell[DIRECTION + 2] * dz
+        beside = dx * dx + dy * dy + dz * dz - along * along
+        if cell[SHAPE] == PLANE:
+            noise += weight * _normal_variance(cell, dx, dy, dz, beside, parameters)
+        if voxels.history[voxel, BORN] <= youngest:
+            informative[i] = weight * (along * along if cell[SHAPE] == PLANE else beside)
+            total += informative[i]
+            if informative[i] > most:
+                most, dominant = informative[i], voxel
+    if dominant >= 0:
+        total -= _sum_around(voxels, dominant, problem.correspondence, informative)
+    return total / max(noise, 1e-300)
+
+
+@njit(cache=True, inline="always")
+def _displacement(T, points, i: int, origin, twist):
+    """Displacement of a point moved by T, under a twist about the origin."""
+    x, y, z = move(T, points, i)
+    x, y, z = x - origin[0], y - origin[1], z - origin[2]
+    if points.shape[1] == 2:
+        return twist[0] - twist[2] * y, twist[1] + twist[2] * x, 0.0
+    return (
+        twist[0] + twist[4] * z - twist[5] * y,
+        twist[1] + twist[5] * x - twist[3] * z,
+        twist[2] + twist[3] * y - twist[4] * x,
+    )
+
+
+@njit(cache=True, inline="always")
+def _normal_variance(cell, dx: float, dy: float, dz: float, beside: float, parameters: float) -> float:
+    """Variance of n·d by the fit of a cell's normal n, ``beside`` being the squared length of d within the plane.
+
+    τ² is estimated from m points less the parameters of the fit.
+    """
+    across = cell[ACROSS] * dx + cell[ACROSS + 1] * dy + cell[ACROSS + 2] * dz
+    m = 1.0 / cell[MEAN_TERM]
+    variance = cell[THICKNESS] * m / max(m - parameters, 1.0)
+    return variance * (cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * (beside - across * across))
+
+
+@njit(cache=True, nogil=True)
+def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
+    """Sum of the information (N,) of correspondences with a voxel or its neighbors."""
+    ix, iy, iz = unpack(voxels.keys[voxel])
+    total = 0.0
+    for i in range(correspondence.shape[0]):
+        if informative[i] > 0.0:
+            jx, jy, jz = unpack(voxels.keys[correspondence[i]])
+            if max(abs(jx - ix), abs(jy - iy), abs(jz - iz)) <= 1:
+                total += informative[i]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -136,14 +259,6 @@ def seen_from_source(T, T_first, H, direction, variance: float):
             information[i, j] /= variance
             turned[j] += Ad[i, j] * direction[i]
     return information, turned
-
-
-@njit(cache=True, nogil=True)
-def add(total, information):
-    """Add information (k, k) to ``total``, in place."""
-    for i in range(total.shape[0]):
-        for j in range(total.shape[0]):
-            total[i, j] += information[i, j]
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Normal equations of the distances between points and the local shapes they are paired with."""
+"""Normal equations of the distances between points and the shapes of their corresponding voxels."""
 
 import numpy as np
 from numba import njit
@@ -7,19 +7,19 @@ from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, SHAPE,
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, curvature: float, H, b):
-    """Linearize every residual at T and sum them up into H (k, k) and b (k,), which are overwritten.
+def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H, b):
+    """Normal equations of all residuals at T, written to H (k, k) and b (k,).
 
     With p a point moved by T, q the mean of its voxel and n the normal there, a left twist ξ = (ρ, φ) about
     ``origin`` (all lengths counted from there, so that rotation and translation stay apart), T ← exp(ξ) T,
     changes the residual by
         r = nᵀ(p − q)        ∂r/∂ξ = [nᵀ, (p × n)ᵀ]     (Chen & Medioni 1992; in 2D Censi 2008)
     On a line the residuals are the two across it, on a point shape all components of p − q. Geman–McClure
-    weighs each pair by w = (s² / (s² + r²))², r² the squared length of its residual (Geman & McClure 1985)
-    times the trust in the pair.
+    weighs each by w = (s² / (s² + r²))², r² the squared length of the residual (Geman & McClure 1985) times
+    the weight of the correspondence.
 
     points : (N, d) meters, source frame; origin : (3,), map frame
-    partner : (N,) rows of the map's voxels, −1 for none; trust : (N,) in [0, 1], what each pair counts
+    correspondence : (N,) rows of the map's voxels, −1 for none; weight : (N,) in [0, 1] of each
     scale_m : s; residuals far above it are all but ignored
     curvature : 1 adds the curvature of the motion, r nᵀ ∂²p/∂ξ², which makes H Newton's Hessian (the weights
         held fixed); 0 leaves it out
@@ -27,87 +27,86 @@ def normal_equations(voxels, points, T, origin, partner, trust, scale_m: float, 
     """
     H.fill(0.0)
     b.fill(0.0)
-    cost = weights = squares = 0.0
+    cost = total_weight = squares = 0.0
     s2 = scale_m * scale_m
     planar = points.shape[1] == 2
     for i in range(points.shape[0]):
-        voxel = partner[i]
+        voxel = correspondence[i]
         if voxel < 0:
             continue
         cell = voxels.cells[voxel]
         px, py, pz = move(T, points, i)
         ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
         px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
-        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-        shape = cell[SHAPE]
-        r2 *= trust[i]
+        r2 *= weight[i]
         ratio = s2 / (s2 + r2)
-        w = trust[i] * ratio * ratio
+        w = weight[i] * ratio * ratio
         cost += 0.5 * r2 * ratio
-        weights += w
+        total_weight += w
         squares += ratio * ratio * r2
-        if planar:
-            _add_2d(H, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
-        elif shape == PLANE:
-            _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
-        else:
-            _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+        _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar)
         if curvature > 0.0:
             _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
     _mirror(H)
-    return cost, weights, squares
+    return cost, total_weight, squares
 
 
 @njit(cache=True, nogil=True)
-def information(voxels, points, T, origin, partner, trust, scale_m: float, H, unweighted):
-    """Fill H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
+def information(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
+    """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
     H.fill(0.0)
     unweighted.fill(0.0)
     s2, b = scale_m * scale_m, np.zeros(H.shape[0])
     planar = points.shape[1] == 2
     for i in range(points.shape[0]):
-        voxel = partner[i]
+        voxel = correspondence[i]
         if voxel < 0:
             continue
         cell = voxels.cells[voxel]
         px, py, pz = move(T, points, i)
         ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
         px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
-        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-        shape = cell[SHAPE]
-        ratio = s2 / (s2 + r2 * trust[i])
-        for A, w in ((H, trust[i] * ratio * ratio), (unweighted, trust[i])):
-            if planar:
-                _add_2d(A, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
-            elif shape == PLANE:
-                _add_plane(A, b, w, px, py, pz, nx, ny, nz, along)
-            else:
-                _add_point(A, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+        ratio = s2 / (s2 + r2 * weight[i])
+        _add(H, b, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, planar)
+        _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, planar)
     _mirror(H)
     _mirror(unweighted)
 
 
 @njit(cache=True, nogil=True)
-def robust_sums(voxels, points, T, partner, trust, scale_m: float):
-    """What ``normal_equations`` returns: the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m²."""
-    cost = weights = squares = 0.0
+def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
+    """The cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m², as ``normal_equations`` returns them."""
+    cost = total_weight = squares = 0.0
     s2 = scale_m * scale_m
     for i in range(points.shape[0]):
-        voxel = partner[i]
+        voxel = correspondence[i]
         if voxel < 0:
             continue
         x, y, z = move(T, points, i)
-        r2 = trust[i] * _residual(voxels.cells[voxel], x, y, z)[4]
+        r2 = weight[i] * _residual(voxels.cells[voxel], x, y, z)[4]
         ratio = s2 / (s2 + r2)
         cost += 0.5 * r2 * ratio
-        weights += trust[i] * ratio * ratio
+        total_weight += weight[i] * ratio * ratio
         squares += ratio * ratio * r2
-    return cost, weights, squares
+    return cost, total_weight, squares
+
+
+@njit(cache=True, inline="always")
+def _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar: bool):
+    """One correspondence of weight w, by the shape of its voxel."""
+    nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+    shape = cell[SHAPE]
+    if planar:
+        _add_2d(H, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
+    elif shape == PLANE:
+        _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
+    else:
+        _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
 
 
 @njit(cache=True, inline="always")
 def _residual(cell, x, y, z):
-    """What of (x, y, z) − mean counts (3), its component along the voxel's direction, and its squared length."""
+    """Residual vector (3) of a point, its offset along the voxel's direction, and its squared length."""
     ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
     nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
     along = nx * ex + ny * ey + nz * ez
@@ -209,7 +208,7 @@ def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
 
 @njit(cache=True, nogil=True)
 def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
-    """Second derivative of eᵀ exp(ξ) p at ξ = 0, of which the first-order rows know nothing.
+    """Second derivative of eᵀ exp(ξ) p at ξ = 0.
 
     exp(ξ) p = p + φ × p + ρ + ½ φ × (φ × p) + ½ φ × ρ + …, so that the blocks are
         ½(e pᵀ + p eᵀ) − (eᵀp) I for (φ, φ), in 2D −eᵀp, and ½ φᵀ(ρ × e) for (ρ, φ).

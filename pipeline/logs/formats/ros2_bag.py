@@ -7,10 +7,6 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
-from rosbags import rosbag2
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
 from scanchain.errors import InputError
 from scanchain.logs.files import size_of
 from scanchain.logs.formats.on_demand import on_demand_index
@@ -41,6 +37,9 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
 
 def parts_of_bag(folder: Path) -> list[Path]:
     """The MCAP files of a ROS 2 bag in their order; the folder itself where it is kept otherwise or is packed."""
+    from ruamel.yaml import YAML  # a tenth of a second with rosbags, which other logs need not wait for
+    from ruamel.yaml.error import YAMLError
+
     try:
         told = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
         parts = [folder / Path(name).name for name in told["relative_file_paths"]]
@@ -112,6 +111,8 @@ class _Bag:
 
 
 def _open(path: Path) -> Any:
+    from rosbags import rosbag2
+
     try:
         reader = rosbag2.Reader(path)
         reader.open()

@@ -1,4 +1,4 @@
-"""The steps of the four optimizers, and the damping that Levenberg–Marquardt keeps between them."""
+"""Steps of the four optimizers, and the damping of Levenberg–Marquardt."""
 
 import math
 
@@ -9,13 +9,13 @@ GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
 
 @njit(cache=True, nogil=True)
 def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
-    """Write the step ξ of one iteration to ``x`` (k,); ``factor`` (k, k) is room for the factorization.
+    """True if the normal equations could be solved; the step ξ of one iteration is written to ``x`` (k,).
 
     Gradient descent    ξ = −(bᵀb / bᵀHb) b, the exact minimizer along the gradient (Cauchy's point)
     Newton              ξ = −H⁻¹b with the full Hessian; where that is indefinite the diagonal is raised
     Gauss–Newton        ξ = −(JᵀJ)⁻¹Jᵀr
     Levenberg–Marquardt ξ = −(JᵀJ + λ diag(JᵀJ))⁻¹Jᵀr (Marquardt 1963)
-    Returns whether the system could be solved.
+    factor : (k, k), room for the factorization
     """
     k = b.shape[0]
     if optimizer == GRADIENT_DESCENT:
