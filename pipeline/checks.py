@@ -17,9 +17,9 @@ from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
-_MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat
-_LATEST_S = 1e11  # of a stamp: the year 5138
-LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
+_MOST_VOXELS = float((1 << 20) - 64)  # largest distance from the origin, beyond which keys of voxels repeat
+_LATEST_S = 1e11  # latest stamp, seconds: the year 5138
+LONGEST_SWEEP_S = 10.0  # largest time between the stamp of a scan and any of its points
 
 
 def dimension(value: object, name: str = "dimension") -> int:

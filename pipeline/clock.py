@@ -1,4 +1,4 @@
-"""Compilation of kernels, once after an installation: announced, and left out of the times that are measured."""
+"""Compilation of kernels, once after an installation: announced, and subtracted from the measured times."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ event.register("numba:compile", _compilation)
 
 
 def tell_compilation() -> None:
-    """Log a warning when kernels are next compiled: a caller of the Python API would wait in silence."""
+    """Log a warning when kernels are next compiled, so that callers of the Python API know of the delay."""
     _compilation.is_silent = False
 
 

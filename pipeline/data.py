@@ -127,7 +127,7 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """The answer of a registration.
+    """Result of a registration.
 
     Attributes
     ----------

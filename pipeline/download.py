@@ -23,7 +23,7 @@ _BROKEN = (http.client.HTTPException, ConnectionError, TimeoutError, urllib.erro
 
 
 class DownloadError(ScanchainError):
-    """A file that could not be fetched; what there is of it is kept for the next try."""
+    """A file that could not be downloaded; the part received is retained for the next try."""
 
 
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> str:
@@ -47,7 +47,7 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """As much of a file as has come. Beside it lies what tells whether the server still has the same one."""
+    """The part of a file received so far, and beside it the server's validator of that version."""
 
     url: str
     path: Path
@@ -58,7 +58,7 @@ class _Part:
         return self.path.with_name(f"{self.path.name}.etag")
 
     def complete(self, progress: Progress | None) -> None:
-        """Fetch what is missing, asking again where the line breaks."""
+        """Download the missing bytes, with a new request after each interruption."""
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 if self._more(progress):
@@ -80,7 +80,7 @@ class _Part:
                 raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
     def _more(self, progress: Progress | None) -> bool:
-        """One request from the first missing byte on; whether the file is complete."""
+        """One request from the first missing byte on; True if the file is complete."""
         have = self.path.stat().st_size if self.path.exists() else 0
         validator = self.validator_path.read_text() if have and self.validator_path.exists() else ""
         have = have if validator else 0
@@ -101,7 +101,7 @@ class _Part:
 
 
 def _verify(path: Path, sha256: str, url: str) -> str:
-    """The SHA-256 of a file; one that is not what it must be is deleted."""
+    """The SHA-256 of a file; one with another than expected is deleted."""
     with path.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if sha256 and found != sha256:

@@ -62,7 +62,7 @@ def available_mib() -> float:
 
 
 def die_first() -> None:
-    """Make the kernel kill this process, not the one that watches it, when memory runs out."""
+    """Make the kernel kill this process, not its parent, when memory runs out."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
 
@@ -150,7 +150,7 @@ def _watch(process: subprocess.Popen[bytes], limits: Limits, look_s: float, stop
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Nothing of it stays, children included."""
+    """Kill the process and its children."""
     if process.poll() is None:
         family = psutil.Process(process.pid).children(recursive=True)
         process.kill()

@@ -36,8 +36,8 @@ from scanchain.odometry import FrontEnd, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
-_LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
-_GROWTH = 0.05  # of the graph, between two optimizations that change little
+_LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
+_GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -235,7 +235,7 @@ class Slam:
         return taken
 
     def _add(self, closure: Closure) -> Closure:
-        """Make an edge of a closure, which is returned with what the graph said of it before."""
+        """Make an edge of a closure; returns the closure with its innovation in the graph before."""
         config = self.config.loops
         information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
         Z_ij = closure.match.T_target_source

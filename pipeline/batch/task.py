@@ -1,4 +1,4 @@
-"""A log of a batch: its task, the process that runs it (``scanchain run``), and the row that says how it ended."""
+"""A log of a batch: its task, the process that runs it (``scanchain run``), and the row of its result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class State(StrEnum):
 
 
 class Task(Struct, frozen=True):
-    """A log and how it is run.
+    """A log to run, with arguments and limits.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Task(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The log as it is called in what is written: an address without the keys in it, spelled as text."""
+        """Name of the log in messages and tables: an address without the keys in it, spelled as text."""
         return spelled(str(source_of(self.log)))
 
     @property
@@ -145,7 +145,7 @@ _THREADS = tuple(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", 
 
 
 def attempt(task: Task, stop: Event | None = None) -> Row:
-    """Run a log, again where it crashed and has tries left; nothing it does is raised."""
+    """Run a log, again where it crashed and has tries left; raises nothing."""
     row = _tried(task, stop)
     while row.state is State.CRASHED and row.tries <= task.retries:
         row = msgspec.structs.replace(_tried(task, stop), tries=row.tries + 1)

@@ -1,4 +1,4 @@
-"""``scanchain compare``: which method is better on a log."""
+"""``scanchain compare``: comparison of methods on a log."""
 
 from __future__ import annotations
 

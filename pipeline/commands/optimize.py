@@ -188,7 +188,7 @@ def _aliases(options: dict[str, str | None]) -> list[Override]:
 
 
 def _config(settings: Sequence[Override]) -> GraphConfig:
-    """The graph's branch of the configuration; nothing else means anything here."""
+    """The graph's branch of the configuration; other keys are refused."""
     for setting in settings:
         if not setting.key.startswith("graph."):
             raise InputError(f"{setting.flag} has no meaning for optimize; its keys begin with --graph.")
@@ -196,7 +196,7 @@ def _config(settings: Sequence[Override]) -> GraphConfig:
 
 
 def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
-    """The graph, with a warning where it is not taken as it stands."""
+    """The graph, with a warning where matrices were projected."""
     from scanchain.graph.files.g2o import read_g2o
 
     with warnings.catch_warnings():

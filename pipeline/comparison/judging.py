@@ -35,7 +35,7 @@ Answer = TypeVar("Answer")
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A method against the ground truth, scan by scan.
+    """Figures of a method against the ground truth, scan by scan.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ def judge(
     truth: Trajectory | None,
     relations: Relations | None,
 ) -> Judged:
-    """A method's runs over scans of these stamps; the first whole one stands for all, times are those of all."""
+    """Figures of a method's runs over scans of these stamps: errors of the first whole one, times of all."""
     outcome = representative(outcomes)
     figures = _speed(outcomes)
     blank = np.full(len(outcome.seconds), np.nan)
@@ -93,7 +93,7 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
 
 
 def unreliable_by_itself(outcome: Outcome) -> str:
-    """Reason why a method of ours calls itself unreliable; empty if it does not, or reports no states."""
+    """Reason for which a method of ours reports itself unreliable; empty if it does not, or reports no states."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return ""
@@ -182,7 +182,7 @@ def _speed(outcomes: Sequence[Outcome]) -> Figures:
 
 
 def _stages(outcome: Outcome) -> tuple[float | None, float | None, float | None, float | None]:
-    """Seconds by stage of a method that tells; the mean for loops, most scans of which take nothing."""
+    """Seconds by stage of a method that reports them; the mean for loops, most scans of which take nothing."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return None, None, None, None

@@ -28,7 +28,7 @@ _ON_REQUEST = (
     "genz-icp-indoor",
     "genz-icp-kitti",
 )
-_BASE = "method"  # the key of a table that says what it is a variant of
+_BASE = "method"  # the key of a table that names the method it is a variant of
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
 

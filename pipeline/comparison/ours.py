@@ -1,4 +1,4 @@
-"""Our own methods in a comparison, with all they know of themselves."""
+"""Our own methods in a comparison, with the tables that only they write."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from scanchain.comparison.worker import METHOD_FILE
 from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # seconds of the default time limit: at least, and per scan
-_SHARE = 0.75  # of the memory that is free
+_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
+_SHARE = 0.75  # share of the free memory that is the default limit
 
 
 def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
@@ -68,12 +68,12 @@ def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
 
 
 _LOOK_S = 0.02
-_LAST_CHARACTERS = 300  # of the output of a process that crashed
+_LAST_CHARACTERS = 300  # last characters of the output of a process that crashed, which are reported
 _KILLED = -9
 
 
 def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> EndReport:
-    """Run a method over stored scans; its own folder takes what it writes and says."""
+    """Run a method over stored scans; its own folder takes what it writes and prints."""
     (folder / METHOD_FILE).write_bytes(msgspec.msgpack.encode(method))
     command = [sys.executable, "-P", "-m", "scanchain.comparison.worker", str(scans), str(folder)]
     # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time

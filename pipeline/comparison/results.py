@@ -42,7 +42,7 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """All runs of all methods by name, what was found of each, and the map (M, d) of each that came to its end."""
+    """All runs of all methods by name, the figures of each, and the map (M, d) of each finished one."""
 
     methods: Sequence[Method]
     scans: StoredScans
@@ -104,7 +104,7 @@ _NOTES = {
 
 @dataclass(frozen=True, slots=True)
 class RunOfMethod:
-    """A run of a method, and what was found of it."""
+    """A run of a method, and its figures."""
 
     name: str
     repeat: int
@@ -143,7 +143,7 @@ def write_relations(path: Path, judged: Mapping[str, Judged]) -> None:
 
 
 def final_poses(outcome: Outcome) -> Matrix:
-    """(M, 4, 4) the last word, or what there is of a run that failed."""
+    """(M, 4, 4) the final poses, or what there is of a run that failed."""
     poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
     broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
     return lie.lift(poses[: broken[0]] if len(broken) else poses)

@@ -1,4 +1,4 @@
-"""The table of a comparison: made of its results; as JSON, CSV, Markdown, and as text for a terminal."""
+"""The table of a comparison: made from its results; as JSON, CSV, Markdown, and as text for a terminal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TABLE_FILE = "table.json"
 
 
 class Row(Struct, frozen=True):
-    """A method: how its runs ended, what it did with which settings, and its figures.
+    """A method: end of its runs, settings, and figures.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ def read_table(folder: Path) -> Table:
 
 
 def markdown(table: Table) -> str:
-    """The summary for a README, the best of each column in bold, and below it what the columns say."""
+    """The summary for a README, the best of each column in bold, and below it the meaning of the columns."""
     columns = columns_of(table.figures, "summary")
     head = ["method", *(column.heading for column in columns)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
@@ -150,7 +150,7 @@ def _csv(table: Table) -> str:
 
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
-    """Every method's row, with what only all of them together tell: sharpness and disagreement."""
+    """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
     scans, sharp = results.scans, sharpness_of(results.maps)
     finals = [representative(results.outcomes[method.name]).trajectory.poses for method in results.methods]
     apart_m = disagreement(finals)

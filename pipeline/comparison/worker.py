@@ -51,7 +51,7 @@ class Runner(Protocol):
         ...
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The last word on all poses; what else is known goes into files of the folder."""
+        """The final trajectory; other results go into files of the folder."""
         ...
 
 
@@ -91,7 +91,7 @@ def _baseline(method: Method, dimension: int) -> Baseline:
 
 METHOD_FILE = "method.msgpack"
 _WARM_UP_SCANS = 4
-_MAX_CHARACTERS = 300  # of the message of an error raised by other code
+_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:

@@ -1,4 +1,4 @@
-"""How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
+"""Metrics of a trajectory: ATE, RPE, the KITTI metric, relations, sharpness; each with its definition."""
 
 from scanchain.evaluation.absolute import (
     AbsoluteError,

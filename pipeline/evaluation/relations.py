@@ -1,4 +1,4 @@
-"""The metric of relations: relative poses checked by hand, each compared with what the trajectory says."""
+"""The metric of relations: relative poses checked by hand, each compared with those of the trajectory."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ from scanchain.evaluation.absolute import path_length
 from scanchain.evaluation.pairing import Pairs, Statistics
 from scanchain.words import counted
 
-_LARGEST = 2.0  # times the size asked for: a stretch that is longer is one of another size
+_LARGEST = 2.0  # largest length of a stretch over the requested one
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
-_LONG_PATH_M = 200.0  # from here on the published lengths leave a choice of starts
+_LONG_PATH_M = 200.0  # length of the path from which on the published lengths leave a choice of starts
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""How sharp the map is that a trajectory makes of a log, where there is no ground truth (Razlaw et al. 2015).
+"""Sharpness of the map by a trajectory of a log, where there is no ground truth (Razlaw et al. 2015).
 
 The same points of the same scans are put where a trajectory has the lidar at their instants (between two stamps
 along the screw that joins the poses). Around the same query points, all neighbors within a radius make a
@@ -25,11 +25,11 @@ from scanchain import lie
 from scanchain.data import Points, Scan, Trajectory
 
 RADIUS_M = {2: 0.2, 3: 0.5}
-REACH_M = 40.0  # points further off are too sparse to judge by
+REACH_M = 40.0  # largest range of the points that are compared: those farther off are too sparse
 MIN_NEIGHBORS = 10
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000
-_AT_ONCE = 64  # queries whose neighbors are held in memory
-_HELD = 0.5  # share of the query points of the best map, below which a map has fallen apart
+_AT_ONCE = 64  # number of queries whose neighbors are in memory at a time
+_HELD = 0.5  # least share of the query points of the best map that another must cover to be compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Sharpness:
 
 
 def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
-    """One answer a map of ``sampled_map``, all over the same query points.
+    """Sharpness of each map of ``sampled_map``, all over the same query points.
 
     None for a map that has fallen apart: it would leave too few points to judge the others by.
     """

@@ -146,7 +146,7 @@ def _turns(positions: Matrix) -> Matrix:
 
 
 def _kept(array: NDArray[Any]) -> NDArray[Any]:
-    """A view that nobody writes into: for one kind of array a kernel is compiled once."""
+    """A read-only view: for one kind of array a kernel is compiled once."""
     view = array.view()
     view.flags.writeable = False
     return view

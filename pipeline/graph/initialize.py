@@ -16,13 +16,13 @@ from scanchain.kernels.graph.tree import follow_tree
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 
-_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the poses at hand need no better guess
+_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the given poses need no other initialization
 
 
 def first_guess(
     problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
 ) -> tuple[Matrix, Initialization]:
-    """Poses to start from, and which of the ways they come from.
+    """Initial poses, and the method that they come from.
 
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
     not every edge is trusted it keeps them in any case: no other guess is safe from a false loop.
@@ -64,7 +64,7 @@ def place_points(problem: BetweenProblem, poses: Matrix) -> Matrix:
 def _with_points(
     problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
 ) -> tuple[Matrix, Initialization]:
-    """The guess for the poses alone, and the points as they are seen from there, if that fits better."""
+    """The initial poses, with the points as observed from there, if that fits better."""
     ways = np.flatnonzero(~problem.is_point)
     place = np.cumsum(~problem.is_point) - 1
     between = np.setdiff1d(np.arange(len(problem.edges)), problem.sightings)

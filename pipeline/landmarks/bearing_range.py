@@ -13,7 +13,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.problem import LandmarkData, Values
 from scanchain.landmarks.system import Layout, LinearSystem, landmark_columns, pattern_of, pose_columns, whitening
 
-_ANCHOR = 0.01  # noise of the first pose, in shares of a step's
+_ANCHOR = 0.01  # noise of the first pose as a share of a step's
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Linearization:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Unknowns of the robot that its motions depend on, all of them alike.
+    """Unknowns common to all motions of the robot.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class Calibration:
 
 
 def no_calibration(motion: Matrix) -> Calibration:
-    """Of motions (K − 1, p) that are what they are."""
+    """Calibration without parameters, of motions (K − 1, p)."""
     return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """What a bearing-range problem is made of.
+    """Measurements of a bearing-range problem.
 
     Attributes
     ----------

@@ -21,7 +21,7 @@ Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-d
 
 
 class Loss(Protocol):
-    """What an observation costs."""
+    """Robust loss of observations."""
 
     def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
         """dρ/dχ², (N,)."""
@@ -37,7 +37,7 @@ QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a minimization ended.
+    """End of a minimization.
 
     Attributes
     ----------

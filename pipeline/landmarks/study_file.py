@@ -83,7 +83,7 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
 
 
 def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
-    """χ² over its degrees of freedom, and what that means."""
+    """χ² over its degrees of freedom, and its meaning."""
     freedom = max(rows - unknowns, 1)
     verdict = (
         "the noise model fits"

@@ -1,4 +1,4 @@
-"""Studies what one robot of an MRCLAM folder logged."""
+"""Studies the log of one robot of an MRCLAM folder."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from scanchain.landmarks.solvers import methods_for
 from scanchain.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
 from scanchain.words import counted
 
-_DOUBTED = 0.25  # of the weight of an observation as expected
-_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
+_DOUBTED = 0.25  # share of its expected weight below which an observation is reported as downweighted
+_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model fits
 
 
 def study_log(folder: Path, options: Options) -> Study:
@@ -97,7 +97,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
 
 
 def _verdict(chi2: float) -> str:
-    """χ² per degree of freedom in words."""
+    """χ² per degree of freedom as text."""
     low, high = _FITS
     verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
     return f"χ² per degree of freedom {chi2:.2f}: {verdict}"

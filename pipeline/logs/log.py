@@ -116,11 +116,11 @@ class Log:
 
     @property
     def has_odometry(self) -> bool:
-        """Whether scans carry the wheels' pose."""
+        """True if scans carry the wheels' pose."""
         return self.odometry_topic != ""
 
     def idle_keys(self) -> dict[str, str]:
-        """Settings that have no effect on this log, and why."""
+        """Settings without an effect on this log, with the reason."""
         idle: dict[str, str] = {}
         if not self._has_point_times():
             idle |= dict.fromkeys(
@@ -135,7 +135,7 @@ class Log:
         return idle
 
     def _has_point_times(self) -> bool:
-        """Whether the first scan that has returns has times of its points; of a remote log it is taken to have."""
+        """True if the first scan with returns has per-point times; assumed of a remote log."""
         if not all(isinstance(path, Path) for path in self.paths):
             return True
         config = replace(self.config, point_times="auto") if self.config.point_times == "none" else self.config
@@ -198,7 +198,7 @@ class Log:
         )
 
     def _mounting_notes(self) -> list[str]:
-        """What is assumed of the mounting. Raises InputError where a planar lidar moves out of its plane."""
+        """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
         mounting = self.mounting
         if mounting.motion is None:
             return [mounting.note] if mounting.note else []
@@ -229,7 +229,7 @@ class Log:
         return poses.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
 
     def assumed_point_times(self) -> str:
-        """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
+        """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
         times = PointTimes(self.config)
         if not is_scan(self.lidar):
             returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
@@ -274,7 +274,7 @@ class Log:
             yield waiting[0], poses.at_scan(waiting.popleft())
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
-        """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
+        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
             return LaserScanDecoder(limits, scan_reader(self.lidar))
@@ -283,7 +283,7 @@ class Log:
         return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
-        """The height of all points of the first clouds, None where it is not one."""
+        """The common height of all points of the first clouds, None where they have none."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         decoder = PointCloudDecoder(limits, PointTimes(self.config), cloud_reader(self.lidar))
         height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))

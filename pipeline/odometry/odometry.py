@@ -39,7 +39,7 @@ class _Registered:
 
 
 class Odometry:
-    """Scan-to-map odometry: one scan after another in, the pose of each out; keeps the local map."""
+    """Scan-to-map odometry: one scan after another in, the pose of each out."""
 
     def __init__(
         self, config: Config | None = None, T_base_lidar: Pose | None = None, *, dimension: int | None = None
@@ -147,14 +147,14 @@ class Odometry:
         return points, blurred(match, error), prediction
 
     def _restart(self, velocity: NDArray[np.float64]) -> Pose:
-        """Make the map anew of the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
+        """Rebuild the map from the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
         T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
         self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
         self.map.restart(self.first_points)
         return T_odom_middle
 
     def _begin_anew(self, points: Points, prediction: Prediction) -> _Registered:
-        """Forget the map, to which the scan does not belong; a new one begins where the last scan was."""
+        """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()
         match = first_match(prediction.T_odom_last, points, self.config.matching)
@@ -170,7 +170,7 @@ class Odometry:
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 
     def _extend(self, points: Points, state: State) -> None:
-        """Insert the scan where its pose is known, or where none was known for so long that the map goes on."""
+        """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
         self.recovery.take(state)
         if state is not State.LOST:
             self.map.extend(points, self.predictor.T_odom_lidar)

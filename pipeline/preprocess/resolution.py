@@ -1,4 +1,4 @@
-"""How finely a place is looked at: voxels that follow the surroundings."""
+"""Adaptive resolution: voxel sizes that follow the surroundings."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.preprocess.sweep import Sweep, sweep_of
 
-_HYSTERESIS = 0.75  # powers of two between the present scale and the wanted one, from which on it changes
-_STEP = 2.0  # by which the voxels of matching shrink or grow from one scan to the next, at most
-_LOOKS = 8  # at the first scan, at most
-_ENOUGH = 0.9  # a change to more than this share is not worth it: the choice of points would dance
+_HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
+_STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
+_LOOKS = 8  # number of times the first scan is downsampled, at most
+_ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
 
 
 class Resolution:
-    """Chooses the sizes of voxels, scan by scan.
+    """Voxel sizes chosen scan by scan.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Resolution:
         self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
 
     def look(self, scan: Scan) -> tuple[Sweep, Sweep]:
-        """What goes into the map of a scan, and what of that is matched.
+        """The scan downsampled for the map, and that once more for matching.
 
         What is found decides about the next scan; the first one is looked at again until all fits.
         """
@@ -49,7 +49,7 @@ class Resolution:
         return self.look(scan) if self.looks > 0 else (sweep, sparse)
 
     def _fit(self, points: Points) -> bool:
-        """Adapt the sizes to what was matched; whether they were right."""
+        """Adapt the sizes to the points to match; True if they fitted already."""
         before = self.scale, self.match_voxel_m
         self.scale = self._scale_for(float(np.median(np.linalg.norm(points, axis=1))))
         wish_m = self.match_voxel_m * min(

@@ -1,4 +1,4 @@
-"""What is left of a scan to be matched, as measured: each point from where the lidar was at its own instant."""
+"""A cropped and downsampled scan as measured: each point from the lidar's pose at its own instant."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scanchain.kernels.voxels import downsample as kernels
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Points of a scan, one a voxel, and when each was measured.
+    """Points of a scan, one a voxel, with their times.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Sweep:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the lidar's motion is in the points."""
+        """True if the points are distorted by the lidar's motion."""
         return len(self.times_s) > 0
 
     @property
@@ -59,7 +59,7 @@ class Sweep:
 
 
 def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
-    """The scan cropped to the range that is used and thinned out, times left out where deskewing is off.
+    """The scan cropped to the range that is used and downsampled, times left out where deskewing is off.
 
     scale : of the voxels, 1 for ``preprocess.map_voxel_m``
     """

@@ -17,7 +17,7 @@ VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closu
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
-    """A closure with its final verdict: by the matcher, or by the graph that it contradicts.
+    """A closure with its final verdict, by the matcher or by the graph.
 
     ``weight`` and ``chi2_after`` are what the optimizer left to its edge: 0 and NaN if it never became one, 1 and
     NaN until it is optimized.
@@ -31,14 +31,14 @@ class JudgedClosure:
 
     @property
     def rejected_by(self) -> str:
-        """Verification by matching, or the back end, which found it to contradict the graph; empty if accepted."""
+        """Verification by matching, or the back end where it contradicts the graph; empty if accepted."""
         if self.verdict is Verdict.ACCEPTED:
             return ""
         return BACK_END if self.closure.verdict is Verdict.ACCEPTED else VERIFICATION
 
 
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[JudgedClosure, ...]:
-    """Every closure with what became of its edge; those the graph contradicts are rejected after all.
+    """Every closure with its final verdict; those the graph contradicts are rejected.
 
     A closure accepted since the optimization that ``state`` comes from stays accepted.
     """

@@ -21,9 +21,9 @@ from scanchain.runs.step_table import STAGES, StepTable
 from scanchain.slam import SlamResult
 from scanchain.words import counted
 
-_MOST_CONTRADICTED = 0.1  # share of the scans; on real logs that went well at most 0.025
-_FEW_POINTS = 100  # points; scans of lidars, planar ones included, have more
-_NOTICEABLE_S = 0.5  # compilation time below this is not reported
+_MOST_CONTRADICTED = 0.1  # largest share of contradicted scans of a reliable run; good real runs have up to 0.025
+_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
 class Accuracy(Struct, frozen=True):

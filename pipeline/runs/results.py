@@ -47,7 +47,7 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """Everything known after the last scan of a log: what the files of a run directory are written from."""
+    """Everything known after the last scan of a log: the input of the files of a run directory."""
 
     log: Log
     config: Config
@@ -59,7 +59,7 @@ class Results:
 
 
 class Output(NamedTuple):
-    """A file of a run directory: its name, its writer, and whether the configuration asks for it."""
+    """A file of a run directory: name, writer, and the condition on the configuration."""
 
     file: str
     write: Callable[[Path, Results], None]
@@ -142,7 +142,7 @@ def cloud_of(result: SlamResult, config: Config) -> Cloud:
 
 
 def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
-    """The grid of all keyframes, coarser than asked for where the world is too large."""
+    """The grid of all keyframes, coarser than configured where the world is too large."""
     resolution_m = fitting_resolution(
         result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )

@@ -51,7 +51,7 @@ def _no_report(folder: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A finished run; ``stopped`` is the reason why it did not see the whole log, empty if it did."""
+    """A finished run; ``stopped`` is the reason why it did not process the whole log, empty if it did."""
 
     path: Path
     metrics: Metrics
@@ -132,7 +132,7 @@ def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> N
 
 
 def _idle_keys(job: Job, log: Log) -> dict[str, str]:
-    """Keys without an effect on this job, and why."""
+    """Keys without an effect on this job, with the reason."""
     recording = {} if job.sinks else {f"recording.{name}": "no recording is made" for name in _RECORDING_KEYS}
     truth = {} if job.ground_truth is None else {"log.ground_truth_topic": "--gt names a file"}
     return log.idle_keys() | recording | truth

@@ -1,4 +1,4 @@
-"""A drive before it is recorded: the place, the motion, the lidar, and which scans there will be."""
+"""A drive before it is recorded: world, motion, lidar, and stamps of its scans."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LONGEST_S = 36_000.0
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What a log is recorded from.
+    """A drive to record.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
-    """All scans but those in the holes: one second each, centered on the first moment nearest to its place."""
+    """All scans outside the dropouts: one second each, centered on the first moment nearest to its location."""
     scans = np.arange(count)
     lacking = round(_HOLE_S * 1e9 / sensor.period_ns)
     kept = np.ones(count, dtype=bool)
@@ -90,7 +90,7 @@ def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArr
 
 
 def _passed(places: Sequence[tuple[float, float]], motion: Motion, times_s: NDArray[np.floating]) -> list[int]:
-    """Index of the instant at which each place is first passed, for those that are."""
+    """Index of the instant at which each location is first passed, for those that are."""
     if not places:
         return []
     path = motion.base(times_s)[:, :2, 3]

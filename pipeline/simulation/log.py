@@ -94,7 +94,7 @@ def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
 
 
 class _Wheels:
-    """Writes the wheel odometry as the log's clock goes on."""
+    """Writer of the wheel odometry up to the log's present time."""
 
     def __init__(
         self, log: LogWriter, motion: Motion, end_ns: int, drift: float, rng: np.random.Generator

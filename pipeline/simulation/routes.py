@@ -119,7 +119,7 @@ class Pivot(NamedTuple):
 
 
 class Pivots:
-    """A dance from the origin, heading along x: ``steps`` that end as they began, over and over again."""
+    """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _BEFORE, _AFTER, _TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
 _FRAME = "#cccccc"
 _ACROSS = 4  # panels of factors in a row
-_PIXELS = 500  # of a picture of a factor, at most
+_PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _TITLE = {"loc": "left", "fontsize": 11}
 
@@ -56,7 +56,7 @@ def draw_estimate(path: Path, study: Study) -> None:
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
-    """Draw where the factor of every method is not zero, to a PNG; several problems stand side by side.
+    """Draw the nonzero entries of every method's factor to a PNG; several problems stand side by side.
 
     The place of a method that a problem was not solved by stays empty.
     """
@@ -80,7 +80,7 @@ def draw_factors(path: Path, studies: Sequence[Study]) -> None:
 
 
 def _frame(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what must be seen, and a margin."""
+    """Corners of the required view, with a margin."""
     parts = [study.true_poses, study.true_landmarks]
     for estimate in (study.before, study.after):
         parts += list(_in_truth(estimate))

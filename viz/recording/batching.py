@@ -19,7 +19,7 @@ from scanchain.viz.recording.messages import Message, Times
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
-_BLIND = 1e-3  # observability; less is drawn as that
+_BLIND = 1e-3  # least observability that is drawn
 _WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
 
 
@@ -91,7 +91,7 @@ class Batcher:
         ]
 
     def settled(self, verdicts: Verdicts, times: Times) -> list[Message]:
-        """The verdicts after the last step, whose ``times`` these are; the numbers in any case, up to there."""
+        """The verdicts after the last step, at its ``times``; their numbers in any case."""
         self.closures = None
         return [
             *_events([[(_INFORMATION, text) for text in verdicts.events]], times),
@@ -128,7 +128,7 @@ class Batcher:
         return messages
 
     def _judged(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
-        """The state where it changes, and as events why, with the verdicts on loop closures."""
+        """The state where it changes, with the reason as an event, and the verdicts on loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state

@@ -16,7 +16,7 @@ from scanchain.runs.step_table import StepRow
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
 
-_GROWTH = 1.05  # drawn anew when it grew by this factor: the recording stays linear in the length of the log
+_GROWTH = 1.05  # factor of growth between two drawings: the recording stays linear in the length of the log
 _DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
@@ -30,7 +30,7 @@ class Verdicts:
 
 
 class KeyframeGraph:
-    """Takes in every step; tells the verdicts on closures, and draws the graph when it has grown enough."""
+    """Takes in every step; returns the verdicts on closures, and draws the graph when it has grown enough."""
 
     def __init__(self) -> None:
         self.positions: list[NDArray[np.float32]] = []
@@ -41,7 +41,7 @@ class KeyframeGraph:
         self.is_current = True
 
     def add(self, step: Step) -> Verdicts:
-        """Take in a step; its closures are judged by the matcher first, then all of them by the back end."""
+        """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
         if step.keyframe >= 0:
             self.positions.append(shapes.positions(step.T_world_lidar[None])[0])
             self.is_current = False
@@ -76,7 +76,7 @@ class KeyframeGraph:
         return len(self.positions) > _GROWTH * self.drawn
 
     def draw(self, times: Times) -> list[Message]:
-        """The graph as it is known, unless it is drawn already."""
+        """Messages of the present graph, unless it is drawn already."""
         if self.is_current or not self.positions:
             return []
         self.drawn, self.is_current = len(self.positions), True
@@ -94,7 +94,7 @@ class KeyframeGraph:
         ]
 
     def _judge(self, judged: Sequence[JudgedClosure]) -> list[str]:
-        """Keep the verdicts; a line for each that is new, the number being the closure's row in loops.parquet."""
+        """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
         before = [item.verdict for item in self.judged]
         self.judged = list(judged)
         counts = Counter(item.verdict for item in judged)

@@ -232,7 +232,7 @@ class Recording:
         return [Message(entities.GRID, grid)]
 
     def _send(self, say: Callable[[], list[Message]]) -> None:
-        """Send what ``say`` has to say to every sink."""
+        """Send the messages that ``say`` returns to every sink."""
         if not self.sinks:
             return
         messages: list[Message] = []

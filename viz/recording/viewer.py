@@ -34,7 +34,7 @@ def grpc_address(port: int) -> str:
 
 
 def web_address(port: int, web_port: int) -> str:
-    """The page that shows what the server on ``port`` takes."""
+    """The page of the server on ``port``."""
     return f"http://{HOST}:{web_port}/?url={quote(grpc_address(port), safe='')}"
 
 
@@ -103,7 +103,7 @@ def _launch(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
-    """Return once the viewer listens and lives on: without a display it listens for a moment, then dies."""
+    """Return once the viewer accepts connections and stays up: without a display it exits after a moment."""
     deadline = monotonic() + _START_S
     listening_since = None
     while monotonic() < deadline:

@@ -33,7 +33,7 @@ from scanchain.viz.report.page import (
 from scanchain.words import counted
 
 _MAX_TRAJECTORIES = 60
-_MAX_POINTS = 1500  # of a line
+_MAX_POINTS = 1500  # largest number of points of a line
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
@@ -95,7 +95,7 @@ def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Sectio
 
 
 def _row(directory: Path, row: Row, name: str) -> page.Row:
-    """The figures of a log, or why it has none."""
+    """The figures of a log, or the reason for none."""
     m, link = row.metrics, _link(directory, row)
     if m is None:
         return page.Row(name, (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)

@@ -42,7 +42,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
 
 
 def _problem(directory: Path, study: Study) -> dict[str, object]:
-    """Draw one problem and gather what the page says of it."""
+    """Pictures and figures of one problem for the page."""
     stem = file_stem(study.name)
     estimate, factors = directory / f"{stem}.png", directory / f"{stem}_factors.png"
     draw_estimate(estimate, study)

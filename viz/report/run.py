@@ -1,4 +1,4 @@
-"""report.html of a run, made of what lies in its directory."""
+"""report.html of a run, made of the files in its directory."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _summary_lines(directory: Path) -> list[str]:
 
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """The result first, what it took last."""
+    """Facts of a run: the result first, its cost last."""
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
@@ -91,7 +91,7 @@ def _accuracy(m: Metrics) -> str:
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
-    """Accuracy, trajectory and map, closures, errors, certainty; time last."""
+    """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")

@@ -138,7 +138,7 @@ def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) ->
 
 
 def loop_section(trajectory: DrawnTrajectory, path: Path, title: str) -> Iterator[Section]:
-    """Every loop closure tried, and how many of them met which verdict."""
+    """Every loop closure tried, and the number of each verdict."""
     if not path.exists():
         return
     table = pq.ParquetFile(path).read()  # read_table imports much more
@@ -189,7 +189,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
 
 
 def _millimeters(value_m: float) -> str:
-    """– for what no point has."""
+    """Millimeters as text, – without a value."""
     return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
@@ -198,7 +198,7 @@ def _with(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajec
 
 
 def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Collapsible]:
-    """The command, and the versions that it ran with."""
+    """The command, and the versions of its packages."""
     yield Collapsible("Command", shlex.join(made.command))
     versions = {"python": made.python} | made.versions | others
     yield Collapsible(

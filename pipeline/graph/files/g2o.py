@@ -1,4 +1,4 @@
-"""Pose graphs read from g2o text (SE2, SE3:QUAT, XY, SE2_XY, FIX) or TORO's; other lines are kept as they are."""
+"""Pose graphs read from g2o text (SE2, SE3:QUAT, XY, SE2_XY, FIX) or TORO's; other lines are retained."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Indefinite = Literal["project", "refuse"]
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Which edges of a file have an indefinite information matrix, and what projecting it changed.
+    """Edges of a file with an indefinite information matrix, and the change by projecting it.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Projection:
 
     @property
     def text(self) -> str:
-        """One line for people."""
+        """The projection as one line of text."""
         return (
             f"{self.edges:,} of {self.of:,} edges have an indefinite information matrix, which is no inverse "
             "covariance; each was projected to the nearest positive semidefinite one, which changed it by "
@@ -71,7 +71,7 @@ class G2oFile:
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
-        """Tags that were not understood, with how many lines of each."""
+        """Tags that are not supported, with the number of lines of each."""
         return tuple(Counter(line.split(maxsplit=1)[0] for line in self.other_lines).items())
 
 
@@ -141,7 +141,7 @@ def _indefinite(path: Path, rows: Rows, information: Matrix, indefinite: Indefin
 
 
 def _project(kinds: list[_Indefinite], edges: int) -> Projection | None:
-    """Put the nearest semidefinite matrices in place of the indefinite ones, with a warning; what that changed."""
+    """Replace indefinite matrices by the nearest semidefinite ones, with a warning; returns the changes."""
     off = []
     for kind in kinds:
         before = kind.information[kind.which]

@@ -127,7 +127,7 @@ def _toro(poses: Matrix) -> list[list[float]]:
 
 
 def _triangles(graph: PoseGraph, edges: Chosen) -> tuple[NDArray[np.bool_], list[list[float]]]:
-    """Which edges are chosen, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
+    """Chosen edges, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
     upper = np.triu_indices(graph.freedom)
     triangles = graph.information[:, upper[0], upper[1]]
     if edges == "rejected":

@@ -13,8 +13,8 @@ from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.covariance import difference_covariance
 
-_MARGIN = 6.0  # over what a pessimistic noise model would allow: residuals have longer tails than the normal law
-_FEWEST = 10  # kept edges that say something about the noise model
+_MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals have long tails
+_FEWEST = 10  # least number of inlier edges from which a noise model is estimated
 _ROUNDING = 1e-9  # keeps an edge without which its poses would be loose from a division by zero
 
 
@@ -54,7 +54,7 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
 
 
 def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_], price: float) -> Matrix:
-    """How much of the whole graph's χ² each edge costs, or would cost were it kept, (E,), to first order.
+    """Share of each edge in the χ² of the whole graph, or its rise were the edge an inlier, (E,), to first order.
 
     It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
     predict: with P the covariance of the prediction, given all kept edges,

@@ -12,7 +12,7 @@ _Index = NDArray[np.int64]
 def product_structure(
     row_start: _Index, columns: _Index, column_start: _Index, rows: _Index
 ) -> tuple[_Index, _Index, _Index]:
-    """Find which pairs of columns share a row, and where each product of two entries of a row goes.
+    """Pairs of columns that share a row, and the destination of each product of two entries of a row.
 
     row_start (m + 1,), columns : columns in each row, each once; column_start (n + 1,), rows : rows in each column
     Returns start (n + 1,), partners, slots: pair p of column v, for start[v] ≤ p < start[v + 1], is
@@ -52,7 +52,7 @@ def product_structure(
 def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, slots: _Index, H: _Array, g: _Array
 ) -> None:
-    """Fill H = AᵀA, in the order that ``slots`` says, and g = Aᵀb.
+    """Fill H = AᵀA, in the order of ``slots``, and g = Aᵀb.
 
     row_start (m + 1,), columns, values : A by rows; b (m,); H (n + pairs,), g (n,) filled
     """

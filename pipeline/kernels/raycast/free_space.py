@@ -1,9 +1,9 @@
-"""Points held against what a lidar saw elsewhere: on its surfaces, behind them, or where it looked through."""
+"""Points compared with the ranges of a lidar elsewhere: on its surfaces, behind them, or in its free space."""
 
 import numpy as np
 from numba import njit
 
-FAR = 1e9  # m, in bins that no ray fell into
+FAR = 1e9  # m, range of bins that no ray fell into
 
 
 @njit(cache=True, nogil=True)
@@ -22,7 +22,7 @@ def nearest_ranges(points, ranges_m):
 
 @njit(cache=True, nogil=True)
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
-    """How many points (N, 3), moved by T (4, 4) into the lidar's frame, agree with its ranges and contradict.
+    """Numbers of points (N, 3), moved by T (4, 4) into the lidar's frame, that agree and that contradict.
 
     A point agrees where its range is that of its bin, within the margin: so many meters and such a share of the
     range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.
@@ -49,7 +49,7 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
 
 @njit(cache=True, nogil=True)
 def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_through):
-    """Count, for each point, whether one scan saw a surface there or looked through it.
+    """Count, for each point, the scan as one that saw a surface there or saw through it.
 
     All rays that pass within half the window of the point, to its sides and above it, are looked at; below it, a
     single bin, or else the ground would vouch for what goes over it. The point was seen where the nearest of them
@@ -83,7 +83,7 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_throug
 
 @njit(cache=True, inline="always")
 def _sight(x, y, z, ranges_m, limits):
-    """1 where a point in the lidar's frame was seen, −1 where it was looked through, else 0."""
+    """1 where a point in the lidar's frame was seen, −1 where it lies in free space, else 0."""
     reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
     if x * x + y * y + z * z > reach_m * reach_m:
         return 0

@@ -117,7 +117,7 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 
 
 def _kind(poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
-    """What the true positions fit better: median distance of the measured point from the true one."""
+    """Kind of the measurements: least median distance of the measured point from the true position."""
     true = landmarks[observed[:, 1]] - poses[observed[:, 0]]
     bearing, reach = measured.T
     polar = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], axis=1)

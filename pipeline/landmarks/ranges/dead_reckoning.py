@@ -1,4 +1,4 @@
-"""Dead reckoning between the observations of a log: motions, their uncertainty and what they depend on."""
+"""Dead reckoning between the observations of a log: motions, their uncertainty and their Jacobians."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are ta
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoise:
-    """White noise of a robot's wheels: what its motion is off by after a meter, and after a radian turned.
+    """White noise of a robot's wheels: standard deviations of its motion after a meter, and after a radian turned.
 
     It grows with the root of either. The values at hand are of a small differential drive on a smooth floor.
     """
@@ -89,7 +89,7 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 def _integrated(
     log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64], *, sources: int
 ) -> tuple[Matrix, Matrix]:
-    """Motions (K − 1, 3) and what so many sources of noise do to them (K − 1, sources, 3, 3)."""
+    """Motions (K − 1, 3) and their Jacobians by so many sources of noise (K − 1, sources, 3, 3)."""
     v, turn_rate = log.velocities.T
     driven = np.stack(
         [(1.0 + own[0]) * v + own[1] * np.abs(turn_rate), (1.0 + own[2]) * turn_rate + own[3] * v], axis=1

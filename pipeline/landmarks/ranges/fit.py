@@ -28,7 +28,7 @@ _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of Ï
 
 
 class LogModel:
-    """What of a log's problem does not depend on its noise: nodes, landmarks, who saw what."""
+    """The part of a log's problem independent of its noise: nodes, landmarks, observations."""
 
     def __init__(self, log: RangeLog) -> None:
         self._log = log
@@ -58,7 +58,7 @@ class LogModel:
 
 @dataclass(frozen=True, slots=True)
 class LogFit:
-    """A minimum, the noise it was found for, and what follows from both.
+    """A minimum, the noise it was found for, and their consistency.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class LogFit:
 
 
 def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) -> LogFit:
-    """Estimate state and noise; that of the odometry stays what it is unless it is None.
+    """Estimate state and noise; that of the odometry is fixed unless it is None.
 
     Raises InputError where the observations tell nothing of the sensor's.
     """
@@ -118,7 +118,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
 
 @dataclass(frozen=True, slots=True)
 class _Settled:
-    """A minimum, the covariance there, and what its residuals say."""
+    """A minimum, the covariance there, and the consistency of its residuals."""
 
     minimum: Minimum
     covariance: Covariance
@@ -134,7 +134,7 @@ def _settled(
     solver: LinearSolver,
     tolerance: float,
 ) -> _Settled:
-    """The minimum with noise as it is."""
+    """The minimum for a given noise."""
     minimum = minimize(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )

@@ -21,7 +21,7 @@ from scanchain.landmarks.system import landmark_columns, pose_columns
 
 @dataclass(frozen=True, slots=True)
 class RangeSolution:
-    """What became of a range log.
+    """Solution of a range log.
 
     Attributes
     ----------

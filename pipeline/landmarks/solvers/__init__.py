@@ -54,7 +54,7 @@ def parse_methods(text: str) -> tuple[str, ...]:
 
 
 def methods_for(asked: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:
-    """Methods to run on a problem of so many unknowns, and what is to be said of one that "all" leaves out there.
+    """Methods to run on a problem of so many unknowns, and a note on one that "all" leaves out there.
 
     "all" is every method of the default installation. Raises InputError where one is named that is too slow.
     """

@@ -21,7 +21,7 @@ Ordering = Literal["natural", "colamd"]
 
 @dataclass(frozen=True, slots=True)
 class _Analysis:
-    """What follows from the pattern: the asked order, the place of each column, fronts, and their rows of A."""
+    """Analysis of the pattern: requested order, position of each column, fronts, and their rows of A."""
 
     order: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -33,7 +33,7 @@ class _Analysis:
 
 
 class QrSolver:
-    """Householder QR of the project's own; its analysis is kept while the pattern is the same."""
+    """Householder QR of the project's own; its analysis is reused while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering
@@ -101,7 +101,7 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
 def _neighbor_lists(
     start: NDArray[np.int64], partners: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every column's partners on either side, from those beyond it: (start (n + 1,), neighbors)."""
+    """Every column's neighbors on either side, from those beyond it: (start (n + 1,), neighbors)."""
     n = len(start) - 1
     beyond = csr_matrix((np.ones(len(partners), np.int8), partners, start), shape=(n, n))
     both = csr_matrix(beyond + beyond.T)

@@ -19,17 +19,17 @@ from scanchain.logs.doctor.statistics import LEAST_S, Rest, Survey
 from scanchain.words import counted
 
 _MANY_LOST = 0.5
-_MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use
-_SOME_BELOW = 0.05  # of beams, below range_min
-_STUCK_SHARE = 0.01  # of beams, all at the farthest range
+_MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
+_SOME_BELOW = 0.05  # share of beams below range_min that is reported
+_STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _LONG_REST_S = 5.0
-_WHEELS_MOVE = 0.02  # meters, or the sine of a turn
+_WHEELS_MOVE = 0.02  # least motion by the wheels that ends a rest: meters, or the sine of a turn
 _FEW_POINTS = 50
-_OPEN = 0.003  # information about the weakest motion, below which matches are degenerate as a rule
+_OPEN = 0.003  # information about the weakest motion, below which matches are usually degenerate
 
 _VOXEL_M = 0.5  # at most one point in each, in 3D: else the ground near the lidar outweighs all else
-_POINTS = 1500  # whose normals are estimated, at most
-_NEIGHBORS = {2: 7, 3: 10}  # of a point, for its normal
+_POINTS = 1500  # largest number of points whose normals are estimated
+_NEIGHBORS = {2: 7, 3: 10}  # number of neighbors from which a point's normal is estimated
 _FLAT = 0.02  # largest ratio of the two least eigenvalues of the covariance of neighbors on a surface
 _LINE = 0.03  # least ratio of the two largest ones: neighbors on one ring make no surface
 _FEW_SURFACES = 20
@@ -119,7 +119,7 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
 
 
 def _no_return(seen: Survey) -> Finding:
-    """Whether many beams tell one farthest range, as scanners do that write a number for no return."""
+    """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
     farthest_m = max(values, default=0.0)
     below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
@@ -155,7 +155,7 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
 
 
 def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
-    """Whether the surfaces in sight determine every motion; a run judges this by matching, scan by scan."""
+    """Finding on surfaces that leave a motion unobservable; a run tests this by matching, scan by scan."""
     found = [weakest_motion(sample, preprocess) for sample in seen.samples]
     open_motions = Counter(each.direction for each in found if each.information < _OPEN)
     bad = open_motions.total()
@@ -195,7 +195,7 @@ def _duplicates(seen: Survey) -> Finding:
 
 
 def _rest(seen: Survey) -> Finding:
-    """How long the surroundings do not change and the wheels, where there are any, do not move."""
+    """Finding on the time during which neither the surroundings change nor the wheels, if any, move."""
     rests = [_until_wheels_move(seen, rest) for rest in seen.rests]
     rests = [rest for rest in rests if rest.duration_s >= LEAST_S]
     still_s = sum(rest.duration_s for rest in rests)
@@ -216,7 +216,7 @@ def _rest(seen: Survey) -> Finding:
 
 
 def _until_wheels_move(seen: Survey, rest: Rest) -> Rest:
-    """The rest up to where the wheels tell a motion."""
+    """The rest up to the first motion by the wheels."""
     begin_ns, end_ns = seen.stamps_ns[rest.first], seen.stamps_ns[rest.last]
     poses = [pose for pose in seen.wheels if begin_ns <= pose.stamp_ns <= end_ns]
     for pose in poses:
@@ -256,7 +256,7 @@ def _mounting(seen: Survey) -> Finding:
 
 
 class Weakest(NamedTuple):
-    """The motion that a scan's surfaces determine least: 0 to 1, relative to one that all constrain; and which."""
+    """The least observable motion of a scan: its relative information, 0 to 1, and its name."""
 
     information: float
     direction: str

@@ -25,7 +25,7 @@ from scanchain.source import Source
 from scanchain.words import counted
 
 _LINES_A_BLOCK = 512
-_LEAST_STEP_NS = 100_000  # between the log times of two scans
+_LEAST_STEP_NS = 100_000  # least step between the log times of two scans
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
@@ -34,13 +34,13 @@ _LEAST_CODE_M = 81.83  # of a SICK LMS: from 8183 up its 13 bits are codes, such
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
 _HALF_TURN = math.pi
 
-_MOST_BYTES = 2 << 30  # of text
-_PLAIN_BYTES = 1 << 20  # read at once
+_MOST_BYTES = 2 << 30  # largest size of the text in bytes
+_PLAIN_BYTES = 1 << 20  # bytes read at once
 _PACKED_BYTES = 64  # unpacked at once: what comes of so many before damage is lost with it
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
-    """Whether a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
+    """True if a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
     word = head.split(maxsplit=1)[0] if head.strip() else b""
     is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
     return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
@@ -165,7 +165,7 @@ def _complaint(path: Source, malformed: list[int]) -> str:
 
 
 class Line(NamedTuple):
-    """Where a line lies in the text, of which kind it is, and at which log time it counts."""
+    """Offset of a line in the text, its kind, and its log time."""
 
     kind: bytes
     begin: int
@@ -184,7 +184,7 @@ class CarmenScan(NamedTuple):
 
 
 def stamp_of(words: list[bytes]) -> int:
-    """Nanoseconds of a line's own stamp, the third word from behind, held as the double that CARMEN keeps.
+    """Nanoseconds of a line's own stamp, the third word from behind, as a double like in CARMEN.
 
     Raises ValueError or IndexError where that is none.
     """
@@ -250,7 +250,7 @@ def _mounting(laser: list[float], robot: list[float]) -> Place:
 
 
 class Text(NamedTuple):
-    """What a file unpacks to; ``damage`` says what is wrong with the rest, empty where all is well."""
+    """Unpacked text of a file; ``damage`` describes what is missing, empty where all is well."""
 
     data: bytes
     damage: str
@@ -265,7 +265,7 @@ class _Unpacker(Protocol):
 
 
 def read_text(path: Path) -> Text:
-    """The text of a file. Raises InputError where it cannot be read or unpacks to more than is believed."""
+    """The text of a file. Raises InputError where it cannot be read or unpacks to more than the limit."""
     text = bytearray()
     try:
         with path.open("rb") as file:
@@ -295,7 +295,7 @@ def _pieces(file: IO[bytes]) -> Iterator[bytes]:
 
 
 def _unpacked(file: IO[bytes], begin: Callable[[], _Unpacker]) -> Iterator[bytes]:
-    """What comes out of one packed stream after the other. Raises EOFError where the last is cut off."""
+    """Unpacked blocks of one packed stream after the other. Raises EOFError where the last is cut off."""
     unpacker = begin()
     while packed := file.read(_PACKED_BYTES):
         while packed:

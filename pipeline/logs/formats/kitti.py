@@ -22,22 +22,22 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
-_TRUTH = -1  # the block of the ground truth
+_TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720
 Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
-_MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
+_MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
 _NS = 1_000_000_000
 
 
 def claims_kitti_raw(path: Path, _: bytes) -> bool:
-    """Whether it is the folder of a drive."""
+    """True for the folder of a drive."""
     return (path / "velodyne_points").is_dir()
 
 
 def claims_kitti_odometry(path: Path, _: bytes) -> bool:
-    """Whether it is the folder of a sequence."""
+    """True for the folder of a sequence."""
     return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
 
 
@@ -87,7 +87,7 @@ def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) ->
 
 
 def _truth_or_none(index: FileIndex, read: Callable[[], Truth]) -> Truth:
-    """The ground truth; none where its files are damaged, which the sweeps do not suffer from."""
+    """The ground truth; none where its files are damaged, as the sweeps do not need it."""
     try:
         return read()
     except (InputError, LinAlgError) as error:

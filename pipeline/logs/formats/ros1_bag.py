@@ -32,9 +32,9 @@ T = TypeVar("T", int, NDArray[np.int64])
 Data = mmap.mmap | memoryview | bytes
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
-_LONGEST_HEAD = 1 << 16  # bytes; a longer one is damage
-_OPCODE = re.compile(rb"\x04\0\0\0op=[\x04\x05\x07]")  # of an index, a chunk, a connection
-_MOST_BEFORE = 256  # bytes of a head before its opcode
+_LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
+_OPCODE = re.compile(rb"\x04\0\0\0op=[\x04\x05\x07]")  # opcode of an index, a chunk, a connection
+_MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
 
 _INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
 
@@ -91,7 +91,7 @@ def channel_of(file: int, record: Record, data: Data) -> Channel:
 
 
 def whole_records(data: Data) -> Iterator[Record]:
-    """One record after the other. Raises struct.error where what follows is none, or not all of one."""
+    """One record after the other. Raises struct.error at bytes that are no record, or not all of one."""
     offset = 0
     while offset < len(data):
         record = read_record(data, offset)
@@ -118,7 +118,7 @@ def next_record(data: Data, offset: int, believed: int) -> Record | None:
 
 
 def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
-    """The fields of a head by name, None where it is not made of fields."""
+    """The fields of a record's head by name, None where it is not made of fields."""
     fields: dict[bytes, bytes] = {}
     offset = 0
     while offset < len(head):
@@ -139,7 +139,7 @@ class _Span(NamedTuple):
 
 
 def _sized(data: Data, offset: int) -> _Span | None:
-    """Where the bytes lie that have their length before them."""
+    """Span of the bytes behind their own length."""
     if offset + _LENGTH.size > len(data):
         return None
     begin = offset + _LENGTH.size
@@ -147,12 +147,12 @@ def _sized(data: Data, offset: int) -> _Span | None:
 
 
 def claims_ros1_bag(_: Path, head: bytes) -> bool:
-    """Whether a file begins as a bag of any version does."""
+    """True if a file begins as a bag of any version does."""
     return head.startswith(b"#ROSBAG")
 
 
 def index_ros1_bag(path: Path, number: int) -> FileIndex:
-    """What lies where in a bag. Raises InputError for one that is empty, encrypted or of an old version."""
+    """Index of a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
@@ -200,7 +200,7 @@ class _Bag:
         self._close(complete=True)
 
     def finish(self) -> None:
-        """Count what there is, opening the chunks that nothing tells about."""
+        """Count the messages, opening the chunks without a complete index."""
         index = self.index
         is_doubtful = bool(self.told) and self.told != _counts(index.blocks)
         index.blocks = [
@@ -235,7 +235,7 @@ class _Bag:
         )
 
     def _is_known(self, block: Block) -> bool:
-        """Whether it is known what a chunk holds, and all its connections are."""
+        """True if the counts of a chunk are known, and all its connections are."""
         return bool(block.entries) and all(entry.channel in self.index.channels for entry in block.entries)
 
     def _take(self, record: Record) -> None:
@@ -278,7 +278,7 @@ class _Bag:
         self.chunk = Block(index.number, record.begin, size, compression, claimed, 0, 0, 0, is_cut=is_cut)
 
     def _index(self, record: Record) -> None:
-        """How many messages of a connection the chunk before holds, and when they came."""
+        """Add the number and times of a connection's messages in the chunk before."""
         times = np.frombuffer(self.index.data, _INDEX_TIMES, record.number(b"count"), record.begin)
         if len(times) and self.chunk is not None:
             self.entries.append(Entry(record.number(b"conn"), -1, len(times)))
@@ -289,7 +289,7 @@ class _Bag:
         self.index.channels.setdefault(channel.key[1], channel)
 
     def _close(self, *, complete: bool) -> None:
-        """The chunk is over; what does not tell all of its messages is not believed."""
+        """End the chunk; an index that does not cover all of its messages is discarded."""
         if self.chunk is not None:
             block = self.chunk
             if complete and self.is_sure and self.entries:

@@ -18,14 +18,14 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.writing.pack import schema_text
 from scanchain.words import counted
 
-_BLOCK_BYTES = 8_000_000  # about, of the file
+_BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
 _MOST_BLOCKS = 4096
-_MOST_TRIES = 400  # to read parts of a damaged block
+_MOST_TRIES = 400  # largest number of tries to read parts of a damaged block
 _LATEST_NS = (1 << 63) - 1
 
 
 def claims_ros2_bag(path: Path, head: bytes) -> bool:
-    """Whether it is an SQLite file, or a folder with a bag's metadata."""
+    """True for an SQLite file, or a folder with a bag's metadata."""
     return head.startswith(b"SQLite format 3\0") or (path / "metadata.yaml").is_file()
 
 
@@ -40,7 +40,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
 
 
 def parts_of_bag(folder: Path) -> list[Path]:
-    """The MCAP files of a ROS 2 bag in their order; the folder itself where it is kept otherwise or is packed."""
+    """The MCAP files of a ROS 2 bag in their order; the folder itself for another storage or a packed bag."""
     try:
         told = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
         parts = [folder / Path(name).name for name in told["relative_file_paths"]]
@@ -94,7 +94,7 @@ class _Bag:
         return Contents(messages, f"{self.index.path}: {what}" if lost else "")
 
     def _ends(self, block: Block) -> tuple[int, int]:
-        """From when to when a block lasts; the first and the last reach as far as time, whatever the bag says."""
+        """First and last time of a block; the first and the last reach as far as time, whatever the metadata."""
         is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
         return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
 
@@ -128,7 +128,7 @@ def _reason(error: Exception) -> str:
 
 
 def _is_sound(connection: Any) -> bool:
-    """Whether what a bag tells of a topic is of the right kind."""
+    """True if the metadata of a topic is of the right types."""
     texts = connection.topic, connection.msgtype, connection.ext.serialization_format
     return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
 
@@ -142,7 +142,7 @@ def _channel(key: tuple[int, int], connection: Any) -> Channel:
 
 
 def _definition(type_name: str) -> bytes:
-    """What a type looks like that an old bag does not define, empty where nobody here knows."""
+    """Definition of a type that an old bag does not define, empty for an unknown type."""
     try:
         return schema_text(type_name)
     except (KeyError, ValueError):

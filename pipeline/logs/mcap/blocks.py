@@ -32,7 +32,7 @@ class DamagedBlockError(Exception):
 
 
 def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
-    """The messages of a block, of all channels or of those wanted; channels met on the way join the index.
+    """The messages of a block, of all channels or of those wanted; channels found there join the index.
 
     Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
@@ -71,7 +71,7 @@ def unpack(index: FileIndex, block: Block) -> memoryview:
 
 
 def release(index: FileIndex, block: Block) -> None:
-    """Let go of a block's bytes of the file, so that memory does not grow with what has been read."""
+    """Release a block's bytes of the file, so that memory does not grow with what has been read."""
     if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
         begin = block.offset - block.offset % mmap.PAGESIZE
         index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
@@ -118,7 +118,7 @@ def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
 
 
 def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
-    """As much as the beginning of a chunk unpacks to; nothing of it has been checked."""
+    """The unpacked beginning of a chunk, as far as it unpacks; nothing of it has been checked."""
     stored, _ = index.stored(block)
     try:
         if block.compression == "zstd":

@@ -39,19 +39,19 @@ from scanchain.source import Source
 from scanchain.words import counted
 
 FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
-_LARGEST_CHUNK = 1 << 30  # bytes; a size beyond is taken for damage, not believed
-_MODEST_CHUNK = 1 << 25  # bytes; a larger one is believed where it is at most
-_MOST_TIMES = 20  # times as large as what is stored
+_LARGEST_CHUNK = 1 << 30  # largest size of a chunk in bytes; one beyond is damage
+_MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is accepted at any ratio
+_MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
 _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
 
 
 def claims_mcap(path: Path, head: bytes) -> bool:
-    """Whether a file begins as MCAP does, or has nothing to begin with, which is refused as a file of MCAP."""
+    """True if a file begins as MCAP does, or is empty, which is refused as a file of MCAP."""
     return head.startswith(MAGIC) or not (head or path.is_dir())
 
 
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
-    """Walk one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
+    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
 
     source : what it is a copy of, and is called in what is said of it; None for itself
     """
@@ -115,7 +115,7 @@ class Walk:
         self._take(opcode, offset, length)
 
     def finish(self, offset: int) -> None:
-        """End the walk at this byte; where a record is cut off there, what is there of a chunk is kept."""
+        """End the walk at this byte; of a chunk that is cut off there the beginning is retained."""
         index, size = self.index, len(self.index.data)
         if is_end(index.data, offset):
             self.close(offset, complete=True)
@@ -135,7 +135,7 @@ class Walk:
             self.close(offset, complete=False)
 
     def close(self, offset: int, *, complete: bool) -> None:
-        """End the chunk or the run of loose messages at this byte; incomplete entries are not believed."""
+        """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
         if self.chunk is not None:
             entries = tuple(self.entries) if complete else ()
             self.index.blocks.append(replace(self.chunk, entries=entries))
@@ -237,12 +237,12 @@ class Walk:
 
 
 def is_believable(size: int, uncompressed: int) -> bool:
-    """Whether a chunk of so many bytes may be as large as it claims once it is unpacked."""
+    """True if a chunk of so many bytes may unpack to the size that its record states."""
     return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
 
 
 def _is_summary_sound(index: FileIndex, summary: int) -> bool:
-    """Whether the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
+    """True if the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
     data = index.data
     footer = len(data) - len(MAGIC) - FOOTER_BODY.size - RECORD.size
     if footer < summary or data[-len(MAGIC) :] != MAGIC or data[footer] != FOOTER:
@@ -255,7 +255,7 @@ def _is_summary_sound(index: FileIndex, summary: int) -> bool:
 
 
 def check_claims(index: FileIndex, chunks_told: int, private: Sequence[int]) -> None:
-    """Trust what blocks say about their channels where it adds up to the statistics; note what does not.
+    """Accept the counts of blocks by channel where they add up to the statistics; note where they do not.
 
     chunks_told : by the statistics; private : where records of unknown kinds lie
     """

@@ -1,4 +1,4 @@
-"""Byte ranges of a remote file that are known to be wanted: fetched in large pieces, ahead of who reads them."""
+"""Read-ahead of a remote file: byte ranges that will be read, downloaded in large parts."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
-_PIECE_BYTES = 4_000_000  # neighbors are fetched together up to this size
-_GAP_BYTES = 65_536  # read along with what lies on both sides of it, as asking anew takes longer
-_AHEAD = 3  # pieces
-_KEPT = 2  # pieces behind, as threads that read them overtake each other
-_REPEATED = 4  # ranges that nobody told of are kept: the first blocks are looked at more than once
+_PIECE_BYTES = 4_000_000  # largest size of ranges that are downloaded together
+_GAP_BYTES = 65_536  # largest gap between two ranges that is downloaded along, as another request takes longer
+_AHEAD = 3  # number of parts requested ahead
+_KEPT = 2  # number of parts retained behind, as threads that read them overtake each other
+_REPEATED = 4  # number of unannounced ranges retained: the first blocks are read more than once
 
 
 class Piece(NamedTuple):
-    """Bytes that are fetched at once."""
+    """A byte range that is downloaded at once."""
 
     begin: int
     end: int
 
 
 class ReadAhead:
-    """Reads ranges with ``fetch(offset, size)``, those that were told before in the order in which they were."""
+    """Reads ranges with ``fetch(offset, size)``, the expected ones ahead and in their order."""
 
     def __init__(self, fetch: Callable[[int, int], bytes]) -> None:
         self.fetch = fetch
@@ -38,14 +38,14 @@ class ReadAhead:
         self.pool = ThreadPoolExecutor(_AHEAD, thread_name_prefix="scanchain-fetch")
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Take note of what will be read next: first byte and the one behind the last, in the order of reading."""
+        """Announce the ranges that will be read next, in order: first byte and the one behind the last."""
         with self.lock:
             self.pieces = merged(ranges)
             self.by_begin = sorted((piece.begin, place) for place, piece in enumerate(self.pieces))
             self.coming = {}
 
     def read(self, offset: int, size: int) -> memoryview:
-        """So many bytes from the offset on; what nobody told of before is fetched by itself."""
+        """So many bytes from the offset on; a range that was not announced is downloaded by itself."""
         with self.lock:
             place = self._place_of(offset, size)
             if place is None:
@@ -56,7 +56,7 @@ class ReadAhead:
         return memoryview(data)[offset - begin : offset - begin + size]
 
     def _place_of(self, offset: int, size: int) -> int | None:
-        """Which piece the bytes lie in."""
+        """Index of the part in which the bytes lie."""
         found = bisect_right(self.by_begin, (offset, len(self.pieces))) - 1
         if found < 0:
             return None
@@ -64,7 +64,7 @@ class ReadAhead:
         return place if offset + size <= self.pieces[place].end else None
 
     def _ask_for(self, place: int) -> Future[bytes]:
-        """The piece of a place; those that follow are asked for as well, those passed forgotten."""
+        """The part of an index; the next ones are requested, those passed are dropped."""
         for number in range(place, min(place + 1 + _AHEAD, len(self.pieces))):
             if number not in self.coming:
                 piece = self.pieces[number]
@@ -75,7 +75,7 @@ class ReadAhead:
 
 
 def merged(ranges: Iterable[tuple[int, int]]) -> list[Piece]:
-    """Ranges joined with those that follow close behind, up to the size of a piece."""
+    """Ranges joined with those that follow close behind, up to the size of a part."""
     pieces: list[Piece] = []
     for begin, end in ranges:
         last = pieces[-1] if pieces else Piece(0, -_GAP_BYTES - 1)

@@ -27,11 +27,11 @@ class Span(NamedTuple):
         return (self.end_ns - self.begin_ns) * 1e-9
 
     def meets(self, block: Block) -> bool:
-        """Whether the block may hold messages of the span."""
+        """True if the block may hold messages of the span."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
     def covers(self, block: Block) -> bool:
-        """Whether all messages of the block lie in the span."""
+        """True if all messages of the block lie in the span."""
         return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
 
 
@@ -56,7 +56,7 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
 
 
 def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
-    """How many messages of a topic lie in the span."""
+    """Number of messages of a topic in the span."""
     count = 0
     for index in indexes:
         for number in (number for number, channel in index.channels.items() if channel.topic == topic):
@@ -70,7 +70,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
 
 
 def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
-    """Scans of the topic in the chosen part, thinned out. Raises InputError where there is none."""
+    """Number of scans of the topic in the chosen part, every n-th. Raises InputError where there is none."""
     name, span = name_of(indexes), chosen_span(whole, config)
     total = sum(
         index.counts.get(number, 0)
@@ -89,7 +89,7 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
 
 
 def _part_in_words(config: LogConfig) -> str:
-    """The chosen part in words."""
+    """The chosen part as text."""
     start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
     if config.end_s == float("inf"):
         return f"after {start}"
@@ -97,7 +97,7 @@ def _part_in_words(config: LogConfig) -> str:
 
 
 def complete(index: FileIndex) -> None:
-    """Learn the channels and counts that a file without a full summary keeps inside its chunks."""
+    """Add the channels and counts that a file without a full summary has inside its chunks."""
     needed = set(index.counts) | {entry.channel for block in index.blocks for entry in block.entries}
     unknown = {number for number in needed if not index.knows(number)}
     counts: Counter[int] = Counter()
@@ -119,7 +119,7 @@ def complete(index: FileIndex) -> None:
 
 
 def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
-    """How many messages a topic has, and the log times of the first and the last of them; 0, 0 where unknown.
+    """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
 
     Exact where a file has a message index, else as exactly as its chunks say.
     """

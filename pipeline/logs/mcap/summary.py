@@ -28,7 +28,7 @@ from scanchain.logs.mcap.records import (
     read_string,
 )
 
-_TAIL_BYTES = 65_536  # read at first; most summaries lie in it
+_TAIL_BYTES = 65_536  # number of bytes read at first; most summaries lie in it
 _FOOTER_BYTES = RECORD.size + FOOTER_BODY.size
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # start, end, offset and length of the chunk, bytes of the map
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index record
@@ -38,7 +38,7 @@ _COUNT = struct.Struct("<HQ")
 
 
 def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
-    """What the summary tells of a file, the ``number``-th of a log; None where that is not everything."""
+    """Index by a file's summary, the ``number``-th of a log; None where that is incomplete."""
     try:
         summary = _summary(file)
         return None if summary is None else _index(file, number, summary)
@@ -91,7 +91,7 @@ def _records(summary: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _block(number: int, summary: bytes, body: int) -> Block:
-    """A chunk; how many messages it has of a channel follows from where the next message index begins."""
+    """A chunk; its number of messages of a channel follows from the offset of the next message index."""
     start_ns, end_ns, chunk, length, size = _CHUNK_INDEX_HEAD.unpack_from(summary, body)
     at = body + _CHUNK_INDEX_HEAD.size
     told = [_INDEX_OFFSET.unpack_from(summary, place) for place in range(at, at + size, _INDEX_OFFSET.size)]
@@ -110,14 +110,14 @@ def _block(number: int, summary: bytes, body: int) -> Block:
 
 
 def _statistics(summary: bytes, body: int) -> tuple[int, dict[int, int]]:
-    """How many chunks there are, and messages by channel."""
+    """Number of chunks, and of messages by channel."""
     (chunks,) = struct.unpack_from("<I", summary, body + 22)
     (size,) = struct.unpack_from("<I", summary, body + 42)
     return chunks, dict(_COUNT.unpack_from(summary, at) for at in range(body + 46, body + 46 + size, _COUNT.size))
 
 
 def _tells_all(index: FileIndex, size: int, chunks_told: int) -> bool:
-    """Whether every chunk lies in the file, may be as large as it claims, and no message is left for elsewhere."""
+    """True if every chunk lies in the file, has a plausible size, and no message lies elsewhere."""
     if chunks_told != len(index.blocks) or any(block.chunk_offset < 0 for block in index.blocks):
         return False
     if any(

@@ -1,4 +1,4 @@
-"""Per-point times, whatever a driver calls them and counts them in, or by the azimuth of a spinning lidar."""
+"""Per-point times, whatever a driver's name and unit for them, or by the azimuth of a spinning lidar."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once"
-_SHORTEST_SCAN_NS = 500_000  # whole numbers that span less are microseconds
-_LONGEST_SCAN = 1e4  # in milliseconds; floats that span more are micro- or nanoseconds
-_NEAR_S = 1.0  # no scan begins further from its stamp than this
-_ABSOLUTE_S = 3600.0  # absolute times are beyond
+_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are microseconds
+_LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
+_NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
+_ABSOLUTE_S = 3600.0  # least absolute time in seconds
 
 
 class PointTimes:
@@ -33,11 +33,11 @@ class PointTimes:
         self.assumed = _NONE
 
     def wants(self, field: str) -> bool:
-        """Whether times are taken from a field of this name."""
+        """True if times are taken from a field of this name."""
         return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
 
     def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
-        """Times (N,) of points (N, 3) by how far the lidar has turned since its start, which is at the stamp."""
+        """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
         config = self.config
         sense = -1.0 if config.point_times == "clockwise" else 1.0
         turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)

@@ -36,7 +36,7 @@ NO_TIMES.flags.writeable = False
 
 
 def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
-    """Points (N, d) in the frame in which they were told to lie; None stands for its origin."""
+    """Points (N, d) moved by the pose of their frame; None stands for its origin."""
     if T_frame_cloud is None:
         return points
     d = points.shape[1]

@@ -1,4 +1,4 @@
-"""A failed run: the files that are kept, and the error that says where they are."""
+"""A failed run: the files that are retained, and the error that names their directory."""
 
 from __future__ import annotations
 

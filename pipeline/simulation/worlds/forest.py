@@ -76,7 +76,7 @@ def _tree(scenery: Scenery, place: NDArray[np.float64], rng: np.random.Generator
 
 
 def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng: np.random.Generator) -> None:
-    """A shrub, a boulder or a fallen log, no farther out than the ``room`` there is."""
+    """A shrub, a boulder or a fallen log, no farther out than the free ``room``."""
     x, y = place.tolist()
     kind, size = rng.random(), min(rng.uniform(0.3, 0.9), room)
     if kind < 0.5:
@@ -89,7 +89,7 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 
 
 def _sampled_route() -> Matrix:
-    """The route's straight pieces, a place every 20 cm."""
+    """Points along the route's straight segments, one every 20 cm."""
     pieces = []
     for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
         pieces.append(np.linspace(a, b, int(np.linalg.norm(b - a) / 0.2)))

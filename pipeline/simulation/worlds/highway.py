@@ -40,7 +40,7 @@ ROUTE = _stadium()
 
 
 class _Road:
-    """Places beside the route, by the distance along it and to its left."""
+    """Positions beside the route, by the distance along it and to its left."""
 
     def __init__(self, route: Matrix) -> None:
         lap = np.vstack([route, route[:1]])

@@ -1,4 +1,4 @@
-"""Three identical corridors of identical rooms: what is seen does not tell which of them one is in."""
+"""Three identical corridors of identical rooms: scans do not tell them apart."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _walls() -> list[Wall]:
 
 
 def _furnish(scenery: Scenery, x: float, y: float, side: float, furniture: Matrix) -> None:
-    """The same pieces in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
+    """The same furniture in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
     yaw_rad = 0.0 if side > 0.0 else np.pi
     for u, v, length, width, height in furniture:
         scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)

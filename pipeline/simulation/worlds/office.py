@@ -78,7 +78,7 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
 
 
 def _sampled_route() -> Matrix:
-    """The route's straight pieces, a place every 5 cm."""
+    """Points along the route's straight segments, one every 5 cm."""
     pieces = []
     for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
         pieces.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))

@@ -17,7 +17,7 @@ from scanchain.simulation.worlds import corridor, forest, highway, identical, of
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A place, the way through it, by whom, and with which lidar and for how long by default.
+    """A world, the route through it, the vehicle, and the default lidar and duration.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class World:
     holes: tuple[tuple[float, float], ...] = ()
 
     def motion(self, solids: Solids, *, duration_s: float, rng: np.random.Generator) -> Motion:
-        """The drive; ``rng`` draws how it strays and sways."""
+        """The drive; ``rng`` draws its deviations and its sway."""
         if isinstance(self.way, tuple):
             return Pivots(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)
         return Laps(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)

@@ -9,7 +9,7 @@ from scanchain.simulation.routes import Pivot
 from scanchain.simulation.solids import Scenery, Solids
 from scanchain.simulation.worlds.outdoors import BELOW_M, parked_car, tree
 
-FIELD_SIGHT_M = 60.0  # haze
+FIELD_SIGHT_M = 60.0  # range limit by haze
 _LONG_M, _SHORT_M = 440.0, 160.0
 _GROUPS = ((30.0, 0.0), (260.0, 0.0), (425.0, 0.0), (300.0, _SHORT_M), (70.0, _SHORT_M))
 

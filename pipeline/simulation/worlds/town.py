@@ -168,7 +168,7 @@ def rounds(rng: np.random.Generator) -> Solids:
 
 
 def _lanes() -> Matrix:
-    """The route (W, 2): the lane of each street, and where it meets that of the next one."""
+    """The route (W, 2): the lane of each street, and its intersection with that of the next one."""
     legs = [*_WAY, _WAY[0]]
     lines = []
     for (start, lane), (end, _) in pairwise(legs):
@@ -178,7 +178,7 @@ def _lanes() -> Matrix:
 
 
 def _meeting(p: Matrix, u: Matrix, q: Matrix, v: Matrix) -> Matrix:
-    """Where the lines p + s u and q + t v meet, or q where they run the same way."""
+    """Intersection of the lines p + s u and q + t v, or q where they are parallel."""
     cross = u[0] * v[1] - u[1] * v[0]
     if abs(cross) < 1e-9:
         return q
