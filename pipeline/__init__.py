@@ -108,5 +108,5 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
     if name in _COMPILED:
-        import_module("scanchain.clock").tell_compilation()
+        import_module("scanchain.clock").warn_of_compilation()
     return globals().setdefault(name, getattr(import_module(f"scanchain.{_HOMES[name]}"), name))

@@ -15,7 +15,7 @@ from scanchain.errors import InputError, ScanchainError
 
 Progress = Callable[[int, int], None]
 
-_PIECE_BYTES = 1 << 18
+_BLOCK_BYTES = 1 << 18
 _MIB = 1 << 20
 _TIMEOUT_S = 30.0
 _ATTEMPTS = 4
@@ -30,7 +30,7 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
     """Download a file unless it exists, resuming an earlier try; returns its SHA-256.
 
     sha256 : what it must be, empty where nobody knows. Raises InputError where it is not, and for what is no
-        HTTP address; DownloadError where the server does not answer as it should.
+        HTTP address; DownloadError where the server does not respond as it should.
     progress : told how many MiB of how many are there, 0 where the server does not say
     """
     if urlsplit(url).scheme not in ("http", "https"):
@@ -84,17 +84,21 @@ class _Part:
         have = self.path.stat().st_size if self.path.exists() else 0
         validator = self.validator_path.read_text() if have and self.validator_path.exists() else ""
         have = have if validator else 0
-        asked = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
-        with urllib.request.urlopen(urllib.request.Request(self.url, headers=asked), timeout=_TIMEOUT_S) as answer:
-            is_rest = answer.status == http.client.PARTIAL_CONTENT
+        headers = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
+        with urllib.request.urlopen(
+            urllib.request.Request(self.url, headers=headers), timeout=_TIMEOUT_S
+        ) as response:
+            is_rest = response.status == http.client.PARTIAL_CONTENT
             have = have if is_rest else 0
-            length = answer.headers.get("Content-Length")
+            length = response.headers.get("Content-Length")
             total = have + int(length) if length is not None else 0
-            self.validator_path.write_text(answer.headers.get("ETag") or answer.headers.get("Last-Modified") or "")
+            self.validator_path.write_text(
+                response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
+            )
             with self.path.open("ab" if is_rest else "wb") as file:
-                while piece := answer.read(_PIECE_BYTES):
-                    file.write(piece)
-                    have += len(piece)
+                while block := response.read(_BLOCK_BYTES):
+                    file.write(block)
+                    have += len(block)
                     if progress is not None:
                         progress(have // _MIB, total // _MIB)
         return not total or have == total

@@ -143,10 +143,10 @@ class Slam:
             timing=timing,
         )
 
-    def finish(self, tell: Callable[[str], None] = lambda stage: None) -> SlamResult:
+    def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
         """Close what is left, optimize once more, spread the corrections over all scans and refine these.
 
-        tell : told which of these stages begins
+        progress : called with the name of each stage when it begins
         Raises InputError without a scan, and when called again.
         """
         self._check_unfinished()
@@ -154,16 +154,16 @@ class Slam:
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
         if self.config.loops.enabled:
-            tell("closing the last loops")
+            progress("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
-        tell(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
+        progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
         corrected = spread(state.poses, numbers, odometry)
         if self.keeps_scans:
-            tell(f"refining {counted(len(odometry), 'scan')}")
+            progress(f"refining {counted(len(odometry), 'scan')}")
             corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),

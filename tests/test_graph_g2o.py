@@ -157,7 +157,7 @@ def test_a_file_without_vertices_starts_from_its_odometry():
 
 
 def test_suspect_loops_are_the_edges_that_skip_poses():
-    graph = read_g2o(shared_data("graphs/intel.g2o"), loops="suspect").graph
+    graph = read_g2o(shared_data("graphs/intel.g2o"), loops="robust").graph
     apart = np.abs(graph.edges[:, 0] - graph.edges[:, 1])
     assert np.array_equal(graph.is_loop, apart != 1)
 

@@ -66,7 +66,7 @@ def test_an_index_by_the_summary_is_that_of_walking_the_file(site, log_file):
     assert len(site.asked) == 2 and site.sent <= 65_537  # the last byte, and the tail
     checked = [replace(block, crc=asked.stored(block)[1]) for block in asked.blocks]
     assert checked == walked.blocks and all(block.crc for block in checked)
-    assert (asked.channels, asked.counts, asked.is_trusted) == (walked.channels, walked.counts, True)
+    assert (asked.channels, asked.counts, asked.is_consistent) == (walked.channels, walked.counts, True)
 
 
 def test_scans_and_truth_are_those_of_the_file_and_every_byte_is_fetched_once(site, log_file):

@@ -194,8 +194,8 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
     """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    said = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
-    error = next((line for line in reversed(said) if line.startswith("error: ")), "")
+    output = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         unreliable = _metrics(task).unreliable
         if unreliable and error.endswith(unreliable):
@@ -204,5 +204,5 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:
         return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(said).split())[-_LAST_CHARACTERS:]
+    last = " ".join(" ".join(output).split())[-_LAST_CHARACTERS:]
     return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")

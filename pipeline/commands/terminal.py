@@ -51,7 +51,7 @@ class Terminal:
         if self.bar is not None:
             self.bar.say(line)
 
-    def tell(self, line: str) -> None:
+    def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""
         if self.bar is None:
             sys.stderr.write(f"{line}\n")

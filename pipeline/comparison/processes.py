@@ -50,7 +50,7 @@ def run_all(
                 progress.say(f"{method.name}: compiled its kernels, once after the installation; run again")
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
-            progress.say(_said(method.name, turn, repeat, outcome))
+            progress.say(_progress_line(method.name, turn, repeat, outcome))
     return outcomes
 
 
@@ -60,7 +60,7 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
     return read_outcome(folder, report, scans.stamps_ns, scans.dimension)
 
 
-def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
+def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
     if outcome.report.status is Status.OK:
         return f"{name}{which}: {outcome.seconds.sum():.1f} s"
@@ -88,8 +88,8 @@ def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> En
         return _own_report(folder)
     if ending.code == _KILLED:
         return _ended(Status.OUT_OF_MEMORY, "killed, as the system does when memory runs out", ending, folder)
-    said = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
-    return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {said}" if said else ""), ending, folder)
+    output = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
+    return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {output}" if output else ""), ending, folder)
 
 
 def _own_report(folder: Path) -> EndReport:

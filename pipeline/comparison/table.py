@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
+from scanchain.comparison.assessment import representative, unreliable_by_itself
 from scanchain.comparison.figures import COLUMNS, Figures, columns_of
-from scanchain.comparison.judging import representative, unreliable_by_itself
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import EndReport, Outcome, Status
 from scanchain.comparison.results import Results
@@ -181,11 +181,11 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
 
 
 def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
-    outcomes, judged = results.outcomes[method.name], results.judged[method.name]
+    outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
     figures: Figures = msgspec.structs.replace(
-        judged.figures,
+        assessed.figures,
         thickness_m=sharp.thickness_m if sharp else None,
         entropy=sharp.mean_map_entropy if sharp else None,
         disagreement_m=float(np.median(known)) if len(known) else None,
@@ -199,7 +199,7 @@ def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.
         unreliable=unreliable_by_itself(representative(outcomes)),
         settings=method.settings,
         figures=figures,
-        definitions=list(judged.definitions),
+        definitions=list(assessed.definitions),
     )
 
 
@@ -226,5 +226,5 @@ def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[s
 
 def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
     """Sharpness of each map that has one."""
-    answers = sharpness(list(maps.values())) if maps else []
-    return {name: answer for name, answer in zip(maps, answers, strict=True) if answer is not None}
+    results = sharpness(list(maps.values())) if maps else []
+    return {name: result for name, result in zip(maps, results, strict=True) if result is not None}

@@ -150,7 +150,7 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
     )
 
 
-def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
+def absolute_error_of_any_path(pairs: Pairs) -> AbsoluteError:
     """ATE after rigid alignment or, where a straight trajectory leaves a rotation free, by the first pose."""
     try:
         return absolute_error(pairs)
@@ -164,14 +164,14 @@ def on_the_estimate(estimate: Trajectory, reference: Trajectory, *, gap_s: float
     Raises InputError where they have no pairs.
     """
     pairs = pair(estimate, reference, gap_s=gap_s)
-    T_reference_estimate = absolute_error_on_any_course(pairs).T_reference_estimate
+    T_reference_estimate = absolute_error_of_any_path(pairs).T_reference_estimate
     return Trajectory(pairs.stamps_ns, lie.inverse(T_reference_estimate) @ pairs.reference)
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
     """The estimate (N, 4, 4) turned by the one rotation R that minimizes Σ ‖R_ref − R R_est‖² (Umeyama 1991).
 
-    Positions alone leave the roll about a straight course to the noise; a rotation error must not inherit that.
+    Positions alone leave the roll about a straight path to the noise; a rotation error must not inherit that.
     """
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3]))
     T = np.eye(4)

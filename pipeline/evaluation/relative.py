@@ -204,7 +204,7 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     )
 
 
-def kitti_error_on_any_course(pairs: Pairs) -> KittiError:
+def kitti_error_of_any_path(pairs: Pairs) -> KittiError:
     """The published lengths where the path is long enough for them, else 10, 20 and 40 m from every pose."""
     if path_length(pairs.reference)[-1] >= _LONG_PATH_M:
         return kitti_error(pairs)

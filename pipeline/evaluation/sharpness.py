@@ -29,7 +29,7 @@ REACH_M = 40.0  # largest range of the points that are compared: those farther o
 MIN_NEIGHBORS = 10
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000
 _AT_ONCE = 64  # number of queries whose neighbors are in memory at a time
-_HELD = 0.5  # least share of the query points of the best map that another must cover to be compared
+_MIN_COVERAGE = 0.5  # least share of the query points of the best map that another must cover to be compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +43,16 @@ class Sharpness:
 def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
     """Sharpness of each map of ``sampled_map``, all over the same query points.
 
-    None for a map that has fallen apart: it would leave too few points to judge the others by.
+    None for a fragmented map: it would leave too few points to compare the others at.
     """
     eigenvalues = np.array([_eigenvalues(points) for points in maps])
     good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
-    held = good.sum(axis=1) >= _HELD * good.sum(axis=1).max(initial=0)
-    counts = good[held].all(axis=0)
+    covered = good.sum(axis=1) >= _MIN_COVERAGE * good.sum(axis=1).max(initial=0)
+    counts = good[covered].all(axis=0)
     if not counts.any():
         return [None] * len(maps)
     chosen = eigenvalues[:, counts]
-    return [_sharpness(each) if is_held else None for each, is_held in zip(chosen, held, strict=True)]
+    return [_sharpness(each) if is_covered else None for each, is_covered in zip(chosen, covered, strict=True)]
 
 
 def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Points:

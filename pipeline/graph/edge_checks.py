@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.kernels.graph.semidefinite import judge_matrices
+from scanchain.kernels.graph.semidefinite import find_semidefinite
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
@@ -43,7 +43,7 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     """True for each of the matrices (E, k, k) that is finite, symmetric and positive semidefinite, (E,)."""
     result = np.empty(len(information), np.bool_)
-    judge_matrices(np.ascontiguousarray(information), _ROUNDING, result)
+    find_semidefinite(np.ascontiguousarray(information), _ROUNDING, result)
     return result
 
 
@@ -61,7 +61,7 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     correlation = scale[:, :, None] * information * scale[:, None, :]
     is_full = np.empty(len(information), np.bool_)
-    judge_matrices(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
+    find_semidefinite(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
     result = np.full(len(information), k, np.int64)
     result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
     return result

@@ -133,5 +133,5 @@ class _Model:
 
 
 def _cost(at: Linearization, loss: Loss) -> float:
-    trusted = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
-    return trusted + float(loss.loss(at.observation_chi2).sum())
+    quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
+    return quadratic + float(loss.loss(at.observation_chi2).sum())

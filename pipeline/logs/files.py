@@ -44,8 +44,8 @@ class RemoteFile:
         if facts.get("size") == 0:
             raise InputError(f"{address}: is empty (0 bytes); record or copy it again")
         self.size = int(facts.get("size") or 0)
-        told = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
-        self.version = str(next(filter(None, told), ""))
+        stated = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
+        self.version = str(next(filter(None, stated), ""))
         self._may_have_ranges = self.size > 0 and facts.get("partial", True)
 
     @cached_property

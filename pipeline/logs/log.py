@@ -155,7 +155,7 @@ class Log:
         counts = ScanCounts(self.topic, self.odometry_topic)
         times = PointTimes(self.config)
         self.scans_with_wheels = 0
-        count, index, asked = 0, 0, working_s()
+        count, index, requested_s = 0, 0, working_s()
         try:
             for message, recorded in self._with_poses(poses, times):
                 count += 1
@@ -167,12 +167,12 @@ class Log:
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, recorded, waited_s=working_s() - asked)
+                scan = self._scan(index, message, recorded, waited_s=working_s() - requested_s)
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
                 index += 1
-                asked = working_s()
+                requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             self.damage += [*counts.losses(), *poses.complaints()]

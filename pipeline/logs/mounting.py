@@ -106,15 +106,15 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     if not fixed and not topics and wheels is None:
         return Mounting("", "", np.eye(4))
     frame = _frame_of(indexes, lidar)
-    told = None
+    stated = None
     if wheels is not None and is_odometry(wheels):
-        told = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
-    bases = [name.lstrip("/") for name in ("" if told is None else told.child, *_BASE_FRAMES) if name]
+        stated = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+    bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, frame, T_base_lidar)
-    worlds = {"" if told is None else told.parent.lstrip("/")}
+    worlds = {"" if stated is None else stated.parent.lstrip("/")}
     seen = _moving_transforms(indexes, topics, span)
     worlds |= {name for each in (*seen, *map(edge, fixed)) for name in each if _is_of_the_world(name)}
     moving = {joint: poses for joint, poses in seen.items() if not worlds & set(joint)}

@@ -18,7 +18,7 @@ class Located:
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
-    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed anew.
+    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
     """
 
     tracked: Tracked

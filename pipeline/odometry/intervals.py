@@ -37,8 +37,8 @@ class Intervals:
         stamped_s, logged_s = _since(self.last_scan, scan)
         if not self.usual_s or _are_alike(stamped_s, self.usual_s):
             return stamped_s
-        is_sound = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
-        return stamped_s if is_sound else self.usual_s
+        is_plausible = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
+        return stamped_s if is_plausible else self.usual_s
 
     def silence_s(self, scan: Scan) -> float:
         """Seconds since the last scan, however many; 0 where the stamps and the log disagree."""

@@ -84,7 +84,7 @@ class Odometry:
         self._check_dimension(scan)
         self.scans += 1
         started = working_s()
-        sweep, sparse = self.resolution.look(scan)
+        sweep, sparse = self.resolution.downsampled(scan)
         self.map.resize(self.resolution.scale)
         if not len(self.local_map):
             self._check_range(scan, sparse)
@@ -126,7 +126,7 @@ class Odometry:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
-            return self._begin_anew(points, prediction)
+            return self._reset_map(points, prediction)
         return _Registered(points, match, state, match.reason, prediction)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
@@ -153,7 +153,7 @@ class Odometry:
         self.map.restart(self.first_points)
         return T_odom_middle
 
-    def _begin_anew(self, points: Points, prediction: Prediction) -> _Registered:
+    def _reset_map(self, points: Points, prediction: Prediction) -> _Registered:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()

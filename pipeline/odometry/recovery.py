@@ -14,7 +14,7 @@ from scanchain.registration import CorrelativeMap, Matcher, VoxelMap
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
-_DOUBTFUL = 2.0  # cost per point over its running mean, from which on other initial poses are tried
+_UNCERTAIN = 2.0  # cost per point over its running mean, from which on other initial poses are tried
 _ELSEWHERE = 3.0  # cost per point over its running mean, from which on a scan after a gap does not fit the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is uncertain
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
@@ -33,7 +33,7 @@ class Recovery:
         """The alignment from the predicted pose or, where that one is uncertain, the best of several."""
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        if self._is_doubtful(best.cost / len(points), prediction):
+        if self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
                 if self._cost(other, prediction) < self._cost(best, prediction):
@@ -65,13 +65,13 @@ class Recovery:
         """True if so many scans were lost that the map has to be extended at the prediction."""
         return self.lost_scans >= _PATIENCE
 
-    def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
+    def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
         """True if the cost per point is far above the usual one, and above a share of the greatest possible."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
             return cost > self.usual_cost
-        return cost > max(_DOUBTFUL * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+        return cost > max(_UNCERTAIN * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""

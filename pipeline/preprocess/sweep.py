@@ -37,7 +37,7 @@ class Sweep:
         """Seconds from the first point to the last."""
         return float(np.ptp(self.times_s)) if self.is_distorted else 0.0
 
-    def thinned(self, voxel_m: float) -> Sweep:
+    def downsampled(self, voxel_m: float) -> Sweep:
         """The first point of every voxel of this size."""
         chosen = _first_per_voxel(self.points, voxel_m, 0.0, np.inf)
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s

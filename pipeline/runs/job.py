@@ -19,7 +19,7 @@ from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.closures import JudgedClosure
+    from scanchain.runs.closures import FinalClosure
     from scanchain.runs.step_table import StepRow
 
 
@@ -72,7 +72,7 @@ class Progress(Protocol):
         """Show a line on a terminal only."""
         ...
 
-    def tell(self, line: str) -> None:
+    def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""
         ...
 
@@ -89,7 +89,7 @@ class Unwatched:
     def say(self, line: str) -> None:
         """Show nothing."""
 
-    def tell(self, line: str) -> None:
+    def announce(self, line: str) -> None:
         """Show nothing."""
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
@@ -142,8 +142,8 @@ class Recorder(Protocol):
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         ...
 
-    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
-        """Record the final graph and the final verdict on every closure."""
+    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
+        """Record the closures graph and the closures verdict on every closure."""
         ...
 
     def log_ground_truth(self, poses: Matrix) -> None:

@@ -27,7 +27,7 @@ from scanchain.maps import (
     write_pcd,
     write_ply,
 )
-from scanchain.runs.closures import JudgedClosure, write_closures
+from scanchain.runs.closures import FinalClosure, write_closures
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
@@ -53,7 +53,7 @@ class Results:
     config: Config
     steps: StepTable
     result: SlamResult
-    judged: tuple[JudgedClosure, ...]
+    final: tuple[FinalClosure, ...]
     cloud: Cloud
     grid: OccupancyGrid
 
@@ -84,7 +84,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
     Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
     Output(
         "loops.parquet",
-        lambda path, r: write_closures(path, r.judged, r.result.keyframes, r.result.trajectory.dimension),
+        lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
     ),
     Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory)),
     Output(  # after the maps, which it reads
@@ -96,10 +96,10 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
 
 
 def results_of(
-    log: Log, config: Config, steps: StepTable, result: SlamResult, judged: tuple[JudgedClosure, ...]
+    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[FinalClosure, ...]
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
-    return Results(log, config, steps, result, judged, cloud_of(result, config), grid_of(result, config.maps))
+    return Results(log, config, steps, result, final, cloud_of(result, config), grid_of(result, config.maps))
 
 
 def write_results(folder: Path, results: Results) -> None:
@@ -114,7 +114,7 @@ def record_results(recording: Recorder, results: Results) -> None:
     trajectory, grid = results.result.trajectory, results.grid
     indices = np.arange(len(trajectory), dtype=np.int64)
     recording.log_trajectory(trajectory.stamps_ns, trajectory.poses, indices)
-    recording.log_closures(results.judged, results.result.state)
+    recording.log_closures(results.final, results.result.state)
     recording.log_map(results.cloud.points)
     if trajectory.dimension == 2:
         x_m, y_m = grid.origin_m.tolist()

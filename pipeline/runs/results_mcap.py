@@ -77,8 +77,8 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, pose
         links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
         data = pack_transforms(row.stamp_ns, *links)
         writer.append("/tf", "tf2_msgs/msg/TFMessage", data, row.stamp_ns, row.log_time_ns)
-        told = None if covariance is None else adjoint @ covariance @ adjoint.T
-        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(told, T_odom_frame))
+        in_ros = None if covariance is None else adjoint @ covariance @ adjoint.T
+        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(in_ros, T_odom_frame))
         writer.append("/odometry", "nav_msgs/msg/Odometry", data, row.stamp_ns, row.log_time_ns)
 
 

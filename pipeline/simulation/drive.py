@@ -17,8 +17,8 @@ from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds.registry import World, find_world
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
-PLACE, WANDER, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
-_HOLE_S = 1.0
+PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
+_DROPOUT_S = 1.0
 _LONGEST_S = 36_000.0
 
 
@@ -30,7 +30,7 @@ class Drive:
     ----------
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
-    scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into holes
+    scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
     """
 
     solids: Solids
@@ -62,7 +62,9 @@ def plan(
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
     solids = place.build(random_numbers(seed, PLACE))
-    motion = place.motion(solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, WANDER))
+    motion = place.motion(
+        solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, DEVIATION)
+    )
     return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, _recorded(place, motion, lidar, count))
 
 
@@ -82,9 +84,9 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
     """All scans outside the dropouts: one second each, centered on the first moment nearest to its location."""
     scans = np.arange(count)
-    lacking = round(_HOLE_S * 1e9 / sensor.period_ns)
+    lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
     kept = np.ones(count, dtype=bool)
-    for first in _passed(world.holes, motion, scans * (sensor.period_ns * 1e-9)):
+    for first in _passed(world.dropouts, motion, scans * (sensor.period_ns * 1e-9)):
         kept[max(first - lacking // 2, 0) :][:lacking] = False
     return scans[kept]
 

@@ -36,7 +36,7 @@ def simulate(
 
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
-    of every scan, exact) and /tf_static (T_base_lidar); in the holes of a world, /odom alone goes on. ``drift``
+    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
     ``progress`` is told scans done and scans in all.
 
@@ -56,7 +56,7 @@ def simulate(
         wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
         for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
             stamp_ns = int(truth.stamps_ns[done])
-            wheels.write_until(stamp_ns - 1)  # in a hole
+            wheels.write_until(stamp_ns - 1)  # in a dropout
             log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
             wheels.write_until(stamp_ns + period_ns)
             _write_sweep(log, sweep, drive.sensor, stamp_ns)

@@ -29,7 +29,7 @@ class Vehicle:
     ----------
     speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the way and in bends
     corner_m : standard deviation of the smoothing that rounds the route; a right angle gets 0.9 of it as radius
-    wander_m : how far it strays from the route, differently on every lap
+    deviation_m : how far it strays from the route, differently on every lap
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
     radius_m : half its width
     T_base_lidar : (4, 4)
@@ -42,7 +42,7 @@ class Vehicle:
     acceleration_m_s2: float
     lateral_acceleration_m_s2: float
     corner_m: float
-    wander_m: float
+    deviation_m: float
     sway_rad: float
     heave_m: float
     radius_m: float

@@ -172,8 +172,8 @@ def draw_run(directory: Path, picture: Path) -> None:
     truth_file = directory / TRUTH_FILE
     truth = None
     if truth_file.exists():
-        judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
-        truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
+        accuracy = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
+        truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
     try:
         draw_map(
             picture,

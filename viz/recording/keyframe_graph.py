@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from scanchain.data import Closure, GraphState, Step, Verdict
-from scanchain.runs.closures import JudgedClosure, final_verdicts
+from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.step_table import StepRow
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
@@ -34,7 +34,7 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self.positions: list[NDArray[np.float32]] = []
-        self.judged: list[JudgedClosure] = []
+        self.closures: list[FinalClosure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)
         self.drawn = 0
@@ -47,24 +47,24 @@ class KeyframeGraph:
             self.is_current = False
         events: list[str] = []
         if step.closures:
-            events += self._judge([*self.judged, *(_as_found(closure) for closure in step.closures)])
+            events += self._update([*self.closures, *(_as_found(closure) for closure in step.closures)])
         if step.graph is not None:
             self.graph = step.graph
-            events += self._judge(final_verdicts([item.closure for item in self.judged], step.graph))
+            events += self._update(final_verdicts([item.closure for item in self.closures], step.graph))
         return Verdicts(events, *self.counts)
 
-    def settle(self, judged: Sequence[JudgedClosure], graph: GraphState) -> Verdicts:
+    def settle(self, closures: Sequence[FinalClosure], graph: GraphState) -> Verdicts:
         """Take in the final graph with every closure tried."""
         self.graph = graph
         self.is_current = False
-        return Verdicts(self._judge(judged), *self.counts)
+        return Verdicts(self._update(closures), *self.counts)
 
     def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> Verdicts:
         """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
         poses = np.array([row.T_world_lidar for row in rows if row.keyframe >= 0])
         self.positions = list(shapes.positions(poses))
         self.graph = graph
-        self._judge(final_verdicts(closures, graph))
+        self._update(final_verdicts(closures, graph))
         for count in range(1, len(self.positions) + 1):
             self.drawn = count if count > _GROWTH * self.drawn else self.drawn
         self.is_current = self.drawn == len(self.positions)
@@ -83,8 +83,8 @@ class KeyframeGraph:
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
-        accepted = [item for item in self.judged if item.verdict is Verdict.ACCEPTED]
-        rejected = [item for item in self.judged if item.verdict is Verdict.REJECTED]
+        accepted = [item for item in self.closures if item.verdict is Verdict.ACCEPTED]
+        rejected = [item for item in self.closures if item.verdict is Verdict.REJECTED]
         colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), times),
@@ -93,22 +93,22 @@ class KeyframeGraph:
             _strips(entities.REJECTED, _edges(nodes, rejected), times),
         ]
 
-    def _judge(self, judged: Sequence[JudgedClosure]) -> list[str]:
+    def _update(self, closures: Sequence[FinalClosure]) -> list[str]:
         """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
-        before = [item.verdict for item in self.judged]
-        self.judged = list(judged)
-        counts = Counter(item.verdict for item in judged)
+        before = [item.verdict for item in self.closures]
+        self.closures = list(closures)
+        counts = Counter(item.verdict for item in closures)
         self.counts = (counts[Verdict.ACCEPTED], counts[Verdict.REJECTED])
         return [
             f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
-            for number, item in enumerate(judged)
+            for number, item in enumerate(closures)
             if number >= len(before) or item.verdict is not before[number]
         ]
 
 
-def _as_found(closure: Closure) -> JudgedClosure:
+def _as_found(closure: Closure) -> FinalClosure:
     """Verdict of the matcher alone, before optimization."""
-    return JudgedClosure(closure, closure.verdict, closure.reason, 1.0, float("nan"))
+    return FinalClosure(closure, closure.verdict, closure.reason, 1.0, float("nan"))
 
 
 def _strips(
@@ -120,7 +120,7 @@ def _strips(
     return Message(entity, rr.ComponentColumnList(columns), times)
 
 
-def _edges(nodes: NDArray[np.float32], judged: list[JudgedClosure]) -> NDArray[np.float32]:
+def _edges(nodes: NDArray[np.float32], closures: list[FinalClosure]) -> NDArray[np.float32]:
     """Line strips (E, 2, 3) between the keyframes of closures."""
-    pairs = np.array([(item.closure.target, item.closure.source) for item in judged], np.int64).reshape(-1, 2)
+    pairs = np.array([(item.closure.target, item.closure.source) for item in closures], np.int64).reshape(-1, 2)
     return nodes[pairs]

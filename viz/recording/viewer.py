@@ -119,13 +119,13 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
     raise ViewerError(f"no viewer: it did not answer within {_START_S:.0f} s; try `rerun` on its own")
 
 
-def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
+def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> None:
     """Open a .rrd file: a window that lives on by itself, or a page served on this machine until Ctrl-C.
 
-    tell : told the page's address
+    announce : told the page's address
     """
     if in_browser:
-        _serve(path, tell)
+        _serve(path, announce)
         return
     if not has_display():
         raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
@@ -133,12 +133,12 @@ def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
     subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
 
 
-def _serve(path: Path, tell: Callable[[str], None]) -> None:
+def _serve(path: Path, announce: Callable[[str], None]) -> None:
     """Until KeyboardInterrupt; whatever ends this ends the server."""
     server = start_web(PORT, WEB_PORT, path)
     try:
         address = web_address(PORT, WEB_PORT)
-        tell(address)
+        announce(address)
         if has_display():
             webbrowser.open(address)
         code = server.wait()

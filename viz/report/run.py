@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
-from scanchain.evaluation import absolute_error_on_any_course, pair
+from scanchain.evaluation import absolute_error_of_any_path, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
@@ -143,7 +143,7 @@ def _against(trajectory: Trajectory, truth: Trajectory | None, gap_s: float | No
     if truth is None:
         return _Off(np.eye(4), errors_m, np.empty((0, 3)))
     pairs = pair(trajectory, truth, gap_s=gap_s)
-    ate = absolute_error_on_any_course(pairs)
+    ate = absolute_error_of_any_path(pairs)
     errors_m[pairs.places] = ate.errors_m
     return _Off(ate.T_reference_estimate, errors_m, pairs.reference[:, :3, 3])
 

@@ -76,11 +76,11 @@ class G2oFile:
 
 
 def read_g2o(
-    path: Path | str, *, loops: Literal["trusted", "suspect"] = "trusted", indefinite: Indefinite = "project"
+    path: Path | str, *, loops: Literal["quadratic", "robust"] = "quadratic", indefinite: Indefinite = "project"
 ) -> G2oFile:
     """Read a graph.
 
-    loops : "suspect" marks edges between poses that do not follow each other for the robust loss
+    loops : "robust" marks edges between poses that do not follow each other for the robust loss
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
     """
@@ -108,8 +108,8 @@ def read_g2o(
         graph.add_pose(pose, stamp)
     for point, stamp in zip(points, point_ids.tolist(), strict=True):
         graph.add_point(point, stamp)
-    suspect = (loops == "suspect") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1)
-    graph.add_edges(pairs, measurements, information, suspect)
+    is_robust = (loops == "robust") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1)
+    graph.add_edges(pairs, measurements, information, is_robust)
     if len(sightings):
         graph.add_sightings(sightings, seen, certainty)
     for index in fixed.tolist():

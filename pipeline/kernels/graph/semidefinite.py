@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True)
-def judge_matrices(matrices: NDArray[np.float64], rounding: float, is_sound: NDArray[np.bool_]) -> None:
+def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidefinite: NDArray[np.bool_]) -> None:
     """Fill ``is_semidefinite`` (E,): matrices (E, k, k) without an eigenvalue below −rounding · largest entry.
 
     Such a matrix has a Cholesky factor once that much is added to its diagonal.
@@ -16,8 +16,10 @@ def judge_matrices(matrices: NDArray[np.float64], rounding: float, is_sound: NDA
     factor = np.empty(matrices.shape[1:])
     for e in range(matrices.shape[0]):
         scale = _largest_entry(matrices[e])
-        is_sound[e] = math.isfinite(scale) and _is_symmetric(matrices[e], rounding * scale)
-        is_sound[e] = is_sound[e] and (scale == 0.0 or _has_factor(matrices[e], rounding * scale, factor))
+        is_semidefinite[e] = math.isfinite(scale) and _is_symmetric(matrices[e], rounding * scale)
+        is_semidefinite[e] = is_semidefinite[e] and (
+            scale == 0.0 or _has_factor(matrices[e], rounding * scale, factor)
+        )
 
 
 @njit(cache=True)

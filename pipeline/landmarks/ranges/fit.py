@@ -23,7 +23,7 @@ _SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the senso
 _LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
 _LEAST_FREEDOM = 1e-3  # observations beyond what the state takes up
 _TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
-_RECKONED = 2  # of them begin with dead reckoning anew, by the robot as it is known then
+_RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is known then
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
 
 
@@ -35,7 +35,7 @@ class LogModel:
         self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
         self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
         self.observed = np.stack([node, landmark], axis=1)
-        self.likeness = SightingPairs(log.seen_s, landmark)
+        self.sighting_pairs = SightingPairs(log.seen_s, landmark)
 
     def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
         """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
@@ -84,7 +84,7 @@ class LogFit:
 def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) -> LogFit:
     """Estimate state and noise; that of the odometry is fixed unless it is None.
 
-    Raises InputError where the observations tell nothing of the sensor's.
+    Raises InputError where the observations contain no information about that of the sensor.
     """
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
     reckoning = model.reckoned(np.zeros(len(OWN)))
@@ -102,7 +102,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
         is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
         residuals = np.sqrt(now.minimum.weights / loss.share)[:, None] * now.minimum.at.observations
-        loss = StudentLoss(model.likeness.share(model.likeness.correlation(residuals)))
+        loss = StudentLoss(model.sighting_pairs.share(model.sighting_pairs.correlation(residuals)))
         state = now.minimum.state
         if turn < _RECKONED:
             reckoning = model.reckoned(state.calibration)

@@ -125,8 +125,8 @@ def _no_return(seen: Survey) -> Finding:
     below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
-    told_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
-    limit_m = min(told_m, seen.log.config.max_range_m)
+    stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
+    limit_m = min(stated_m, seen.log.config.max_range_m)
     if share < _STUCK_SHARE:
         return Finding("no return", Severity.OK, "no range is told so often that it must stand for no return")
     found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"

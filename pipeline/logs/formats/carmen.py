@@ -76,7 +76,7 @@ class _Carmen:
             self._block(begin)
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
         index.make = self.make
-        self._tell()
+        self._summarize()
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """The messages of a block of lines."""
@@ -95,12 +95,12 @@ class _Carmen:
         words = self.text[line.begin : line.end].split()
         if line.kind in SCANS:
             offset_m, reach_m = (self.parameters.get(name, 0.0) for name in _PARAMETERS)
-            told = read_scan(words, line.stamp_ns, reach_m, offset_m)
+            stated = read_scan(words, line.stamp_ns, reach_m, offset_m)
             if is_first:
-                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", told.mounting))
+                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", stated.mounting))
                 yield self._message(self.mounting, line, data)
-            yield self._message(self.odometry, line, told.odometry)
-            yield self._message(self.scan, line, told.scan)
+            yield self._message(self.odometry, line, stated.odometry)
+            yield self._message(self.scan, line, stated.scan)
         elif line.kind == b"ODOM":
             yield self._message(self.odometry, line, read_pose(words, line.stamp_ns, "odom"))
         else:
@@ -150,7 +150,7 @@ class _Carmen:
         size = lines[-1].end - lines[0].begin
         add_block(self.index, begin, size, [line.log_time_ns for line in lines], counts)
 
-    def _tell(self) -> None:
+    def _summarize(self) -> None:
         if self.malformed:
             self.index.note_damage(_complaint(self.index.path, self.malformed))
         if self.others:
@@ -238,7 +238,7 @@ def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
 
 def _numbers(words: list[bytes], count: int) -> list[float]:
     if not 0 <= count <= len(words):
-        raise ValueError(f"{count} numbers are told, {len(words)} words follow")
+        raise ValueError(f"{count} numbers are stated, {len(words)} words follow")
     return [float(word) for word in words[:count]]
 
 
@@ -269,8 +269,8 @@ def read_text(path: Path) -> Text:
     text = bytearray()
     try:
         with path.open("rb") as file:
-            for piece in _pieces(file):
-                text += piece
+            for block in _blocks(file):
+                text += block
                 if len(text) > _MOST_BYTES:
                     raise InputError(f"{path}: unpacks to more than {_MOST_BYTES:,} bytes; is it a CARMEN log?")
     except (zlib.error, EOFError, ValueError) as error:
@@ -282,7 +282,7 @@ def read_text(path: Path) -> Text:
     return Text(bytes(text), "")
 
 
-def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+def _blocks(file: IO[bytes]) -> Iterator[bytes]:
     head = file.read(3)
     file.seek(0)
     if head == b"BZh":
@@ -290,8 +290,8 @@ def _pieces(file: IO[bytes]) -> Iterator[bytes]:
     elif head[:2] == b"\x1f\x8b":
         yield from _unpacked(file, lambda: zlib.decompressobj(zlib.MAX_WBITS | 16))
     else:
-        while piece := file.read(_PLAIN_BYTES):
-            yield piece
+        while block := file.read(_PLAIN_BYTES):
+            yield block
 
 
 def _unpacked(file: IO[bytes], begin: Callable[[], _Unpacker]) -> Iterator[bytes]:

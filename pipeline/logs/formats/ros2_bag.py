@@ -32,7 +32,7 @@ def claims_ros2_bag(path: Path, head: bytes) -> bool:
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
     index, reader = on_demand_index(path, number), _open(path)
-    if not all(_is_sound(connection) for connection in reader.connections):
+    if not all(_is_valid(connection) for connection in reader.connections):
         raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
     bag = _Bag(index, reader)
     index.make = bag.make
@@ -42,9 +42,9 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
 def parts_of_bag(folder: Path) -> list[Path]:
     """The MCAP files of a ROS 2 bag in their order; the folder itself for another storage or a packed bag."""
     try:
-        told = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
-        parts = [folder / Path(name).name for name in told["relative_file_paths"]]
-        is_packed = str(told.get("compression_mode", "")).lower() not in ("", "none")
+        stated = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
+        parts = [folder / Path(name).name for name in stated["relative_file_paths"]]
+        is_packed = str(stated.get("compression_mode", "")).lower() not in ("", "none")
     except (OSError, YAMLError, KeyError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
@@ -127,17 +127,17 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _is_sound(connection: Any) -> bool:
+def _is_valid(connection: Any) -> bool:
     """True if the metadata of a topic is of the right types."""
     texts = connection.topic, connection.msgtype, connection.ext.serialization_format
     return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
 
 
 def _channel(key: tuple[int, int], connection: Any) -> Channel:
-    told = connection.msgdef
+    stated = connection.msgdef
     encoding = connection.ext.serialization_format
-    language = "ros2idl" if told.format.name == "IDL" else "ros2msg"
-    definition = told.data.encode() or _definition(connection.msgtype)
+    language = "ros2idl" if stated.format.name == "IDL" else "ros2msg"
+    definition = stated.data.encode() or _definition(connection.msgtype)
     return Channel(key, connection.topic, encoding, key[1], connection.msgtype, language, definition)
 
 

@@ -40,7 +40,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         return index.make(block, wanted)
     payload = unpack(index, block)
     messages: list[Message] = []
-    met = strangers = 0
+    met = undefined = 0
     try:
         for opcode, begin, end in _records(payload):
             if opcode == SCHEMA:
@@ -51,18 +51,20 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
                 met += 1
                 channel = index.channels.get(number)
-                strangers += channel is None
+                undefined += channel is None
                 if channel is not None and (wanted is None or number in wanted):
                     messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
     except (struct.error, UnicodeDecodeError):
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
-    told = sum(entry.messages for entry in block.entries)
-    if strangers:
+    stated = sum(entry.messages for entry in block.entries)
+    if undefined:
         return Contents(
-            messages, f"{_name(index, block)}: {counted(strangers, 'message')} of a channel that nothing defines"
+            messages, f"{_name(index, block)}: {counted(undefined, 'message')} of a channel that nothing defines"
         )
-    return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
+    return Contents(
+        messages, f"{_name(index, block)}: holds {met} of the {stated} indexed messages" * (met < stated)
+    )
 
 
 def unpack(index: FileIndex, block: Block) -> memoryview:

@@ -108,8 +108,8 @@ class FileIndex:
     data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
         makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    doubted : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
-    is_trusted : whether what blocks say about their channels agrees with what the file says about itself
+    damaged_summary : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
+    is_consistent : whether what blocks say about their channels agrees with what the file says about itself
     """
 
     path: Source
@@ -125,8 +125,8 @@ class FileIndex:
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
     takes_rate: bool = False
-    is_trusted: bool = True
-    doubted: list[tuple[int, int]] = field(default_factory=list)
+    is_consistent: bool = True
+    damaged_summary: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -168,13 +168,13 @@ class FileIndex:
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
         """True if a block can have messages of the channels."""
-        if not self.is_trusted or not block.entries:
+        if not self.is_consistent or not block.entries:
             return True
         return any(entry.channel in channels for entry in block.entries)
 
-    def believe(self, wanted: AbstractSet[int]) -> None:
+    def take_from_damaged_summary(self, wanted: AbstractSet[int]) -> None:
         """Add channels from a damaged summary, as they are defined nowhere else."""
-        for opcode, body in self.doubted:
+        for opcode, body in self.damaged_summary:
             try:
                 if opcode == SCHEMA:
                     self.add_schema(self.data, body)

@@ -51,10 +51,10 @@ def record_end(data: mmap.mmap | bytes, offset: int) -> int:
         return end
     if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
         return 0
-    return end if vouches_for_itself(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
+    return end if states_length_twice(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
 
 
-def vouches_for_itself(data: mmap.mmap | bytes, offset: int) -> bool:
+def states_length_twice(data: mmap.mmap | bytes, offset: int) -> bool:
     """True if the record at ``offset`` states its length twice, and both agree."""
     opcode, length = RECORD.unpack_from(data, offset)
     body = offset + RECORD.size
@@ -125,4 +125,4 @@ def _begins_chunk(data: mmap.mmap | bytes, offset: int) -> bool:
 
 def _is_start(data: mmap.mmap | bytes, offset: int) -> bool:
     end = record_end(data, offset)
-    return end > 0 and (vouches_for_itself(data, offset) or is_end(data, end) or record_end(data, end) > 0)
+    return end > 0 and (states_length_twice(data, offset) or is_end(data, end) or record_end(data, end) > 0)

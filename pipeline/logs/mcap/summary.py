@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.mcap.index import FOOTER_BODY, is_believable
+from scanchain.logs.mcap.index import FOOTER_BODY, is_plausible_size
 from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -64,7 +64,7 @@ def _summary(file: RemoteFile) -> bytes | None:
 
 def _index(file: RemoteFile, number: int, summary: bytes) -> FileIndex | None:
     index = FileIndex(file.address, number, b"", ReadAhead(file.read))
-    chunks_told = -1
+    chunks_stated = -1
     for opcode, body in _records(summary):
         if opcode == SCHEMA:
             index.add_schema(summary, body)
@@ -73,10 +73,10 @@ def _index(file: RemoteFile, number: int, summary: bytes) -> FileIndex | None:
         elif opcode == CHUNK_INDEX:
             index.blocks.append(_block(number, summary, body))
         elif opcode == STATISTICS:
-            chunks_told, index.counts = _statistics(summary, body)
+            chunks_stated, index.counts = _statistics(summary, body)
             index.is_counted = True
     index.blocks.sort(key=lambda block: block.offset)
-    return index if _tells_all(index, file.size, chunks_told) else None
+    return index if _is_complete(index, file.size, chunks_stated) else None
 
 
 def _records(summary: bytes) -> Iterator[tuple[int, int]]:
@@ -94,11 +94,11 @@ def _block(number: int, summary: bytes, body: int) -> Block:
     """A chunk; its number of messages of a channel follows from the offset of the next message index."""
     start_ns, end_ns, chunk, length, size = _CHUNK_INDEX_HEAD.unpack_from(summary, body)
     at = body + _CHUNK_INDEX_HEAD.size
-    told = [_INDEX_OFFSET.unpack_from(summary, place) for place in range(at, at + size, _INDEX_OFFSET.size)]
+    stated = [_INDEX_OFFSET.unpack_from(summary, place) for place in range(at, at + size, _INDEX_OFFSET.size)]
     (indexed,) = struct.unpack_from("<Q", summary, at + size)
     compression, at = read_string(summary, at + size + 8)
     compressed, uncompressed = _SIZES.unpack_from(summary, at)
-    offsets = sorted((offset, channel) for channel, offset in told)
+    offsets = sorted((offset, channel) for channel, offset in stated)
     ends = [*(offset for offset, _ in offsets[1:]), chunk + length + indexed]
     entries = tuple(
         Entry(channel, offset + _ENTRY_HEAD, (end - offset - _ENTRY_HEAD) // 16)
@@ -116,17 +116,17 @@ def _statistics(summary: bytes, body: int) -> tuple[int, dict[int, int]]:
     return chunks, dict(_COUNT.unpack_from(summary, at) for at in range(body + 46, body + 46 + size, _COUNT.size))
 
 
-def _tells_all(index: FileIndex, size: int, chunks_told: int) -> bool:
+def _is_complete(index: FileIndex, size: int, chunks_stated: int) -> bool:
     """True if every chunk lies in the file, has a plausible size, and no message lies elsewhere."""
-    if chunks_told != len(index.blocks) or any(block.chunk_offset < 0 for block in index.blocks):
+    if chunks_stated != len(index.blocks) or any(block.chunk_offset < 0 for block in index.blocks):
         return False
     if any(
-        block.offset + block.size > size or not is_believable(block.size, block.uncompressed_size)
+        block.offset + block.size > size or not is_plausible_size(block.size, block.uncompressed_size)
         for block in index.blocks
     ):
         return False
     totals: Counter[int] = Counter()
     for block in index.blocks:
         totals.update({entry.channel: entry.messages for entry in block.entries})
-    index.is_trusted = dict(totals) == {channel: count for channel, count in index.counts.items() if count}
-    return index.is_trusted or not all(block.entries for block in index.blocks)
+    index.is_consistent = dict(totals) == {channel: count for channel, count in index.counts.items() if count}
+    return index.is_consistent or not all(block.entries for block in index.blocks)

@@ -53,7 +53,7 @@ def read_multi_echo_scan(data: memoryview, form: type[CdrReader] = CdrReader) ->
     reader = form(data)
     stamp_ns, frame = reader.header()
     first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
-    ranges_m = np.full(_believed(reader.integer(), len(data)), np.inf, np.float32)
+    ranges_m = np.full(_checked_count(reader.integer(), len(data)), np.inf, np.float32)
     for beam in range(len(ranges_m)):
         echoes_m = reader.floats()
         if len(echoes_m):
@@ -121,7 +121,7 @@ class LaserScanDecoder:
         return geometry
 
 
-def _believed(beams: int, size: int) -> int:
+def _checked_count(beams: int, size: int) -> int:
     if 4 * beams > size:
         raise MalformedMessageError(f"it claims {beams} beams, more than its {size} bytes can hold")
     return beams

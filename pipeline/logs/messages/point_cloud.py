@@ -69,7 +69,7 @@ def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> Poi
     begin = reader.offset
     count = reader.integer()
     if count > _MOST_FIELDS:
-        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are believed")
+        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are accepted")
     fields = [
         PointField(reader.string(), reader.integer(), reader.integer("B"), reader.integer()) for _ in range(count)
     ]

@@ -15,7 +15,7 @@ ROBOT = Vehicle(
     acceleration_m_s2=0.5,
     lateral_acceleration_m_s2=0.5,
     corner_m=0.6,
-    wander_m=0.05,
+    deviation_m=0.05,
     sway_rad=0.0,
     heave_m=0.0,
     radius_m=0.25,
@@ -79,7 +79,7 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
 
 def _sampled_route() -> Matrix:
     """Points along the route's straight segments, one every 5 cm."""
-    pieces = []
+    segments = []
     for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
-        pieces.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))
-    return np.vstack(pieces)
+        segments.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))
+    return np.vstack(segments)

@@ -26,7 +26,7 @@ CAR = Vehicle(
     acceleration_m_s2=2.5,
     lateral_acceleration_m_s2=4.0,
     corner_m=7.0,
-    wander_m=0.4,
+    deviation_m=0.4,
     sway_rad=0.006,
     heave_m=0.015,
     radius_m=1.0,
@@ -42,7 +42,7 @@ _LANE_M = 2.0  # from the middle of the street, to the right
 _FREE_M = 1.8  # on either side of the middle of a lane
 
 # Crossings in the order they are passed, and the lane taken from there: 1 is the right one, −1 the left one.
-_WAY = (
+_LEGS = (
     ((0, 0), 1), ((100, 0), 1), ((100, 40), 1), ((0, 40), 1),  # new
     ((0, 0), 1), ((0, -40), 1), ((-50, -40), 1), ((-50, 40), 1),  # new
     ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, the other way round
@@ -169,7 +169,7 @@ def rounds(rng: np.random.Generator) -> Solids:
 
 def _lanes() -> Matrix:
     """The route (W, 2): the lane of each street, and its intersection with that of the next one."""
-    legs = [*_WAY, _WAY[0]]
+    legs = [*_LEGS, _LEGS[0]]
     lines = []
     for (start, lane), (end, _) in pairwise(legs):
         along = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
