@@ -35,7 +35,7 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind
 class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="download"):
     """A recording that others publish, in a form that ``scanchain convert`` takes.
 
-    ``page`` is where its authors describe it. ``reference_url`` is what it is judged by, or calibrated with, empty
+    ``page`` is where its authors describe it. ``reference_url`` is its reference or calibration, empty
     if there is nothing. Of an archive ``converts`` is the folder in it that becomes the log.
     """
 
@@ -49,7 +49,7 @@ class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 class Page(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="page"):
     """A recording behind an account or without a fixed address, to be downloaded by hand.
 
-    ``steps`` says what to fetch there and how it becomes MCAP.
+    ``steps`` are the instructions for its download and conversion to MCAP.
     """
 
     page: str
@@ -100,7 +100,7 @@ def prepare(
 ) -> Path:
     """The path of the sequence's log in ``folder``; simulated, or downloaded and converted, where it is missing.
 
-    progress : told of scans made, or of MiB fetched, so many of all
+    progress : called with the scans made, or the MiB downloaded, and their total
     """
     source = load(name).source
     destination = folder / f"{name}.mcap"

@@ -183,7 +183,7 @@ def matrices(value: object, name: str, wanted: tuple[int, ...]) -> NDArray[np.fl
 
 
 def whole_numbers(value: object, name: str, wanted: str) -> NDArray[np.int64]:
-    """An array of whole numbers; floats are refused, since seconds are told from nanoseconds by that alone."""
+    """An array of whole numbers; floats are refused, since that alone distinguishes seconds from nanoseconds."""
     array = _array(value, name, wanted)
     if array.dtype.kind not in "iu" and array.size:
         raise InputError(f"{name} holds {_kind(array)}; wanted whole numbers: {wanted}")

@@ -29,9 +29,9 @@ class DownloadError(ScanchainError):
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> str:
     """Download a file unless it exists, resuming an earlier try; returns its SHA-256.
 
-    sha256 : what it must be, empty where nobody knows. Raises InputError where it is not, and for what is no
+    sha256 : the expected one, empty where unknown. Raises InputError where it is not, and for what is no
         HTTP address; DownloadError where the server does not respond as it should.
-    progress : told how many MiB of how many are there, 0 where the server does not say
+    progress : called with the MiB received and their total, 0 where unknown
     """
     if urlsplit(url).scheme not in ("http", "https"):
         raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")

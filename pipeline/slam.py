@@ -249,7 +249,7 @@ class Slam:
     def _optimize_when_due(self) -> GraphState | None:
         """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
 
-        The growth asked for is a share of the graph, so that all optimizations together cost little more than a
+        The required growth is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
@@ -270,7 +270,7 @@ class Slam:
 def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:
     """Information (k, k) of a pose-graph edge: the matcher's, with a floor under its variances.
 
-    Residuals share the map's errors and are far from independent, so that H alone promises too much.
+    Residuals share the map's errors and are far from independent, so that H alone is overconfident.
     """
     floor = lie.by_component(len(match.information), sigma_m, sigma_rad) ** 2
     covariance = np.linalg.inv(match.information + np.diag(1e-6 / floor)) + np.diag(floor)

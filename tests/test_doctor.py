@@ -427,7 +427,7 @@ def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd)
     finding = diagnose(path)["sensors"]
     assert finding.severity == "ok"
     assert finding.found.split("; ") == [
-        "GNSS /fix: not used", "ground truth /ground_truth: judges the result, is not used for it",
+        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
     ]  # fmt: skip
     assert main(["info", str(path)]) == 0

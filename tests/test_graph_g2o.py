@@ -126,7 +126,7 @@ def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_
 def test_toro_cannot_hold_points(tmp_path):
     path = tmp_path / "square.g2o"
     path.write_text(SQUARE)
-    with pytest.raises(InputError, match="TORO knows no points, and the graph has 1"):
+    with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
         write_toro(tmp_path / "x.graph", read_g2o(path).graph)
 
 

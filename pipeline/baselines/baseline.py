@@ -82,7 +82,7 @@ class InPlane:
     """Feeds a 3D baseline with planar scans and brings its poses back into the plane.
 
     Points lie at z = 0 or, where the method looks for surfaces, stand on top of each other: walls, whose normals
-    are horizontal. All levels are alike, so that nothing is said about the height.
+    are horizontal. All levels are alike, so that the height is unobservable.
     """
 
     def __init__(self, baseline: Baseline, *, is_raised: bool) -> None:

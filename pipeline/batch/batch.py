@@ -52,7 +52,7 @@ class Batch:
     out : the batch's directory, created or resumed
     config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
     workers : processes at a time on this machine
-    time_s : what a log may take; memory_mib : as well, None for a fair share of what is free
+    time_s : limit of a log; memory_mib : likewise, None for a fair share of the free memory
     retries : further tries of a log that crashed its process
     """
 
@@ -89,7 +89,7 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
     """Run the logs without a result and write the table; logs of the same contents are run once.
 
     work : where the tasks are run; None for processes on this machine
-    On Ctrl-C what runs is killed, and the table says what was not run. Raises InputError for a directory that
+    On Ctrl-C what runs is killed, and the table lists what was not run. Raises InputError for a directory that
     cannot be made or is another's, and a configuration that is wrong.
     """
     _check_out(batch)
@@ -171,7 +171,7 @@ def _row_of(task: Task, rows: dict[str, Row]) -> Row:
     if not task.sha256:
         if isinstance(source, Path) and not source.exists():
             return unfinished_row(task, State.FAILED, "no such file; check the path")
-        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} says why")
+        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} shows the reason")
     return unfinished_row(task, State.NOT_RUN, "stopped by the user")
 
 

@@ -20,7 +20,7 @@ from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 
-ROWS_FOLDER = "rows"  # of a batch's directory: what became of each log
+ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
 
 class State(StrEnum):
@@ -50,7 +50,7 @@ class Task(Struct, frozen=True):
     key : of its contents and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
-    time_s, memory_mib : what its process may take
+    time_s, memory_mib : limits of its process
     retries : further tries of one that crashed
     """
 
@@ -160,7 +160,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
         [*command, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
         output=task.output_file,
-        look_s=_LOOK_S,
+        interval_s=_LOOK_S,
         is_own_session=True,
         stop=stop,
     )

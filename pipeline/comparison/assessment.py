@@ -44,7 +44,7 @@ class Assessed:
         end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
     relations : the error over relations; None without any, or after a failure
-    definitions : what was computed, in words
+    definitions : of the figures, as text
     """
 
     figures: Figures

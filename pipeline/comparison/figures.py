@@ -60,7 +60,7 @@ class Column(Struct, frozen=True):
     digits : after the point, at most
     better : which values are marked as the best; "one" is whatever is nearest to 1
     table : the summary, which the short tables are, or one of the two that hold the rest
-    definition : what it says, in a sentence
+    definition : its meaning, in a sentence
     """
 
     key: str

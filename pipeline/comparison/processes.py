@@ -22,7 +22,7 @@ _SHARE = 0.75  # share of the free memory that is the default limit
 
 
 def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
-    """The limits asked for, else 300 s and one more a scan, and three quarters of the memory that is free."""
+    """The requested limits, else 300 s and one more a scan, and three quarters of the memory that is free."""
     return Limits(
         _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
         _SHARE * available_mib() if memory_mib is None else memory_mib,
@@ -67,7 +67,7 @@ def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
 
 
-_LOOK_S = 0.02
+_INTERVAL_S = 0.02
 _LAST_CHARACTERS = 300  # last characters of the output of a process that crashed, which are reported
 _KILLED = -9
 
@@ -78,7 +78,7 @@ def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> En
     command = [sys.executable, "-P", "-m", "scanchain.comparison.worker", str(scans), str(folder)]
     # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
-    ending = run_within(limits, command, environment, output=folder / "output.txt", look_s=_LOOK_S)
+    ending = run_within(limits, command, environment, output=folder / "output.txt", interval_s=_INTERVAL_S)
     if ending.killed_for is KilledFor.TIME:
         return _ended(Status.TIMED_OUT, f"took longer than --time-limit ({limits.time_s:.3g} s)", ending, folder)
     if ending.killed_for is KilledFor.MEMORY:

@@ -32,7 +32,7 @@ METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tu
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Reference of the errors: poses, relations, both or none; ``note`` says what is missing."""
+    """Reference of the errors: poses, relations, both or none; ``note`` names what is missing."""
 
     truth: Trajectory | None
     relations: Relations | None
@@ -98,7 +98,7 @@ _NOTES = {
     "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
     "distance_m": "traveled up to the scan, by the method itself",
     "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
-    "nees": "of the motion up to the scan; null where the method does not tell its covariance",
+    "nees": "of the motion up to the scan; null where the method reports no covariance",
 }
 
 

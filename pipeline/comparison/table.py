@@ -35,7 +35,7 @@ class Row(Struct, frozen=True):
     ----------
     status, reason : of the first run that did not end well, else ok
     settings : whole, as a TOML file for --settings would hold them
-    definitions : what its errors are, in words
+    definitions : of its errors, as text
     unreliable : reason, by its own account, not to use the result, as most of its scans are degenerate; else empty
     """
 

@@ -41,7 +41,7 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
     """T_reference_estimate (4, 4), to be put in front of each estimated pose.
 
     estimate, reference : (N, 4, 4) paired poses. Planar ones are aligned within the plane, where a mirrored
-    course cannot be met by turning the plane over. Raises InputError where the positions leave a rotation free.
+    trajectory cannot be aligned by turning the plane over. Raises InputError where a rotation is unobservable.
     """
     if alignment is Alignment.NONE:
         return np.eye(4)
@@ -84,7 +84,7 @@ class AbsoluteError:
 
     Attributes
     ----------
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation

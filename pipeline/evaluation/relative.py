@@ -29,7 +29,7 @@ class RelativeError:
     Attributes
     ----------
     size : of the stretches, in words
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
     stretches : (M, 2) int64 places i, j among the pairs
     errors_m, errors_rad : (M,) stretch by stretch
@@ -145,7 +145,7 @@ class KittiError:
 
     Attributes
     ----------
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
     stretches : how many there were

@@ -110,7 +110,7 @@ def certify(
         if borrowing.any():
             i, j = names[problem.edges[borrowing][0]]
             edges = counted(int(borrowing.sum()), "edge")
-            reason += f", or where Ω says little of some direction, first at {i}-{j} of {edges}"
+            reason += f", or where Ω has little information about some direction, first at {i}-{j} of {edges}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 
@@ -266,7 +266,7 @@ def _isotropic_of_singular(information: Matrix, d: int) -> tuple[NDArray[np.floa
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω: the smallest eigenvalues, lowered as far as the coupling asks."""
+    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω: the smallest eigenvalues, lowered for the coupling."""
     tau = np.linalg.eigvalsh(information[:, :d, :d])[:, 0]
     kappa = np.linalg.eigvalsh(information[:, d:, d:])[:, 0]
     k = information.shape[-1]

@@ -199,7 +199,7 @@ class PoseGraph:
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        rejection : of loop edges under the truncated loss; "gnc" is good enough on the way and cheaper
+        rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")

@@ -42,7 +42,7 @@ class Truth:
 
 
 def of_positions(state: Values, data: LandmarkData) -> Accuracy:
-    """Against the positions of a course file; both lie in one frame."""
+    """Against the positions of an npz file; both lie in one frame."""
     return Accuracy(
         _rms(state.poses - data.true_poses),
         _rms(state.landmarks - data.true_landmarks),

@@ -72,7 +72,7 @@ class Measurements:
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's
-    calibration : what the motions may all be off by
+    calibration : errors common to all motions
     observed : (N, 2) pose, landmark
     measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; of every one alike
     landmarks : (L,) their names, as numbers
@@ -172,7 +172,7 @@ class BearingRangeProblem:
 
 
 def world_referenced(data: LandmarkData) -> Measurements:
-    """The problem of a course file: headings are known, so that bearings are those of the world's axes."""
+    """The problem of an npz file: headings are known, so that bearings are those of the world's axes."""
     return Measurements(
         first_pose=np.zeros(2),
         first_covariance=_ANCHOR**2 * data.odometry_covariance,

@@ -25,7 +25,7 @@ class MethodResult:
     ----------
     method : its name
     build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
-    again_s : the whole once more with the same solver, which keeps what it found out about the pattern
+    again_s : the whole once more with the same solver, which reuses its analysis of the pattern
     iterations : linear solves
     factor : of the last one
     x : (n,) the unknowns

@@ -69,7 +69,7 @@ def minimize(
 ) -> Minimum:
     """Follow the residuals downhill from the guess; a linearized step at a time, each solved by ``solver``.
 
-    It ends where ``descend`` says. The first damping is for a guess that may be poor; near the minimum 1e-10
+    It ends as ``descend`` does. The first damping is for a guess that may be poor; near the minimum 1e-10
     serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
     start = problem.linearize(guess)

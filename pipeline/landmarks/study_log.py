@@ -27,7 +27,7 @@ _FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model fit
 def study_log(folder: Path, options: Options) -> Study:
     """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
 
-    The linear solvers that are asked for run on the first step from where the estimate began, with the noise that
+    The requested linear solvers run on the first step from where the estimate began, with the noise that
     it found; ``ESTIMATOR`` makes the estimate.
     """
     log = read_mrclam(folder, options.robot)

@@ -60,7 +60,7 @@ class Layout:
 class Pattern:
     """Entries of A that may be nonzero, row by row: columns of row r are columns[row_start[r] : row_start[r + 1]].
 
-    One object is one pattern: solvers keep what they found out about it as long as they are given the same one.
+    One object is one pattern: solvers reuse their analysis of it as long as they are given the same one.
     """
 
     row_start: NDArray[np.int64]

@@ -22,7 +22,7 @@ _PAUSE_S = 0.5  # pause after the first failure; twice as long after each furthe
 _CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts after which a server counts as gone
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
 
-_PIECE_BYTES = 8_000_000
+_BLOCK_BYTES = 8_000_000
 
 
 class RemoteFile:
@@ -30,8 +30,8 @@ class RemoteFile:
 
     Attributes
     ----------
-    size : bytes, 0 where the server does not say
-    version : its ETag or when it was last changed, empty where the server does not say
+    size : bytes, 0 where the server does not state it
+    version : its ETag or when it was last changed, empty where the server does not state it
     """
 
     def __init__(self, address: Address) -> None:
@@ -121,7 +121,7 @@ def _patient(ask: Callable[[], T], what: str) -> T:
             if hopeless := _hopeless(error):
                 raise InputError(f"{what}: {hopeless} ({reason})") from error
             if attempt == _ATTEMPTS:
-                raise InputError(f"{what}: cannot be read ({reason}); asked {_ATTEMPTS} times") from error
+                raise InputError(f"{what}: cannot be read ({reason}); requested {_ATTEMPTS} times") from error
             sleep(_PAUSE_S * 2 ** (attempt - 1))
     raise AssertionError
 
@@ -170,8 +170,8 @@ def fetch_whole(file: RemoteFile) -> Path:
 def _copy(file: RemoteFile, destination: Path) -> None:
     """Copy block by block, so that a broken connection costs one block only."""
     with destination.open("wb") as copy:
-        for offset in range(0, file.size, _PIECE_BYTES):
-            copy.write(file.read(offset, min(_PIECE_BYTES, file.size - offset)))
+        for offset in range(0, file.size, _BLOCK_BYTES):
+            copy.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
 
 
 def files_of(path: Path) -> list[Path]:

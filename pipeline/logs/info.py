@@ -36,9 +36,9 @@ class LogInfo:
     """A log: files, topics, those that a run would use, and problems.
 
     ``sensors`` are those beside lidar and wheels.
-    ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Meters, radians,
-    nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
-    ``base_frame`` is empty where the log does not tell it. ``idle_keys`` are the settings that have no effect on
+    ``lidar`` is empty where a run could not choose a topic, for the reason in ``problem``. Meters, radians,
+    nanoseconds; ``T_base_lidar`` row by row, the first one where the lidar moves (``mount_motion``);
+    ``base_frame`` is empty where the log does not state it. ``idle_keys`` are the settings that have no effect on
     it, and why.
     """
 

@@ -127,7 +127,7 @@ class Log:
                 ("log.point_times", "preprocess.deskew"), "the scans have no times of their points"
             )
         if is_scan(self.lidar):
-            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan tells the times of its beams itself")
+            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan states the times of its beams")
         if not any(index.takes_rate for index in self.indexes):
             idle["log.rate_hz"] = HAS_STAMPS
         if not self.has_odometry:

@@ -59,8 +59,8 @@ class Mounting(NamedTuple):
 
     Attributes
     ----------
-    base, lidar : frames; the base's is empty where the log does not tell it
-    T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not tell it
+    base, lidar : frames; the base's is empty where the log does not state it
+    T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     fixed : the static transforms; joints : those of /tf between base and lidar, none where all are static
     motion : None where the lidar stays where it is
     note : what was assumed, empty where nothing was

@@ -108,7 +108,9 @@ def _index_copy(file: RemoteFile, number: int, config: LogConfig) -> FileIndex:
     copy = fetch_whole(file)
     index = _index_path(copy, number, config, file.address)
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
-    index.notes.insert(0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were fetched")
+    index.notes.insert(
+        0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded"
+    )
     return index
 
 

@@ -88,7 +88,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
-            found.append(OtherSensor("ground truth", topic, "judges the result, is not used for it"))
+            found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:

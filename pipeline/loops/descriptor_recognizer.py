@@ -60,7 +60,7 @@ class DescriptorRecognizer:
     def _best(self, descriptor: Descriptor, similar: Sequence[Descriptor], query: Query) -> Candidate:
         """The most similar of several descriptors, ambiguous where another one contradicts it.
 
-        Two that are the same place, but for what the map may have drifted between them, do not contradict.
+        Two at the same position, up to the possible drift of the map between them, do not contradict.
         """
         ranked = sorted(
             ((compare(descriptor, other), other.anchor) for other in similar), key=lambda each: -each[0].similarity

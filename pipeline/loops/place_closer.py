@@ -162,5 +162,5 @@ class PlaceCloser:
         moved_m = float(np.linalg.norm(moved[:-1, -1]))
         traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
         if moved_m > max(limits.place_drift * traveled_m, limits.min_radius_m):
-            return f"{moved_m:.1f} m from the prediction > loops.place_drift ({limits.place_drift:g}) of the way"
+            return f"{moved_m:.1f} m from the prediction > loops.place_drift ({limits.place_drift:g}) of the path"
         return ""

@@ -63,7 +63,7 @@ class Recognizer(Protocol):
     """Database of submaps that proposes which of them a new one revisits.
 
     A checkpoint does not hold it: a resumed run makes a new one from its name and adds the same submaps again, in
-    the same order. It goes on to the same result if ``query`` changes nothing that a later answer depends on.
+    the same order. It goes on to the same result if ``query`` changes nothing that a later result depends on.
     """
 
     def __init__(self, config: Config, dimension: int) -> None:

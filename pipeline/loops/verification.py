@@ -76,7 +76,7 @@ class ScanVerifier:
         """The source's scan in the submap of an anchor, from an initial pose.
 
         newest : keyframe that may be in the submap
-        alone : whether nothing but the match speaks for the closure, of which more is asked then
+        alone : whether nothing but the match supports the closure, which must overlap more then
         """
         submap = self.submaps.around(target, keyframes, newest)
         points = downsample(keyframes[source].points, submap.scale * self.match_voxel_m)

@@ -33,7 +33,7 @@ class View:
     ----------
     T_world_lidar : (d+1, d+1)
     points : (M, d) meters, lidar frame
-    spacing_m : edge of the voxels that the scan was thinned out with; a surface has a point in each
+    spacing_m : edge of the voxels that the scan was downsampled with; a surface has a point in each
     """
 
     T_world_lidar: Pose
@@ -47,7 +47,7 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
     A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
     """
     index = _Cells(_in_space(voxels), _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi))
-    seen, looked_through = np.zeros((2, len(voxels)), np.int32)
+    seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
         for view in views:
@@ -61,14 +61,14 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
             parts = [
                 pool.submit(
                     weigh_points, index.points, np.ascontiguousarray(spans[k::_THREADS]), T_lidar_world, ranges_m,
-                    limits, _ENOUGH, seen, looked_through,
+                    limits, _ENOUGH, seen, seen_through,
                 )
                 for k in range(_THREADS)
             ]  # fmt: skip
             for part in parts:
                 part.result()
     result = np.zeros(len(voxels), bool)
-    clearly = (looked_through >= _LEAST_THROUGH) & (looked_through > _MAJORITY * seen)
+    clearly = (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
     result[index.order] = clearly & (seen < _ENOUGH)
     return result
 

@@ -13,7 +13,7 @@ class MotionFilter:
     """Constant velocity: the pose moves on by the motion, the motion stays but for its noise.
 
     A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
-    are known to go together: the next match, which is right again, does not throw the motion the other way.
+    are known to go together: the next match, which is right again, does not reverse the motion.
 
     Attributes
     ----------

@@ -19,8 +19,8 @@ class Tracked:
     """A scan with its pose in the odometry frame.
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
-    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
-    ``elsewhere_m`` is how far away it may be where nothing says how it came there, 0 as a rule.
+    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
+    ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
     """
 
     scan: Scan

@@ -21,7 +21,7 @@ class Resolution:
 
     Attributes
     ----------
-    scale : 1, ½, ¼ …, what all voxel sizes of the configuration are multiplied with: small in narrow places, so
+    scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
         that the median range spans about ``preprocess.range_voxels`` voxels of the local map, or more
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
     """

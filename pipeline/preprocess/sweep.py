@@ -49,7 +49,7 @@ class Sweep:
         velocity : (k,) twist per second in the lidar frame, constant through the scan
         Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
         alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
-        the other way, and so on for ever.
+        in the other direction, and so on.
         """
         if not self.is_distorted:
             return self.points

@@ -29,7 +29,7 @@ _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reporte
 class Accuracy(Struct, frozen=True):
     """A trajectory against the ground truth; what the path is too short for is null.
 
-    Of the scans, ``pairs`` have a true pose; ``missing`` says how many have none and why, empty if all have.
+    Of the scans, ``pairs`` have a true pose; ``missing`` counts the others, with the reason, empty if all have.
     """
 
     pairs: int
@@ -47,7 +47,7 @@ class Accuracy(Struct, frozen=True):
 class GroundTruth(Struct, frozen=True):
     """Accuracy of a run against the ground truth, after and before optimization.
 
-    ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
+    ``max_gap_s`` : between true poses to interpolate over, as requested; null for the default
     """
 
     source: str
@@ -69,7 +69,7 @@ class Metrics(Struct, frozen=True):
     No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
     Closures tried = rejected by verification + verified; verified = rejected by the back end + accepted.
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
-    ``stopped`` says why the run did not see the whole log, of which these are the numbers up to there; else empty.
+    ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
     ``unreliable`` is the reason not to use the result as a whole, empty if there is none.
     ``warnings`` : data lost, skipped or wrong, a line each

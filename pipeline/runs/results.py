@@ -103,7 +103,7 @@ def results_of(
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write every output that is asked for into a run directory."""
+    """Write every requested output into a run directory."""
     for output in OUTPUTS:
         if output.is_wanted(results.config):
             output.write(folder / output.file, results)
@@ -127,7 +127,7 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
 
 
 def cloud_of(result: SlamResult, config: Config) -> Cloud:
-    """The cloud of all keyframes, without moving objects if the configuration says so."""
+    """The cloud of all keyframes, without moving objects if so configured."""
     dimension = result.trajectory.dimension
     built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()

@@ -52,7 +52,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
 
 
 def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
-    """A covariance (6, 6) as nav_msgs/Odometry tells it: x, y, z, and turns about the fixed axes of its frame.
+    """A covariance (6, 6) as in nav_msgs/Odometry: x, y, z, and turns about the fixed axes of its frame.
 
     covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); None, where a
         direction is undetermined, becomes zeros, which stand for unknown

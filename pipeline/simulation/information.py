@@ -33,7 +33,7 @@ def spectrum(information: Matrix) -> tuple[NDArray[np.float64], Matrix]:
 
     Rotations are measured by what they do to the returns: H is scaled by L = √(Σ|p × n|² / N), N = Σ|n|², so that
     the twist of every row, in meters and radians, moves the returns by about a meter. Shares do not depend on the
-    number of returns nor on units; a share of 1e-4 means that H knows the direction as well as it would if one
+    number of returns nor on units; a share of 1e-4 means that H constrains the direction as well as if one
     return in ten thousand faced it squarely.
     """
     count, levers = np.trace(information[:3, :3]), np.trace(information[3:, 3:])

@@ -38,7 +38,7 @@ def simulate(
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
-    ``progress`` is told scans done and scans in all.
+    ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """

@@ -27,7 +27,7 @@ class Vehicle:
 
     Attributes
     ----------
-    speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the way and in bends
+    speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the path and in bends
     corner_m : standard deviation of the smoothing that rounds the route; a right angle gets 0.9 of it as radius
     deviation_m : how far it strays from the route, differently on every lap
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes

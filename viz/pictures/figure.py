@@ -47,7 +47,7 @@ class SvgFigure:
     """One figure with one pair of axes; a context, inside which ``axes`` is drawn on.
 
     height_inches : of the whole figure
-    name : tells its parts from those of other figures on the same page
+    name : prefix of the ids of its parts on a page
     """
 
     def __init__(self, name: str, height_inches: float = 2.7) -> None:

@@ -70,7 +70,9 @@ def start_web(port: int, web_port: int, recording: Path | None = None) -> subpro
     """Serve the web viewer on this machine only: of a .rrd file, or of what is sent to ``port``."""
     for taken in (port, web_port):
         if is_listening(taken):
-            raise ViewerError(f"no web viewer: port {taken} is taken; close what listens there (another viewer?)")
+            raise ViewerError(
+                f"no web viewer: port {taken} is taken; close the program that uses it (another viewer?)"
+            )
     files = [] if recording is None else [str(recording)]
     process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port), *files)
     try:
@@ -116,13 +118,13 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
         if listening_since is not None and monotonic() - listening_since > _SETTLE_S:
             return
         sleep(0.02)
-    raise ViewerError(f"no viewer: it did not answer within {_START_S:.0f} s; try `rerun` on its own")
+    raise ViewerError(f"no viewer: it did not respond within {_START_S:.0f} s; try `rerun` on its own")
 
 
 def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> None:
     """Open a .rrd file: a window that lives on by itself, or a page served on this machine until Ctrl-C.
 
-    announce : told the page's address
+    announce : called with the page's address
     """
     if in_browser:
         _serve(path, announce)

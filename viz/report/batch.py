@@ -63,7 +63,8 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in its own process.",
         facts=tuple(totals(rows)),
-        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; see the table for the reason",)
+        * bool(missing)
         + tuple(unreliable),
         notes=(),
         sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),

@@ -39,7 +39,7 @@ class Cell:
 class Row:
     """A table's row: its subject, with its line in the drawings if it has one, and its cells.
 
-    ``link`` : a page or file beside this one that tells more
+    ``link`` : a page or file beside this one with details
     """
 
     name: str

@@ -58,9 +58,9 @@ class G2oFile:
     ----------
     graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
     ids : (K,) the file's vertex ids
-    other_lines : lines that say nothing about poses and edges, kept to be written again
+    other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
-    projection : what became of indefinite information matrices; None without any
+    projection : of the indefinite information matrices; None without any
     """
 
     graph: PoseGraph

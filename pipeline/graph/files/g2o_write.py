@@ -91,9 +91,9 @@ def write_toro(
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
 ) -> None:
-    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO knows no points."""
+    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO has no points."""
     if graph.is_point.any():
-        raise InputError(f"{path}: TORO knows no points, and the graph has {graph.is_point.sum()}; write .g2o")
+        raise InputError(f"{path}: TORO has no points, and the graph has {graph.is_point.sum()}; write .g2o")
     d = graph.dimension
     names = (np.arange(len(graph)) if ids is None else ids).tolist()
     lines = [

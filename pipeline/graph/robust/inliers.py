@@ -45,7 +45,7 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
     """The price, lowered where the contradictions of kept edges (L,) show that the noise model is pessimistic.
 
     Information matrices that are far too small would let in any edge. The median of the contradictions, against
-    that of χ² with so many degrees of freedom, says by how much they are.
+    that of χ² with so many degrees of freedom, is the factor.
     """
     if len(against) < _FEWEST:
         return nominal
@@ -59,7 +59,7 @@ def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool
     It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
     predict: with P the covariance of the prediction, given all kept edges,
         eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
-    The residual alone says less: a kept edge bends the graph toward itself. Where a lower bound of the second,
+    The residual alone is too small: a kept edge bends the graph toward itself. Where a lower bound of the second,
     by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
     """
     errors, k = problem.errors(poses), problem.freedom

@@ -26,7 +26,7 @@ _SHAPES = {
 def read_landmark_data(path: Path) -> LandmarkData:
     """Read a problem; raises InputError for whatever is wrong with the file, pickled objects included.
 
-    Nothing in the file says whether its observations are relative positions or bearings and ranges: the one that
+    The file does not state whether its observations are relative positions or bearings and ranges: the one that
     the true positions fit better is taken.
     """
     arrays = _read(path)

@@ -12,13 +12,13 @@ from scanchain.kernels.landmarks import dead_reckoning
 from scanchain.landmarks.bearing_range import Calibration
 from scanchain.landmarks.files.mrclam import RangeLog
 
-_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot is told to move
+_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
 
 OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
 _MEAN = np.zeros(5)
-_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # what differential drives may have; the units as above
+_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are taken
 
 
@@ -48,7 +48,7 @@ class Reckoning:
     ----------
     motion : (K − 1, 3) from each node to the next, in the frame of the former
     sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each noise of unit density, and by none
-    calibration : what the robot's velocities may be off by, and the motion's slope
+    calibration : errors of the robot's velocities, and the motion's Jacobian
     """
 
     motion: Matrix

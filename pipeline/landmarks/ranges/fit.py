@@ -21,7 +21,7 @@ from scanchain.landmarks.solvers import LinearSolver
 _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
 _LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
-_LEAST_FREEDOM = 1e-3  # observations beyond what the state takes up
+_LEAST_FREEDOM = 1e-3  # least redundancy of the observations
 _TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
 _RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is known then
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
@@ -93,7 +93,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
     variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
     now = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
     if not np.all(now.consistency.redundancy > _LEAST_FREEDOM):
-        raise InputError("the landmarks were seen too seldom to tell the sensor's noise; give a longer log")
+        raise InputError("the landmarks were seen too seldom to estimate the sensor's noise; give a longer log")
     iterations = now.minimum.iterations
     for turn in range(_TURNS):
         growth = now.consistency.growth(stated / variances)

@@ -79,7 +79,7 @@ class Consistency:
     ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
     motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
-    sightings : what all of them count as
+    sightings : effective number of them
     sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
     """
 
@@ -113,7 +113,7 @@ def consistency(
     sources: Matrix,
     share: NDArray[np.float64],
 ) -> Consistency:
-    """Weigh residuals against what they should be where the noise is right.
+    """Compare residuals with their expectation under the noise model.
 
     With r a whitened motion, W its whitening, H = J C Jᵀ its leverage and V = Σ Vₛ its covariance by sources, the
     part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). Of observations,

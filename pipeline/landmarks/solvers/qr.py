@@ -76,8 +76,8 @@ class QrSolver:
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
     """Order the columns and lay out the fronts.
 
-    Within the asked order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
-    it is (Liu 1990), so that R can be given in the order asked for.
+    Within that order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
+    it is (Liu 1990), so that R can be given in the requested order.
     """
     n = pattern.shape[1]
     column_start, rows = pattern.by_column()

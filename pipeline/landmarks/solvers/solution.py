@@ -25,7 +25,7 @@ class Factor:
 
     Attributes
     ----------
-    name : what it is, as "U of AᵀA" or "R of A"
+    name : such as "U of AᵀA" or "R of A"
     matrix : (n, n) its rows and columns as the method ordered them; may hold zeros where it could have filled in
     order : (n,) column of A at each place of that order
     """

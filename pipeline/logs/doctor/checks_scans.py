@@ -122,7 +122,7 @@ def _no_return(seen: Survey) -> Finding:
     """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
     farthest_m = max(values, default=0.0)
-    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below the stated range, to the last bit
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
     stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))

@@ -181,9 +181,11 @@ def _by_azimuth(seen: Survey) -> str:
         return ""
     low_s, high_s = _SPINS_AT_S
     revolution_s = f"{seen.period_s:.3g}" if low_s < seen.period_s < high_s else "0.1"
-    way = "counterclockwise" if sense > 0 else "clockwise"
+    direction = "counterclockwise" if sense > 0 else "clockwise"
     start_rad = f"{np.angle(start) % (2.0 * np.pi):.3g}"
-    return f"--log.point_times {way} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+    return (
+        f"--log.point_times {direction} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+    )
 
 
 def _other_unit(seen: Survey, part: float) -> str:

@@ -143,13 +143,13 @@ class ScanFacts(NamedTuple):
     beams : measurements in the message; ``undefined`` are NaN or infinite, ``zero`` are at no distance at all
     below : closer than ``limits_m``, though not at no distance
     kept : what a run would use
-    limits_m : the least and the largest range that the message believes in, 0 and inf where it tells none
-    farthest_m, at_farthest : the largest finite range and how many beams tell just that one
+    limits_m : the least and the largest valid range of the message, 0 and inf where it states none
+    farthest_m, at_farthest : the largest finite range and the number of beams with just that one
     ranges_m : (101,) percentiles of the ranges that are kept, NaN where none is
     time_span_s : of the per-point times, NaN where there are none
     turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
     start_rad : azimuth of the first point
-    rings : rings with returns, 0 where points do not tell
+    rings : rings with returns, 0 where points have no field for it
     digest : of the measurements, equal for equal ones
     points : (N, d) meters, those that are kept
     outline : (C,) meters, mean distance in each cell of direction, NaN where nothing was seen

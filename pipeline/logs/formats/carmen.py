@@ -198,7 +198,7 @@ def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: f
     """A FLASER or ROBOTLASER1 line. Raises ValueError or IndexError where words are missing or no numbers.
 
     max_range_m, offset_m : the scanner's reach and its place ahead of the robot's center, as the log's PARAM
-        lines tell them for FLASER; ROBOTLASER1 tells both itself
+        lines set them for FLASER; ROBOTLASER1 states both itself
     """
     if words[0] == b"FLASER":
         count = int(words[1])

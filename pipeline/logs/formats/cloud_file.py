@@ -61,7 +61,7 @@ def _all_of(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
 
 
 def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.void]:
-    """The points (N,) of a file as they are, little endian, in number types that ROS knows.
+    """The points (N,) of a file as they are, little endian, in number types of ROS.
 
     raw : a point of a .bin file
     Raises CloudFileError, and OSError where the file cannot be read.
@@ -128,7 +128,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         try:
             point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
         except (KeyError, IndexError, ValueError) as error:
-            raise CloudFileError(f"is no PCD: its header does not tell {error}") from error
+            raise CloudFileError(f"is no PCD: its header does not state {error}") from error
         if form == "ascii":
             return ascii_rows(file, point, count)
         return (
@@ -167,7 +167,9 @@ def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDAr
     packed_size, size = struct.unpack("<II", sizes)
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
-        raise CloudFileError(f"does not unpack: {size} bytes are told for {count} points, {len(packed)} are there")
+        raise CloudFileError(
+            f"does not unpack: {size} bytes are stated for {count} points, {len(packed)} are there"
+        )
     try:
         data = lzf.decompress(packed, size)
     except ValueError:

@@ -125,7 +125,7 @@ def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
     stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
     if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
         raise InputError(
-            f"{folder}: names such as {files[0].name} tell no stamp of their own; say how often the scans come, "
+            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
             "as in --log.rate_hz 10"
         )
     return stamps_ns
@@ -136,7 +136,7 @@ def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
 
     A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
     columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
-    so that all columns look alike. x, y, z, intensity where nothing speaks for another. Raises CloudFileError
+    so that all columns are equal. x, y, z, intensity where no other is more likely. Raises CloudFileError
     where none fits.
     """
     sizes = [file.stat().st_size for file in files]

@@ -1,6 +1,6 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-The records are walked as those of an MCAP file are, and what is damaged is passed over in the same way.
+The records are walked as those of an MCAP file are, and what is damaged is passed over likewise.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -104,7 +104,7 @@ def whole_records(data: Data) -> Iterator[Record]:
 def next_record(data: Data, offset: int, stated_end: int) -> Record | None:
     """The first record behind the offset that may stand outside of a chunk; None where there is none.
 
-    stated_end : byte at which the damaged record ends if it tells the truth; no connection before it is taken, as
+    stated_end : byte at which the damaged record ends if its length is right; no connection before it is taken, as
         chunks hold such too
     """
     for match in _OPCODE.finditer(data, offset + 1):
@@ -212,7 +212,7 @@ class _Bag:
         index.is_counted = True
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a chunk; connections met on the way join the index."""
+        """The messages of a chunk; connections found there join the index."""
         name = f"{self.index.path}: the chunk at byte {block.offset}"
         messages: list[Message] = []
         undefined = 0

@@ -33,7 +33,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
     index, reader = on_demand_index(path, number), _open(path)
     if not all(_is_valid(connection) for connection in reader.connections):
-        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
+        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
     bag = _Bag(index, reader)
     index.make = bag.make
     return index

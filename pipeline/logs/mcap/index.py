@@ -53,7 +53,7 @@ def claims_mcap(path: Path, head: bytes) -> bool:
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
     """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
 
-    source : what it is a copy of, and is called in what is said of it; None for itself
+    source : the original of a copy, named in messages; None for itself
     """
     index = FileIndex(source or path, number, _map(path))
     data, walk, resync = index.data, Walk(index), Resync(index.data)
@@ -102,7 +102,7 @@ class Walk:
         self.index = index
         self.is_inconsistent = False  # in a summary of a wrong CRC
         self.chunks_stated = 0  # by the statistics
-        self.private: list[int] = []  # where records lie that only some application knows
+        self.private: list[int] = []  # offsets of records of some application
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
         self.loose_from = -1
@@ -271,7 +271,7 @@ def check_claims(index: FileIndex, chunks_stated: int, private: Sequence[int]) -
             f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
             f"are not the {chunks_stated} and {sum(stated.values())} of its statistics"
         )
-    if private and not index.is_counted:  # nothing tells whether one of them was a chunk
+    if private and not index.is_counted:  # one of them may have been a chunk
         index.damage.append(
             f"{index.path}: passed over {counted(len(private), 'record')} of unknown kinds, "
             f"the first at byte {private[0]}"

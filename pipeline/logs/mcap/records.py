@@ -27,7 +27,7 @@ _LONGEST_STRING = 1 << 16  # longest name in bytes; a longer one is damage
 class Channel:
     """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
 
-    ``definition`` says what the type looks like, in the language ``schema_encoding``.
+    ``definition`` defines the type, in the language ``schema_encoding``.
     """
 
     key: tuple[int, int]
@@ -69,10 +69,10 @@ class Block:
     Attributes
     ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked, None that the chunk's head
+    compression, uncompressed_size, crc : as the chunk states; crc 0 means unchecked, None that the chunk's head
         has to be read for it
     start_ns, end_ns : log time of the first and last message
-    entries : the channels in it; empty where the file does not say
+    entries : the channels in it; empty where the file does not state them
     """
 
     file: int
@@ -108,8 +108,8 @@ class FileIndex:
     data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
         makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    damaged_summary : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
-    is_consistent : whether what blocks say about their channels agrees with what the file says about itself
+    damaged_summary : opcodes and bodies of records of a damaged summary, for channels defined nowhere else
+    is_consistent : whether the counts of blocks by channel agree with the statistics of the file
     """
 
     path: Source

@@ -72,7 +72,7 @@ def states_length_twice(data: mmap.mmap | bytes, offset: int) -> bool:
 class Resync:
     """Resynchronization in a file behind damage.
 
-    In one with chunks no message is looked for outside of them: what is left of a damaged chunk, unchecked, is not
+    In one with chunks no message is searched outside of them: what is left of a damaged chunk, unchecked, is not
     taken for messages.
     """
 

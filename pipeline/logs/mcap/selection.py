@@ -121,7 +121,7 @@ def complete(index: FileIndex) -> None:
 def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
     """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
 
-    Exact where a file has a message index, else as exactly as its chunks say.
+    Exact where a file has a message index, else as exact as its chunks.
     """
     messages, ends_ns = 0, []
     for index in indexes:

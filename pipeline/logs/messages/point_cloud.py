@@ -200,7 +200,7 @@ def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
             continue
         if field.datatype not in _FORMATS:
             raise MalformedMessageError(
-                f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8"
+                f"field {field.name} has data type {field.datatype}; PointField has 1 to 8"
             )
         number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
         if field.offset + number.itemsize > message.point_step:
@@ -258,7 +258,7 @@ def read_livox(data: memoryview, form: type[CdrReader] = CdrReader) -> PointClou
     reader = form(data)
     stamp_ns, frame = reader.header()
     reader.numbers("Q")  # time of the first point, by the lidar's clock
-    reader.integer()  # the number of points, told once more by their array
+    reader.integer()  # the number of points, stated once more by their array
     reader.numbers("B", 4)  # lidar and reserved
     count = reader.integer()
     before = reader.offset

@@ -23,7 +23,7 @@ class PointTimes:
     """Seconds after the stamp for the points of scans, in any order and from any thread.
 
     The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
-    ``assumed`` says in words what was done with one of the first scans that have times.
+    ``assumed`` describes the interpretation of one of the first scans that have times.
     """
 
     def __init__(self, config: LogConfig) -> None:
@@ -41,8 +41,10 @@ class PointTimes:
         config = self.config
         sense = -1.0 if config.point_times == "clockwise" else 1.0
         turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
-        way = f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
-        self.assumed = f"point times by the azimuth: {way} (log.point_times)"
+        direction = (
+            f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+        )
+        self.assumed = f"point times by the azimuth: {direction} (log.point_times)"
         return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
     def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ class Returns(NamedTuple):
     """The valid returns of one scan message.
 
     ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` says for what where nothing is left.
+    counts what was left out, ``why`` is the reason where nothing is left.
     """
 
     stamp_ns: int

@@ -24,8 +24,8 @@ _END = 16  # bytes: length of the tree, CRC-32 of all before
 class Classes:
     """The classes that may stand in a snapshot, by name, and the attributes in them that are left out.
 
-    rebuilt : what makes these attributes from the object when it is read, its other attributes being there
-    version : a line that tells which code the classes belong to; that of another is not read
+    rebuilt : functions that rebuild these attributes of an object from its others when it is read
+    version : a line that identifies the code of the classes; that of another is not read
     """
 
     def __init__(

@@ -22,7 +22,7 @@ ROBOT = Vehicle(
     T_base_lidar=np.array([[1.0, 0, 0, 0.15], [0, 1, 0, 0], [0, 0, 1, 0.25], [0, 0, 0, 1]]),
 )
 
-# Round the ring by way of two rooms; then again, across the core, and by way of two more rooms.
+# Round the ring by two rooms; then again, across the core, and by two more rooms.
 ROUTE = np.array([
     [5.0, 5.0], [8.0, 5.0], [8.0, 2.0], [13.0, 2.0], [13.0, 5.0], [21.0, 5.0], [21.0, 13.0], [5.0, 13.0],
     [5.0, 5.0], [21.0, 5.0], [21.0, 13.0], [12.7, 13.0], [12.7, 5.0], [21.0, 5.0], [21.0, 13.0], [17.0, 13.0],

@@ -59,7 +59,7 @@ YARD_ROBOT = Vehicle(
     T_base_lidar=mount(0.15, 0.9),
 )
 
-# A triangle, a square the other way round, there and back, once round on the spot and once back; it closes.
+# A triangle, a square in the other direction, there and back, once round on the spot and once back; it closes.
 YARD_STEPS = (
     *[Pivot(120.0, 3.0)] * 3,
     *[Pivot(-90.0, 2.0)] * 4,

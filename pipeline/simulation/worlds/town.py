@@ -45,7 +45,7 @@ _FREE_M = 1.8  # on either side of the middle of a lane
 _LEGS = (
     ((0, 0), 1), ((100, 0), 1), ((100, 40), 1), ((0, 40), 1),  # new
     ((0, 0), 1), ((0, -40), 1), ((-50, -40), 1), ((-50, 40), 1),  # new
-    ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, the other way round
+    ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, in the other direction
     ((0, 0), 1), ((0, 40), 1), ((0, 80), 1), ((50, 80), 1), ((50, 40), 1),  # partly new
     ((50, 0), 1), ((100, 0), 1), ((100, 40), -1), ((0, 40), -1),  # as the first time, at last in the other lane
 )  # fmt: skip
