@@ -3,10 +3,12 @@
 The names below are the Python API; each is imported when it is first used, so that ``import scanchain`` is cheap.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
+TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-C would show a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from scanchain.api import compare, downsample, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
@@ -107,6 +109,8 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
+    from importlib import import_module
+
     if name in _COMPILED:
         import_module("scanchain.clock").warn_of_compilation()
     return globals().setdefault(name, getattr(import_module(f"scanchain.{_HOMES[name]}"), name))

@@ -39,7 +39,7 @@ def scanchain() -> None:
       scanchain run office.mcap --out runs/office
       scanchain view runs/office
 
-    Exit codes: 0 done, 1 the run failed, was stopped, or most of its scans are degenerate or lost,
+    Exit codes: 0 done, 1 the run failed, was stopped, or its result is unreliable,
     2 bad input or arguments.
     """
 

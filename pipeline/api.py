@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from scanchain import checks
 from scanchain.data import Points
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
 from scanchain.settings import Override, load_settings
-from scanchain.source import Source, source_of
 
 if TYPE_CHECKING:
     from scanchain.comparison.compare import Compared
     from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
-    from scanchain.graph.pose_graph import PoseGraph
     from scanchain.runs.job import Recorder, SinkName
 
 Logs = str | Path | Sequence[str | Path]
@@ -47,12 +47,12 @@ def run(
     Raises InputError for bad input.
     """
     job = Job(
-        logs=_sources(log),
-        out=Path(out),
-        config_file=None if config is None else Path(config),
+        logs=sources_of(log),
+        out=checks.path(out, "out"),
+        config_file=None if config is None else checks.path(config, "config"),
         overrides=_overrides(overrides),
         sinks=frozenset({"save"}) if recording else frozenset(),
-        ground_truth=None if ground_truth is None else Path(ground_truth),
+        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         force=force,
     )
     return run_job(job, open_recorder, Unwatched(), write_report)
@@ -78,11 +78,11 @@ def compare(
     from scanchain.comparison.compare import compare as run_comparison
 
     comparison = Comparison(
-        logs=_sources(log),
-        out=Path(out),
-        methods=tuple(methods),
+        logs=sources_of(log),
+        out=checks.path(out, "out"),
+        methods=(methods,) if isinstance(methods, str) else tuple(methods),
         overrides=_overrides(overrides),
-        ground_truth=None if ground_truth is None else Path(ground_truth),
+        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         repeat=repeat,
         force=force,
     )
@@ -96,6 +96,7 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     Returns state, χ² before and after, iterations, ``converged`` and ``reason``.
     Raises InputError if the graph is disconnected.
     """
+    checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
     changes = _overrides({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
@@ -129,10 +130,6 @@ def present_comparison(directory: Path) -> None:
 
     write_compare_report(directory)
     record_comparison(directory)
-
-
-def _sources(log: Logs) -> tuple[Source, ...]:
-    return tuple(source_of(each) for each in ([log] if isinstance(log, str | Path) else log))
 
 
 def _overrides(values: dict[str, object]) -> tuple[Override, ...]:

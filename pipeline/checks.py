@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,8 @@ from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # largest distance from the origin, beyond which keys of voxels repeat
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
+SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
+LARGEST = 1e50  # largest number in points, weights or a graph: products of a few are still finite
 LONGEST_SWEEP_S = 10.0  # largest time between the stamp of a scan and any of its points
 
 
@@ -46,7 +51,10 @@ def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
         )
-    if not math.isfinite(largest_magnitude(array)):
+    farthest = largest_magnitude(array)
+    if LARGEST < farthest < math.inf:
+        raise InputError(f"{name} holds {farthest:.3g}, over {LARGEST:g}; give meters")
+    if not math.isfinite(farthest):
         bad = int((~np.isfinite(array)).any(axis=1).sum())
         raise InputError(
             f"{name}: {bad:,} of {len(array):,} points are NaN or infinite; leave them out, with their times"
@@ -159,7 +167,7 @@ def seconds(value: object, name: str) -> float:
     """A stamp in seconds; nanoseconds of our time are refused."""
     if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) < _LATEST_S:
         return float(value)
-    raise InputError(f"{name} is {shown(value)}; wanted seconds, as a number below {_LATEST_S:.0e}")
+    raise InputError(f"{name} is {shown(value)}; wanted seconds, as a number below {_LATEST_S:.0e}{SMALLER_UNITS}")
 
 
 def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
@@ -167,8 +175,10 @@ def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
     array = _numbers(value, name, f"({count},) weights", np.float64)
     if array.shape != (count,):
         raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a pair")
-    if not (np.isfinite(array).all() and (array >= 0.0).all()):
-        raise InputError(f"{name} holds negative, NaN or infinite values; wanted weights from 0 on")
+    if not ((array >= 0.0) & (array <= LARGEST)).all():
+        raise InputError(
+            f"{name} holds negative, NaN, infinite or huge values; wanted weights from 0 to {LARGEST:g}"
+        )
     return array
 
 
@@ -202,6 +212,24 @@ def instance(value: object, kind: type, name: str, remedy: str) -> None:
     """Refuse what is not of a kind."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is {shown(value)}; wanted a {kind.__name__}: {remedy}")
+
+
+def path(value: object, name: str) -> Path:
+    """The path that a text or a path object names."""
+    if not isinstance(value, str | Path) or "\0" in str(value):
+        raise InputError(f"{name} is {shown(value)}; wanted a path, as text or pathlib.Path")
+    return Path(value)
+
+
+@contextmanager
+def writing(path: Path) -> Generator[None]:
+    """A context in which a place that takes no file, or none of this user, is told as InputError."""
+    try:
+        yield
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists and is yours"
+        ) from None
 
 
 def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike) -> NDArray[Any]:

@@ -20,6 +20,8 @@ Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
 
 
+NO_TRUTH = "none"  # of ``log.ground_truth_topic``
+
 MATCHERS = {
     "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
     "svd": "scanchain.registration.svd_icp:SvdMatcher",
@@ -44,7 +46,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     format : log format: found automatically, a known one by name, or ``module:Class`` of your own
     topic : lidar topic; found automatically where empty
     odometry_topic : wheel odometry, ``nav_msgs/Odometry`` or stamped poses; found automatically where empty
-    ground_truth_topic : true poses, used for evaluation only
+    ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
     start_s : what comes before is left out, counted from the first message
     end_s : what comes after is left out
     every : every N-th scan is taken
@@ -57,7 +59,6 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
         points are timed by azimuth
     revolution_s : duration of a revolution, for points timed by azimuth
     revolution_start_rad : azimuth at which a revolution begins, at the stamp; π is the rear
-    prefetch_chunks : chunks of an MCAP file decompressed ahead of use
     """
 
     format: str = "auto"
@@ -74,7 +75,6 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     point_times: Literal["auto", "none", "s", "ms", "us", "ns", "clockwise", "counterclockwise"] = "auto"
     revolution_s: Positive = 0.1
     revolution_start_rad: float = 3.141592653589793
-    prefetch_chunks: Count = 4
 
 
 class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
@@ -87,8 +87,6 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     match_voxel_m : largest voxel size to which scans are downsampled before they are matched
     match_points : number of points to match; the voxels of matching shrink, down to those of the map, until
         about that many remain
-    range_voxels : voxels of the local map that the median range of a scan spans, at the least; all voxels
-        shrink where the surroundings are narrow
     min_scale : smallest factor by which voxels shrink in narrow surroundings; 1 keeps their size fixed
     """
 
@@ -98,7 +96,6 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     map_voxel_m: Positive = 0.5
     match_voxel_m: Positive = 1.5
     match_points: Count = 2500
-    range_voxels: Positive = 14.0
     min_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.125
 
 
@@ -111,8 +108,6 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
     insert_distance_m : a scan is inserted once the lidar has moved this far since the last insertion; 0
         inserts every scan
     insert_angle_rad : a scan is inserted once the lidar has turned this far; 0 inserts every scan
-    min_points_alone : points from which on the surface of a voxel is fitted without the points of its
-        neighbors
     """
 
     voxel_size_m: Positive = 1.0
@@ -120,7 +115,6 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
     max_insertions: Count = 1000
     insert_distance_m: NonNegative = 0.0
     insert_angle_rad: NonNegative = 0.0
-    min_points_alone: Count = 10
 
 
 class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
@@ -130,10 +124,8 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
         closed form
     optimizer : method of the nonlinear least squares of ``plicp``
     max_iterations : limit of the iterations of one alignment
-    reach_voxels : neighboring voxels searched for a correspondence, in each direction
     max_distance_m : largest distance of a correspondence; it shrinks with the voxels
     kernel_scale_m : scale of the Geman-McClure kernel on the residuals
-    wide_reach_voxels : ``reach_voxels`` of a wide search
     wide_max_distance_m : ``max_distance_m`` of a wide search
     wide_kernel_scale_m : scale at which the kernel of a wide search begins, before it narrows to
         ``kernel_scale_m``
@@ -149,10 +141,8 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
     matcher: Matcher = "plicp"
     optimizer: Optimizer = "levenberg-marquardt"
     max_iterations: Count = 50
-    reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 1
     max_distance_m: Positive = 2.0
     kernel_scale_m: Positive = 0.2
-    wide_reach_voxels: Annotated[int, Meta(ge=1, le=8)] = 2
     wide_max_distance_m: Positive = 3.0
     wide_kernel_scale_m: Positive = 2.0
     tolerance_m: Positive = 1e-3
@@ -204,21 +194,13 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_radius_m : smallest search radius
     max_radius_m : largest search radius, and largest correction by one closure
     min_travel_m : path length between two keyframes from which on they may close a loop
-    submap_keyframes : keyframes before and after its center that make up a submap, which scans are matched to
     min_overlap : share of the points on surfaces of the submap from which on a closure is accepted
     min_information : information per inlier of the worst direction from which on a closure is accepted
     edge_sigma_m : translational standard deviation added to that of a loop edge
     edge_sigma_rad : rotational standard deviation added to that of a loop edge
-    optimize_every : keyframes between two optimizations of the graph, at the least
     recognizer : proposes places seen before, however far the map has drifted: "auto" (descriptors of submaps seen
         from above in 3D, none in the plane), "none", or ``module:Class`` of your own
     place_radius_m : radius of a submap that is recognized; it shrinks with the voxels
-    place_drift : drift in meters a meter within which recognized places are accepted
-    min_similarity : descriptor similarity from which on a place is verified by matching
-    min_place_overlap : ``min_overlap`` of a recognized place
-    min_place_information : ``min_information`` of a recognized place
-    min_agreement : agreement about free space from which on a recognized place is accepted, relative to that
-        of each submap with itself
     refine : whether at the end every planar scan is aligned once more, to the map of all keyframes
     """
 
@@ -227,19 +209,12 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_radius_m: Positive = 5.0
     max_radius_m: Positive = 30.0
     min_travel_m: Positive = 30.0
-    submap_keyframes: Count = 5
     min_overlap: Share = 0.6
     min_information: NonNegative = 0.01
     edge_sigma_m: Positive = 0.05
     edge_sigma_rad: Positive = 0.005
-    optimize_every: Count = 10
     recognizer: str = "auto"
     place_radius_m: Positive = 32.0
-    place_drift: Positive = 0.1
-    min_similarity: Share = 0.45
-    min_place_overlap: Share = 0.4
-    min_place_information: NonNegative = 0.005
-    min_agreement: Share = 0.87
     refine: bool = True
 
 

@@ -7,7 +7,8 @@ def main() -> int:
     """Import the command line and run it; 1 where Ctrl-C came before it was there, as after."""
     try:
         from scanchain.__main__ import main as run
+
+        return run()
     except KeyboardInterrupt:
         sys.stderr.write("error: interrupted\n")
         return 1
-    return run()

@@ -31,6 +31,7 @@ _NO_SPACE = "the disk is full; free some space on it, or write to another one"
 _REMEDIES = {
     errno.ENOSPC: _NO_SPACE,
     errno.EDQUOT: "the quota of the disk is used up; free some space on it, or write to another one",
+    errno.EFBIG: "File too large: raise the limit of file sizes (ulimit -f), or write to another disk",
     errno.ENAMETOOLONG: "the name is longer than the file system takes (255 bytes a part); shorten it",
     errno.EROFS: "the file system is read-only; write to another one",
     errno.EACCES: "access is denied; check the permissions",

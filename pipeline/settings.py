@@ -20,11 +20,8 @@ from scanchain.errors import InputError, shown
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
 _REVOLUTION_KEYS = ("log.revolution_s", "log.revolution_start_rad")
-_PLACE_KEYS = ("loops.place_radius_m", "loops.place_drift")
-_SUBMAP_KEYS = (
-    "loops.min_similarity", "loops.min_place_overlap", "loops.min_place_information", "loops.min_agreement",
-)  # fmt: skip
-_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m", *_SUBMAP_KEYS)
+_PLACE_KEYS = ("loops.place_radius_m",)
+_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m")
 _PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
 _NOTHING: Mapping[str, str] = {}
 _ORDERED = (
@@ -93,6 +90,10 @@ def load_settings(
     idle : keys that have no effect on the log at hand, and why
     Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
     """
+    if not isinstance(file, str | Path | None):
+        raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
+    if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
+        raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
     layer: dict[str, Value] = {}
     source = "defaults"
     if dimension is not None:
@@ -103,6 +104,10 @@ def load_settings(
     source += "" if file is None else f", {file}"
     preset = {key: spec.default for key, spec in config_keys().items()} | layer
     values = preset | ({} if file is None else read_layer(Path(file)))
+    if dimension is not None and file is not None:
+        _check_dimension(
+            values, dimension, str(file), f"scanchain config dump --lidar {dimension}d prints what they take"
+        )
     origins = {key: str(file) for key in values if values[key] != preset[key]}
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
@@ -136,13 +141,11 @@ def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, 
     recognizer = str(values["loops.recognizer"])
     is_own = ":" in recognizer
     reasons = {
-        "loops.recognizer is none": (*_PLACE_KEYS, *_SUBMAP_KEYS) if recognizer == "none" else (),
-        "loops.recognizer is a class of your own": ("loops.min_similarity",) if is_own else (),
+        "loops.recognizer is none": _PLACE_KEYS if recognizer == "none" else (),
         "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
         "it is of 3D logs alone": (*_SPATIAL_KEYS, *(() if is_own else _PLACE_KEYS)) if dimension == 2 else (),
         "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
         "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
-        "preprocess.min_scale is 1": ("preprocess.range_voxels",) if values["preprocess.min_scale"] == 1.0 else (),
         "preprocess.match_voxel_m is not above preprocess.map_voxel_m": (
             ("preprocess.match_points",) if matches_all else ()
         ),
@@ -202,6 +205,30 @@ def flatten(config: Config) -> dict[str, Value]:
 def check_order(config: Config) -> None:
     """Refuse a configuration whose lower limits are not below the upper ones."""
     _check_order(flatten(config), "Config", {}, _ORDERED)
+
+
+def check_dimension(config: Config, dimension: int) -> None:
+    """Refuse a configuration made for logs of the other dimension."""
+    _check_dimension(flatten(config), dimension, "config", f"start from load_settings({dimension}).config")
+
+
+def _check_dimension(values: Mapping[str, Value], dimension: int, source: str, remedy: str) -> None:
+    """Refuse values of which most are those of the other preset, where the presets differ."""
+    other = 5 - dimension
+    mine, others = _preset_values(dimension), _preset_values(other)
+    differing = [key for key in mine if mine[key] != others[key]]
+    foreign = sum(values[key] == others[key] for key in differing)
+    if 2 * foreign > len(differing):
+        raise InputError(
+            f"{source} is made for {other}D scans: of the {len(differing)} settings in which the presets of "
+            f"2D and 3D differ it has {foreign} as in {other}D; these scans are {dimension}D: {remedy}"
+        )
+
+
+@functools.cache
+def _preset_values(dimension: int) -> Mapping[str, Value]:
+    """Every key as the preset of logs of this dimension sets it."""
+    return {key: spec.default for key, spec in config_keys().items()} | read_layer(preset_path(PRESETS[dimension]))
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:

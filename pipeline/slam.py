@@ -32,11 +32,12 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.loops import LoopCloser, refined, spread
-from scanchain.odometry import FrontEnd, Located, checked_start
+from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
+_OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
@@ -96,6 +97,7 @@ class Slam:
         self.moves_map = False
         self.lost_scans = 0
         self.optimized_at = 0
+        self.live_stamps = LiveStamps()
         self.is_finished = False
 
     def track(
@@ -106,9 +108,12 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes; arguments as in ``Scan.of``."""
-        scans = self.front_end.scans
-        return self.process(Scan.of(points, stamp_s, times_s, index=scans, T_odom_base=T_odom_base))
+        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does."""
+        scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
+        self.live_stamps.check(scan)
+        step = self.process(scan)
+        self.live_stamps.take(scan)
+        return step
 
     def process(self, scan: Scan) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
@@ -253,7 +258,7 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = self.config.loops.optimize_every
+        enough = _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:

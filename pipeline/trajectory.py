@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.words import counted
@@ -62,10 +62,15 @@ def _check_tum_row(stamp_ns: int, row: list[float], place: str) -> None:
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0."""
+    """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0.
+
+    Raises InputError where there is no such folder, and OSError where the disk is full.
+    """
+    path = checks.path(path, "path")
+    checks.instance(trajectory, Trajectory, "trajectory", "Trajectory(stamps_ns, poses), or read_tum(path)")
     poses = lie.lift(trajectory.poses)
     quaternions = lie.to_quaternion(poses[:, :3, :3])
-    with Path(path).open("w", encoding="utf-8", newline="\n") as file:
+    with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
         for stamp_ns, pose, quat_xyzw in zip(trajectory.stamps_ns.tolist(), poses, quaternions, strict=True):
             values = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw))
             file.write(f"{format_stamp(stamp_ns)} {values}\n")
@@ -125,17 +130,17 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
 
     Words are separated by spaces, commas or semicolons.
     """
-    path = Path(path)
+    path = checks.path(path, "path")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
     except IsADirectoryError:
         raise InputError(f"{path} is a directory; name a file in it") from None
-    except PermissionError:
-        raise InputError(f"{path} cannot be read; check its permissions") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.replace(",", " ").replace(";", " ").split()
         if words and not words[0].startswith("#"):

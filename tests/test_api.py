@@ -4,11 +4,11 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from scenes import configured, kitti_scans, shared_data
 
 import scanchain as sc
 from scanchain import lie
 from scanchain.errors import InputError
+from tests.support.scenes import configured, kitti_scans, shared_data
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +59,79 @@ POINTS = np.ones((10, 3), np.float32)
         (lambda: sc.downsample(POINTS[0], 1.0), "points has the shape"),
         (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
         (lambda: sc.optimize(sc.PoseGraph(2), robustness="none"), "graph.robustness"),
+        (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
+        (lambda: sc.read_g2o(3), "path is 3; wanted a path"),
+        (lambda: sc.write_g2o("/nope/x.g2o", sc.PoseGraph(2)), "/nope/x.g2o: cannot be written"),
+        (lambda: sc.run(3, "out"), "a log is 3; wanted a path"),
+        (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),
+        (lambda: sc.compare(["a.mcap", 3], "out"), "a log is .* wanted a path"),
+        (lambda: sc.simulate("office", 3), "destination is 3; wanted a path"),
+        (lambda: sc.Odometry(sc.load_settings(2).config, np.eye(4)), "config is made for 2D scans: .*3D"),
+        (lambda: sc.Slam(sc.load_settings(2).config), "config is made for 2D scans: .*3D"),
+        (lambda: sc.Slam(sc.Config(), dimension=2), r"made for 3D .* start from load_settings\(2\).config"),
     ],
 )
 def test_what_is_no_argument_is_named(call, words):
     with pytest.raises(InputError, match=words):
         call()
+
+
+ROOM = np.random.default_rng(1).uniform(-8.0, 8.0, (400, 3)).round()  # points on planes
+
+
+def live(stamps_s, span_s=0.0):
+    """Odometry that was given a scan at each of these stamps, its points measured over so many seconds."""
+    odometry = sc.Odometry()
+    for stamp_s in stamps_s:
+        odometry.track(ROOM, stamp_s, np.linspace(0.0, span_s, len(ROOM)) if span_s else None)
+    return odometry
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "span_s", "words"),
+    [
+        ([5.0, 5.0], 0.0, "stamp_s is 5.0+, that of the scan before 5.0+; wanted seconds that increase"),
+        ([5.0, 4.9], 0.0, "stamp_s is 4.9"),
+        (1e3 * np.arange(0.0, 0.5, 0.1), 0.0, "stamp_s grows by 100 from scan to scan.*1e-3"),
+        (1e9 * np.arange(0.0, 0.1, 0.02), 0.0, r"stamp_s grows by 2e\+07 from scan to scan.*nanoseconds: 1e-9"),
+        (
+            np.arange(0.0, 0.5, 0.1),
+            1.0,
+            "times_s spans 1 s, but scans follow each other within 0.1 s.*from 0 to 1",
+        ),
+        ([1.7e12], 0.0, "stamp_s is 17.*from milliseconds: 1e-3"),
+    ],
+)
+def test_stamps_and_times_that_cannot_be_seconds_are_refused(stamps_s, span_s, words):
+    for start in (live, lambda *given: live_slam(*given)):
+        with pytest.raises(InputError, match=words):
+            start(stamps_s, span_s)
+
+
+def live_slam(stamps_s, span_s):
+    slam = sc.Slam()
+    for stamp_s in stamps_s:
+        slam.track(ROOM, stamp_s, np.linspace(0.0, span_s, len(ROOM)) if span_s else None)
+
+
+@pytest.mark.parametrize(
+    "stamps_s",
+    [
+        [0.0, 0.1, 0.2, 300.0, 300.1, 300.2],  # a gap of minutes
+        [0.0, 60.0, 75.0, 130.0],  # stop and go
+        [0.0, 0.02, 0.04, 0.3, 0.4],  # stamps on arrival, after a burst
+    ],
+)
+def test_gaps_and_bursts_are_stamps_too(stamps_s):
+    assert live(stamps_s, 0.05).scans == len(stamps_s)
+
+
+def test_a_scan_that_was_refused_is_forgotten():
+    odometry = live([0.0, 0.1])
+    for _ in range(2):
+        with pytest.raises(InputError, match="wanted seconds that increase"):
+            odometry.track(ROOM, 0.1)
+    assert odometry.track(ROOM, 0.2).scan.index == 2
 
 
 def test_a_run_from_python_writes_what_the_command_writes(office, tmp_path):

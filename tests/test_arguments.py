@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import shared_data
 
 from scanchain import (
     Config,
@@ -21,6 +20,7 @@ from scanchain import (
     Trajectory,
     VoxelMap,
     create_matcher,
+    evaluate,
     lie,
     load_settings,
     open_log,
@@ -30,6 +30,7 @@ from scanchain import (
 )
 from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
 from scanchain.evaluation import absolute_error, pair
+from tests.support.scenes import shared_data
 
 CALLS = 2000
 
@@ -131,6 +132,16 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
+        (lambda: rigid_transform(1e200 * ROOM, ROOM), r"source holds .*e\+20\d, over 1e\+50; give meters"),
+        (lambda: rigid_transform(ROOM, ROOM, np.full(len(ROOM), 1e300)), "weight holds .*huge"),
+        (lambda: write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
+        (lambda: write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
+        (lambda: write_tum(3, Trajectory([0], I4[None])), "path is 3; wanted a path"),
+        (lambda: read_tum(3), "path is 3; wanted a path"),
+        (lambda: read_tum("a\0b"), "path is .*; wanted a path"),
+        (lambda: load_settings(overrides="x"), "overrides is 'x'; wanted a list of Override"),
+        (lambda: load_settings(3, file=3), "file is 3; wanted the path"),
+        (lambda: evaluate(Trajectory([0], I4[None]), Trajectory([0], I4[None])), "3 in space, not 1"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
     ],
 )  # fmt: skip

@@ -11,15 +11,15 @@ import zipfile
 import msgspec
 import numpy as np
 import pytest
-import recorders
-from test_inputs_carmen import flaser, save
-from test_inputs_folders import kitti_raw
 
 from scanchain import catalog
 from scanchain.__main__ import main
 from scanchain.download import DownloadError, fetch
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from tests.logs.test_carmen import flaser, save
+from tests.logs.test_folders import kitti_raw
+from tests.support import recorders
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from naive_graph import error
-from naive_maps import served_map
 from rerun.chunk import RrdReader
-from scenes import ROOT, configured, shared_data
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from test_recording import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
 
 from scanchain.__main__ import main
 from scanchain.settings import flatten
 from scanchain.viz.recording import entities
+from tests.support.naive_graph import error
+from tests.support.naive_maps import served_map
+from tests.support.scenes import ROOT, configured, shared_data
+from tests.viz.test_recording import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
 
 FILES = {
     "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",

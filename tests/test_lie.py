@@ -1,10 +1,10 @@
-import naive_graph
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanchain import lie
+from tests.support import naive_graph
 
 _length = st.floats(-50.0, 50.0)
 _angles = st.one_of(

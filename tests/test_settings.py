@@ -6,11 +6,11 @@ import tomllib
 import msgspec
 import pytest
 from msgspec.structs import fields
-from scenes import ROOT, configured
 
 from scanchain.config import Config
 from scanchain.errors import InputError
 from scanchain.settings import Override, config_keys, dump, flatten, load_settings, preset_path, read_layer
+from tests.support.scenes import ROOT, configured
 
 
 def flag(key, text):
@@ -43,13 +43,12 @@ def says(text, *parts):
 @pytest.mark.parametrize(
     ("dimension", "key", "text", "why"),
     [
-        (2, "loops.place_drift", "0.2", "it is of 3D logs alone"),
+        (2, "loops.place_radius_m", "9", "it is of 3D logs alone"),
         (2, "maps.slice_min_z_m", "-1", "it is of 3D logs alone"),
         (3, "loops.refine", "false", "it is of 2D logs alone"),
         (3, "odometry.max_turn_rad_s", "3", "it is of 2D logs alone"),
         (3, "log.revolution_s", "0.2", "log.point_times"),
         (2, "graph.robust_scale", "2", "graph.robust"),
-        (2, "preprocess.range_voxels", "3", "preprocess.min_scale is 1"),
         (2, "preprocess.match_points", "300", "preprocess.match_voxel_m is not above preprocess.map_voxel_m"),
     ],
 )
@@ -162,7 +161,7 @@ def test_an_unknown_flag_names_itself_and_the_nearest_key():
 
 
 def test_a_key_in_the_wrong_section_is_told_the_right_one():
-    says(complaint(overrides=[flag("odometry.submap_keyframes", "1")]), "did you mean loops.submap_keyframes?")
+    says(complaint(overrides=[flag("odometry.place_radius_m", "1")]), "did you mean loops.place_radius_m?")
 
 
 @pytest.mark.parametrize(
@@ -195,7 +194,7 @@ def test_a_key_like_none_there_is_points_to_the_list(key):
         ("matching.max_distance_m", "0", "a number > 0, in m"),
         ("matching.max_distance_m", "nan", "a number > 0, in m"),
         ("matching.min_inlier_share", "1.5", "a number from 0 to 1"),
-        ("matching.reach_voxels", "9", "a whole number from 1 to 8"),
+        ("matching.max_iterations", "0", "a whole number >= 1"),
         ("log.every", "0", "a whole number >= 1"),
         ("log.every", "1.5", "a whole number >= 1"),
         ("log.every", "inf", "a whole number >= 1"),
@@ -289,7 +288,14 @@ def test_what_is_dumped_loads_as_the_same_configuration(tmp_path, dimension):
     config = load_settings(dimension, overrides=changes).config
     assert config.matching.tolerance_m == 1.25e-7
     file = written(tmp_path, dump(config))
-    assert load_settings(2, file=file).config == load_settings(3, file=file).config == config
+    assert load_settings(file=file).config == load_settings(dimension or 3, file=file).config == config
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_file_made_for_the_other_dimension_is_refused(tmp_path, dimension):
+    file = written(tmp_path, dump(load_settings(5 - dimension, overrides=[flag("loops.drift", "0.02")]).config))
+    with pytest.raises(InputError, match=rf"made for {5 - dimension}D scans.*dump --lidar {dimension}d"):
+        load_settings(dimension, file=file)
 
 
 def test_a_dump_holds_every_key_and_nothing_else():

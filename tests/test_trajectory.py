@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from scenes import shared_data
 
 from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.trajectory import format_stamp, parse_stamp_ns, read_kitti, read_tum, write_kitti, write_tum
+from tests.support.scenes import shared_data
 
 STAMPS_NS = [1317042145963999987, 1317042145963999986, 976052857337529984, 0, 1, -1, -2500000001]
 

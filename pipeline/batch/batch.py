@@ -81,7 +81,7 @@ class Batched:
         absent = sum(not row.state.has_result for row in self.rows)
         unreliable = sum(row.state is State.UNRELIABLE for row in self.rows)
         parts = [f"{absent:,} of {len(self.rows):,} logs have no result"] if absent else []
-        parts += [f"of {unreliable:,} most scans are degenerate or lost"] if unreliable else []
+        parts += [f"{unreliable:,} of {len(self.rows):,} logs are unreliable"] if unreliable else []
         return ", ".join(parts)
 
 
@@ -109,7 +109,7 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
         for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
             row.write(missing[row.key].row_file)
             rows[row.key] = row
-            progress.say(f"{row.log}: {row.state}{row.reason and f': {row.reason}'}{_damage(row)}")
+            progress.say(f"{row.log}: {row.state}{row.why and f': {row.why}'}{_damage(row)}")
             progress.count(kept + done, len(tasks))
     except KeyboardInterrupt:
         progress.say("stopped")

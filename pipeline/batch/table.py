@@ -10,13 +10,14 @@ import numpy as np
 
 from scanchain.batch.task import Row, State
 from scanchain.runs.metrics import Metrics
-from scanchain.words import counted
+from scanchain.words import counted, duration
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
     "scans",
     "dimension",
     "ok",
+    "contradicted",
     "degenerate",
     "lost",
     "keyframes",
@@ -65,7 +66,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 def summary(rows: Sequence[Row]) -> str:
     """Totals, each log without a result and its reason, each log with warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
-    lines += [f"{row.state:<14} {row.log}: {row.reason}" for row in rows if row.state is not State.DONE]
+    lines += [f"{row.state:<14} {row.log}: {row.why}" for row in rows if row.state is not State.DONE]
     lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
     return "\n".join(lines) + "\n"
 
@@ -86,13 +87,17 @@ def _first_warning(row: Row) -> str:
 
 
 def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
-    scans, degenerate, lost = (
-        sum(getattr(each, name) for each in results) for name in ("scans", "degenerate", "lost")
+    scans, contradicted, degenerate, lost = (
+        sum(getattr(each, name) for each in results) for name in ("scans", "contradicted", "degenerate", "lost")
     )
     path = _distance(sum(each.traveled_m for each in results))
-    time = _duration(sum(each.log_span_s for each in results))
+    time = duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
-    yield "scans", f"{scans:,}, {degenerate:,} degenerate, {lost:,} lost, over {path} and {time}"
+    yield (
+        "scans",
+        f"{scans:,}, {contradicted:,} contradicted, {degenerate:,} degenerate, {lost:,} lost, "
+        f"over {path} and {time}",
+    )
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
     errors_m = [each.ground_truth.optimized.ate_rmse_m for each in results if each.ground_truth is not None]
     if errors_m:
@@ -105,13 +110,6 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
 
 def _distance(length_m: float) -> str:
     return f"{length_m:.1f} m" if length_m < 1000.0 else f"{1e-3 * length_m:.2f} km"
-
-
-def _duration(time_s: float) -> str:
-    for unit, seconds in (("h", 3600.0), ("min", 60.0)):
-        if time_s >= seconds:
-            return f"{time_s / seconds:.1f} {unit}"
-    return f"{time_s:.1f} s"
 
 
 def _cells(row: Row) -> dict[str, object]:

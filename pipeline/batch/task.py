@@ -15,6 +15,7 @@ from msgspec import Struct
 
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
+from scanchain.runs.directory import directory_name
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings
@@ -36,7 +37,7 @@ class State(StrEnum):
 
     @property
     def has_result(self) -> bool:
-        """True if there is a run directory, even if most of its scans are degenerate or lost."""
+        """True if there is a run directory, even if its result is unreliable."""
         return self in (State.DONE, State.UNRELIABLE)
 
 
@@ -71,7 +72,7 @@ class Task(Struct, frozen=True):
     @property
     def run(self) -> Path:
         """The run directory; its name is that of the log and the key's first letters."""
-        return Path(self.out) / f"{source_of(self.log).resolve().stem}-{self.key[:8]}"
+        return Path(self.out) / f"{directory_name(source_of(self.log).resolve().stem)}-{self.key[:8]}"
 
     @property
     def row_file(self) -> Path:
@@ -102,6 +103,11 @@ class Row(Struct, frozen=True):
     def warnings(self) -> int:
         """Number of warnings of its run."""
         return 0 if self.metrics is None else len(self.metrics.warnings)
+
+    @property
+    def why(self) -> str:
+        """The reason without the name of the log, behind which it stands."""
+        return self.reason.removeprefix(f"{self.log}: ")
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""

@@ -8,8 +8,17 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, ground_truth, limit_options, overrides
-from scanchain.commands.run import aliases
+from scanchain.commands.options import (
+    LOG,
+    OverrideCommand,
+    ground_truth,
+    limit_options,
+    matcher_options,
+    method_of,
+    overrides,
+    part_of,
+    part_options,
+)
 from scanchain.errors import InputError, ScanchainError
 from scanchain.settings import Override
 from scanchain.source import Source
@@ -26,17 +35,11 @@ _DAY_S = 86_400.0
     "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
 )
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic of every log. [default: the only one that fits]")
-@click.option("--start", metavar="SECONDS", help="Skip each log up to this time, counted from its first message.")
-@click.option("--end", metavar="SECONDS", help="Skip each log after this time.")
-@click.option("--every", metavar="N", help="Take every N-th scan.")
+@part_options("each log")
+@matcher_options
 @click.option(
-    "--matcher",
-    metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
+    "--gt", metavar="TOPIC|none", help="Ground truth in every log; none to ignore it. [default: /ground_truth]"
 )
-@click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
-@click.option("--gt", metavar="TOPIC", help="Ground truth in every log. [default: /ground_truth]")
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )
@@ -101,7 +104,7 @@ def batch(
         raise InputError(
             f"--gt {gt}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
-    changes = tuple(overrides(ctx, [*aliases(shortcuts), *truth_topic]))
+    changes = tuple(overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]))
     job = Batch(
         logs=collect(logs, manifests),
         out=out.resolve(),

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, alias, ground_truth, limit_options, overrides
+from scanchain.commands.options import (
+    LOG,
+    OverrideCommand,
+    ground_truth,
+    limit_options,
+    overrides,
+    part_of,
+    part_options,
+)
 from scanchain.errors import ScanchainError
 from scanchain.source import Source
 
@@ -24,7 +32,11 @@ _PATH = click.Path(path_type=Path)
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
+@click.option(
+    "--gt",
+    metavar="FILE|TOPIC|none",
+    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
+)
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
@@ -33,7 +45,7 @@ _PATH = click.Path(path_type=Path)
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
 )
 @limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
+@part_options()
 @click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
 @click.pass_context
@@ -49,9 +61,9 @@ def compare(
     repeat: int,
     time_limit: float | None,
     memory_mib: float | None,
-    topic: str | None,
     force: bool,
     as_json: bool,
+    **part: str | None,
 ) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
@@ -84,22 +96,23 @@ def compare(
       scanchain compare log.mcap --methods plicp,svd,kiss-icp --repeat 5 --out runs/three
       scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
-      scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --log.end_s 600
+      scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
     """
     from scanchain.api import present_comparison
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.table import TABLE_FILE, text
+    from scanchain.runs.directory import directory_name
 
     truth_file, truth_topic = ground_truth(gt)
     comparison = Comparison(
         logs=logs,
-        out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
+        out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         matcher=matcher,
         settings_file=settings,
-        overrides=overrides(ctx, [*alias("log.topic", topic, "--topic"), *truth_topic]),
+        overrides=overrides(ctx, [*part_of(part), *truth_topic]),
         ground_truth=truth_file,
         relations=relations,
         repeat=repeat,

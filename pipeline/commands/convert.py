@@ -7,14 +7,12 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, alias, overrides, part_of, part_options
 from scanchain.errors import InputError
 from scanchain.settings import load_settings
 from scanchain.source import Source
 
-_KEYS = tuple(
-    f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every", "prefetch_chunks")
-)
+_KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
@@ -23,7 +21,7 @@ _KEYS = tuple(
 @click.option(
     "--rate", metavar="HZ", help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz."
 )
-@click.option("--topic", metavar="TOPIC", help="Lidar topic to keep, of several lidars.")
+@part_options(topic="all of them")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
@@ -32,14 +30,15 @@ def convert(
     source: Source,
     destination: Path,
     rate: str | None,
-    topic: str | None,
     force: bool,
     as_json: bool,
+    **part: str | None,
 ) -> None:
-    """Convert a log of another format to MCAP. The other commands read all of these formats directly, too.
+    """Convert a log of another format to MCAP, or cut one. The other commands read all of these formats directly.
 
     \b
     SRC is one of
+      an MCAP file        to cut it: --start, --end, --every, --topic
       a CARMEN log        .log or .clf, also .bz2 or .gz: FLASER, ROBOTLASER1, ODOM, TRUEPOS
       a ROS 1 bag         .bag
       a ROS 2 bag         .db3, or its folder
@@ -51,18 +50,17 @@ def convert(
                           --log.rate_hz
       a format of yours   read by a class of your own, --log.format my_module:MyFormat
 
-    Messages are copied unchanged. A part of them is selected by --topic (one of several lidars), --log.start_s,
-    --log.end_s and --log.every.
+    Messages are copied unchanged. --start, --end, --every and --topic (one of several lidars) choose a part.
 
     \b
     Examples:
       scanchain convert intel.clf.bz2 intel.mcap
       scanchain convert 2011_09_26/2011_09_26_drive_0001_sync kitti_0001.mcap
-      scanchain convert scans/ scans.mcap --log.rate_hz 10
-      scanchain convert drive.bag minute.mcap --log.start_s 60 --log.end_s 120
+      scanchain convert scans/ scans.mcap --rate 10
+      scanchain convert drive.bag minute.mcap --start 60 --end 120
       scanchain convert drive.bag drive.mcap --json
     """
-    chosen = overrides(ctx, [*alias("log.rate_hz", rate, "--rate"), *alias("log.topic", topic, "--topic")])
+    chosen = overrides(ctx, [*alias("log.rate_hz", rate, "--rate"), *part_of(part)])
     for override in chosen:
         if override.key not in _KEYS:
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")

@@ -85,7 +85,7 @@ def evaluate(
 def _text(results: Results) -> str:
     lines = [f"paired {results.pairing}"] if results.pairing else []
     lines += [f"{result.summary}\n  {result.definition}" for result in results.found.values()]
-    return "\n".join([*lines, *(f"{name}: none: {reason}" for name, reason in results.missing.items())])
+    return "\n".join([*lines, *(f"not computed: {reason}" for reason in results.missing.values())])
 
 
 def _json(results: Results) -> str:

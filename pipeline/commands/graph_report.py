@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scanchain.graph.observability import FreePose
     from scanchain.graph.optimization import GraphChange, Optimization
 
+_POOR_FIT = 10.0  # χ² per degree of freedom, above which no noise model that is a little off explains it
 _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
 
@@ -50,6 +51,11 @@ class GraphReport:
         ]
         if graph.is_loop.any():
             rest = "; they do not count" if done.rejected.any() else ""
+            chain = len(graph.edges) - int(graph.is_loop.sum())
+            lines.append(
+                f"robust         on {counted(int(graph.is_loop.sum()), 'loop edge')}; "
+                f"the other {counted(chain, 'edge')} (odometry, points) in full weight"
+            )
             lines.append(f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} loop edges{rest}")
         lines += self._free
         held = ", with fixed robust weights" if graph.is_loop.any() else ""
@@ -59,13 +65,22 @@ class GraphReport:
     @property
     def _warnings(self) -> list[str]:
         """Warnings to read before the rest."""
-        weight = self.file.graph.weight[self.file.graph.is_loop]
+        notes = [self.file.note] if self.file.note else []
+        after, graph = self.change.after, self.file.graph
+        ratio = after.chi2 / max(after.degrees_of_freedom, 1)
+        if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:
+            notes.append(
+                f"chi2 is {ratio:.3g} per degree of freedom, where 1 is expected: some edges are wrong, or the "
+                "information matrices are too large; --robust truncated finds wrong loop edges"
+            )
+        weight = graph.weight[graph.is_loop]
         downweighted = int((weight < _HALF).sum())
         if 2 * downweighted <= len(weight):
-            return []
+            return notes
         return [
+            *notes,
             f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they are "
-            "right, all below is wrong; the certificate covers the edges in force, not their selection"
+            "right, all below is wrong; the certificate covers the edges in force, not their selection",
         ]
 
     @property

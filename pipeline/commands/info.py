@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, alias, overrides
+from scanchain.commands.options import LOG, OverrideCommand, overrides, part_of, part_options
 from scanchain.settings import load_settings
 from scanchain.source import Source
 from scanchain.words import counted
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
+@part_options()
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_json: bool) -> None:
+def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: str | None) -> None:
     """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
     \b
@@ -35,7 +35,7 @@ def info(ctx: click.Context, logs: tuple[Source, ...], topic: str | None, as_jso
     """
     from scanchain.logs.info import describe
 
-    chosen = overrides(ctx, alias("log.topic", topic, "--topic"))
+    chosen = overrides(ctx, part_of(part))
     found = describe(logs, load_settings(overrides=chosen).config.log)
     idle = load_settings(found.dimension or None, overrides=chosen, idle=found.idle_keys).without_effect
     found = replace(found, notes=(*found.notes, *idle))
@@ -59,9 +59,11 @@ def _text(log: LogInfo) -> str:
             f"lidar     {log.lidar}: {log.dimension}D, {counted(log.scans, 'scan')}",
             f"mounting  at x {x:.3f} m, y {y:.3f} m on {log.base_frame or 'the base'}"
             + (f" at first; {log.mount_motion}" if log.mount_motion else ""),
-            f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}",
-            *([f"times     {log.point_times.removeprefix('point times: ')}"] if log.point_times else []),
         ]
+    if log.lidar or log.odometry:
+        lines.append(f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}")
+    if log.point_times:
+        lines.append(f"times     {log.point_times.removeprefix('point times: ')}")
     lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log.sensors]
     lines += [f"note      {note}" for note in log.notes]
     lines += [f"damage    {line}" for line in log.damage]

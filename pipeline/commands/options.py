@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import click
 
+from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
@@ -96,6 +97,55 @@ class _LogType(click.ParamType):
 LOG = _LogType()
 
 
+_PART = (
+    ("topic", "TOPIC", "log.topic", "Lidar topic{of}. [default: {topic}]"),
+    ("start", "SECONDS", "log.start_s", "Skip {log} up to this time, counted from its first message."),
+    ("end", "SECONDS", "log.end_s", "Skip {log} after this time."),
+    ("every", "N", "log.every", "Take every N-th scan."),
+)
+
+
+def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
+    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log; ``part_of`` reads them.
+
+    log, topic : in words, what is cut and which lidar is taken without ``--topic``
+    """
+
+    def decorate(command: Any) -> Any:
+        for name, metavar, _, text in reversed(_PART):
+            of = "" if log == "the log" else f" of {log}"
+            command = click.option(f"--{name}", metavar=metavar, help=text.format(log=log, of=of, topic=topic))(
+                command
+            )
+        return command
+
+    return decorate
+
+
+def part_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
+    """The keys that ``part_options`` set."""
+    return tuple(each for name, _, key, _ in _PART for each in alias(key, options[name], f"--{name}"))
+
+
+def matcher_options(command: Callable[..., None]) -> Callable[..., None]:
+    """``--matcher`` and ``--no-loops``; ``method_of`` reads them."""
+    command = click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")(command)
+    return click.option(
+        "--matcher",
+        metavar="plicp|svd|MODULE:CLASS",
+        help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
+    )(command)
+
+
+def method_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
+    """The keys that ``matcher_options`` set."""
+    no_loops = "false" if options["no_loops"] else None
+    return (
+        *alias("matching.matcher", options["matcher"], "--matcher"),
+        *alias("loops.enabled", no_loops, "--no-loops"),
+    )
+
+
 def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
     """The option ``--max-gap``."""
     return click.option(
@@ -103,7 +153,7 @@ def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
-        help="Longest gap between true poses to interpolate. [default: 5 times their usual interval, at most 0.6]",
+        help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
     )(command)
 
 
@@ -114,11 +164,11 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
 
 
 def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic as an override; a word that is neither a file nor looks like a topic is a file."""
+    """A file, or a topic or "none" as an override; any other word is a file."""
     if text is None:
         return None, ()
     path = Path(text)
-    if text.startswith("/") and not path.exists() and not path.suffix:
+    if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
         return None, (Override("log.ground_truth_topic", text, "--gt"),)
     return path, ()
 

@@ -9,9 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, alias, ground_truth, max_gap_option, overrides
+from scanchain.commands.options import (
+    LOG,
+    OverrideCommand,
+    ground_truth,
+    matcher_options,
+    max_gap_option,
+    method_of,
+    overrides,
+    part_of,
+    part_options,
+)
 from scanchain.errors import InputError, ScanchainError
-from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
@@ -27,7 +36,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search the
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to create."
 )
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
-@click.option("--topic", metavar="TOPIC", help="Lidar topic. [default: the only one that fits]")
+@part_options()
 @click.option(
     "--rerun",
     default="save",
@@ -35,16 +44,12 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search the
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@click.option("--start", metavar="SECONDS", help="Skip the log up to this time, counted from its first message.")
-@click.option("--end", metavar="SECONDS", help="Skip the log after this time.")
-@click.option("--every", metavar="N", help="Take every N-th scan.")
+@matcher_options
 @click.option(
-    "--matcher",
-    metavar="plicp|svd|MODULE:CLASS",
-    help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
+    "--gt",
+    metavar="FILE|TOPIC|none",
+    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
 )
-@click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
-@click.option("--gt", metavar="FILE|TOPIC", help="Ground truth: TUM, KITTI or a topic. [default: /ground_truth]")
 @max_gap_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
@@ -102,7 +107,7 @@ def run(
         logs=logs,
         out=out,
         config_file=config,
-        overrides=overrides(ctx, [*aliases(shortcuts), *truth_topic]),
+        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]),
         sinks=_sinks(rerun),
         ground_truth=truth_file,
         max_gap_s=max_gap,
@@ -126,18 +131,6 @@ def run(
         click.echo(f"written        {out}")
     if unreliable:
         ctx.exit(1)
-
-
-_KEYS = {"topic": "log.topic", "start": "log.start_s", "end": "log.end_s", "every": "log.every"}
-
-
-def aliases(options: dict[str, str | bool | None]) -> list[Override]:
-    """Configuration keys set by the short options."""
-    keys = _KEYS | {"matcher": "matching.matcher"}
-    result = [each for name, key in keys.items() for each in alias(key, options.get(name), f"--{name}")]
-    if options.get("no_loops"):
-        result.append(Override("loops.enabled", "false", "--no-loops"))
-    return result
 
 
 def _sinks(text: str) -> frozenset[SinkName]:

@@ -18,6 +18,7 @@ from scanchain.comparison.processes import limits_for, run_all
 from scanchain.comparison.results import Reference, Results, write_results
 from scanchain.comparison.scan_store import StoredScans, store
 from scanchain.comparison.table import Table, maps_of, summarize, write_table
+from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair, read_relations, read_truth, relation_error
@@ -135,7 +136,7 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
     topic = named(comparison.overrides, "log.ground_truth_topic")
     if comparison.ground_truth is not None:
         truth, source = read_truth(comparison.ground_truth).at(scans.stamps_ns), str(comparison.ground_truth)
-    elif topic and truth is None:
+    elif topic not in ("", NO_TRUTH) and truth is None:
         raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:

@@ -48,6 +48,11 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
     if alignment is Alignment.FIRST:
         return reference[0] @ lie.inverse(estimate[0])
     d = 2 if _is_planar(estimate) and _is_planar(reference) else 3
+    if len(estimate) < d:
+        raise InputError(
+            "rigid alignment takes 2 paired poses in the plane and 3 in space, not "
+            f"{len(estimate)}; align by the first pose or not at all"
+        )
     try:
         T = rigid_transform(estimate[:, :d, 3], reference[:, :d, 3], np.ones(len(estimate)))
     except DegeneratePairsError as error:

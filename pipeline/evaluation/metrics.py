@@ -78,7 +78,7 @@ def evaluate(
     estimate : a trajectory or a TUM file
     truth : a trajectory, a TUM file, or a KITTI file with one row a pose of the estimate
     align : "rigid", "first" or "none", for the ATE
-    max_gap_s : truth is interpolated over at most this; by default five of its median intervals
+    max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
     rpe : intervals in poses, seconds or meters; ``source`` names them in errors
     Returns ``found`` by name ("ate", "rpe_1_s", "kitti"), ``missing`` with reasons, ``warnings``.
     Raises InputError where no pose has a true one, or an argument is none of these.

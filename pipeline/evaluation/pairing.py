@@ -14,6 +14,7 @@ from scanchain.errors import InputError
 from scanchain.words import counted
 
 _WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
+_SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it
 _INTERVALS = 5.0  # median intervals of the reference that the default widest gap has at least
 _SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of seconds
 _ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
@@ -111,15 +112,16 @@ def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = N
     reference, and where its neighbors are more than ``gap_s`` apart, an estimated pose has none, except one within
     the rounding of a stamp written in milliseconds. Neither trajectory's stamps need increase.
 
-    gap_s : None for five median intervals of the reference, at most 0.6 s
+    gap_s : None for five usual intervals of the reference, from 0.1 to 0.6 s; half of its time lies in longer ones
     """
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not len(trajectory):
             raise InputError(f"the {name} has no pose; nothing to compare")
     order = np.argsort(reference.stamps_ns, kind="stable")
     stamps_ns, wanted_ns = reference.stamps_ns[order], estimate.stamps_ns
-    interval_ns = _median_interval_ns(stamps_ns)
-    gap_ns = min(_INTERVALS * interval_ns, _WIDEST_GAP_S * 1e9) if gap_s is None else gap_s * 1e9
+    interval_ns = _usual_interval_ns(stamps_ns)
+    default_s = min(max(_INTERVALS * 1e-9 * interval_ns, _SHORTEST_GAP_S), _WIDEST_GAP_S)
+    gap_ns = 1e9 * (default_s if gap_s is None else gap_s)
     index, difference_ns = nearest(wanted_ns, reference.stamps_ns)
     after = np.searchsorted(stamps_ns, wanted_ns, side="right")
     early, late = after == 0, after == len(stamps_ns)
@@ -185,11 +187,16 @@ def span(stamps_ns: NDArray[np.int64]) -> str:
     return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
 
 
-def _median_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
-    """Between successive different stamps; 0 where all are equal."""
-    intervals = np.diff(ordered_ns)
-    intervals = intervals[intervals > 0]
-    return float(np.median(intervals)) if len(intervals) else 0.0
+def _usual_interval_ns(ordered_ns: NDArray[np.int64]) -> float:
+    """The interval of stamps in which an instant lies at the median; 0 where all are equal.
+
+    Of stamps that come in bursts most intervals are next to nothing, and so is their median.
+    """
+    intervals = np.sort(np.diff(ordered_ns))
+    if not intervals.any():
+        return 0.0
+    elapsed = np.cumsum(intervals)
+    return float(intervals[np.searchsorted(elapsed, 0.5 * elapsed[-1])])
 
 
 def _interpolated(T_a: Matrix, T_b: Matrix, share: NDArray[np.float64]) -> Matrix:

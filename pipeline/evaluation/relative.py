@@ -109,7 +109,7 @@ def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> Relative
     start = np.flatnonzero(end < len(pairs))
     if not len(start):
         raise InputError(
-            f"no stretch of {size} fits into {counted(len(pairs), 'paired pose')}; take a shorter one"
+            f"RPE over {size}: no stretch of that length fits into {counted(len(pairs), 'paired pose')}"
         )
     stretches = np.stack([start, end[start]], axis=1)
     error = motion_errors(pairs, stretches)
@@ -187,7 +187,7 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     share, turn = np.concatenate(shares), np.concatenate(turns)
     if not len(share):
         raise InputError(
-            f"no stretch of {min(lengths_m):g} m fits into a path of {traveled_m[-1]:.1f} m; take shorter lengths"
+            f"KITTI metric: no stretch of {min(lengths_m):g} m fits into a path of {traveled_m[-1]:.1f} m"
         )
     starts = "pose" if every == 1 else f"{every}th pose"
     lengths = ", ".join(f"{length_m:g}" for length_m in lengths_m)

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.kernels.graph.semidefinite import find_semidefinite
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
-LARGEST = 1e50  # largest number in a graph: products of a few such are still finite
 
 
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:

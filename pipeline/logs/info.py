@@ -13,8 +13,9 @@ from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.selection import times_of, whole_span
 from scanchain.logs.messages.readers import kind
 from scanchain.logs.opening import index_files
-from scanchain.logs.topics import OtherSensor, other_sensors, topics_of
+from scanchain.logs.topics import OtherSensor, find_ground_truth, find_odometry, other_sensors, topics_of
 from scanchain.source import Source
+from scanchain.words import grouped
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
     indexes = index_files(sources, config)
     whole = whole_span(indexes)
     log, problem = _open(indexes, config)
-    wheels, truth = ("", "") if log is None else (log.odometry_topic, log.ground_truth_topic)
+    wheels, truth, notes = _pose_topics(indexes, config)
     return LogInfo(
         files=tuple(str(source) for source in sources),
         size_bytes=sum(size_of(source) for source in sources),
@@ -85,8 +86,8 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         base_frame="" if log is None else log.mounting.base,
         mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
         idle_keys={} if log is None else log.idle_keys(),
-        notes=() if log is None else tuple(log.notes),
-        damage=tuple(line for index in indexes for line in index.damage),
+        notes=tuple(notes if log is None else log.notes),
+        damage=tuple(grouped(line for index in indexes for line in index.damage)),
         problem=problem,
     )
 
@@ -96,6 +97,17 @@ def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, 
         return Log(indexes, config), ""
     except InputError as error:
         return None, str(error)
+
+
+def _pose_topics(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[str, str, list[str]]:
+    """Topics of wheels and ground truth, whichever lidar is chosen, and notes; empty where the log has none."""
+    notes = [line for index in indexes for line in index.notes]
+    try:
+        wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, notes)
+        truth = find_ground_truth(indexes, config.ground_truth_topic, LogConfig().ground_truth_topic)
+    except InputError:  # which is the problem of the log as well
+        return "", "", notes
+    return wheels.topic if wheels else "", truth.topic if truth else "", notes
 
 
 def _topics(indexes: Sequence[FileIndex], duration_s: float) -> tuple[TopicInfo, ...]:

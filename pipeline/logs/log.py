@@ -19,7 +19,7 @@ from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import chosen_span, count_scans, whole_span
+from scanchain.logs.mcap.selection import chosen_span, count_scans, notes_on, whole_span
 from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
@@ -39,7 +39,7 @@ from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.source import Source, source_of
-from scanchain.words import counted
+from scanchain.words import counted, grouped
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
@@ -50,14 +50,20 @@ _WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma
 
 def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
     """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+    named = sources_of(sources)
+    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
+    return Log(index_files(named, config), config)
+
+
+def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, ...]:
+    """The files or addresses of one log. Raises InputError for what is neither, and for none."""
     named = [sources] if isinstance(sources, Source | str) else sources
     is_named = isinstance(named, Sequence) and all(isinstance(each, Source | str) for each in named)
     if not is_named:
         raise InputError(f"a log is {shown(sources)}; wanted a path, an address or a list of them")
     if not named:
         raise InputError("no log was given; wanted a path, an address or a list of them")
-    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
-    return Log(index_files([source_of(each) for each in named], config), config)
+    return tuple(source_of(each) for each in named)
 
 
 class Log:
@@ -73,7 +79,6 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
-    damage : what could not be read; complete once ``scans`` is through or closed
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -83,12 +88,19 @@ class Log:
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, self.notes)
+        wheels = find_odometry(
+            indexes,
+            config.odometry_topic,
+            (config.ground_truth_topic, _DEFAULTS.ground_truth_topic),
+            self.notes,
+        )
         truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
+        is_untimed = config.point_times == "none"  # told from scans that have no times at all
+        self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
@@ -96,11 +108,11 @@ class Log:
         self.span = chosen_span(whole, config)
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
-        self.notes += self._mounting_notes()
+        self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        self.damage: list[str] = [line for index in indexes for line in index.damage]
+        self._damage: list[str] = [line for index in indexes for line in index.damage]
         self.pose_decoders: Decoders = {
             channel.topic: pose_reader(channel, self.dimension)
             for channel in (wheels, truth)
@@ -113,6 +125,11 @@ class Log:
         self.scans_with_wheels = 0
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    @property
+    def damage(self) -> list[str]:
+        """Damage that was met; complete once ``scans`` is through or closed."""
+        return grouped(self._damage)
 
     @property
     def has_odometry(self) -> bool:
@@ -135,11 +152,12 @@ class Log:
         return idle
 
     def _has_point_times(self) -> bool:
-        """True if the first scan with returns has per-point times; assumed of a remote log."""
+        """True if the first scan has per-point times; assumed of a laser scan of a remote log."""
+        if not is_scan(self.lidar):
+            return self._sampled_times.are_found
         if not all(isinstance(path, Path) for path in self.paths):
             return True
-        config = replace(self.config, point_times="auto") if self.config.point_times == "none" else self.config
-        returns = first_messages(self.indexes, self.topic, self.decoder(PointTimes(config)).decode)
+        returns = first_messages(self.indexes, self.topic, self.decoder(self._sampled_times).decode)
         return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
@@ -149,7 +167,7 @@ class Log:
         counted in ``damage`` and left out, like damaged chunks. Raises InputError when there are more of them
         than ``log.max_bad_scans_percent`` allows.
         """
-        self.damage = [line for index in self.indexes for line in index.damage]
+        self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self.mounting)
         counts = ScanCounts(self.topic, self.odometry_topic)
@@ -175,13 +193,13 @@ class Log:
                 requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
-            self.damage += [*counts.losses(), *poses.complaints()]
+            self._damage += [*counts.losses(), *poses.complaints()]
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
-        if self.damage:
+        if self._damage:
             scans = counted(count - counts.bad, "scan")
-            self.damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
+            self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _scan(self, index: int, message: Decoded, poses: PosesAtScan, *, waited_s: float) -> Scan:
         returns = message.value
@@ -230,11 +248,10 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        times = PointTimes(self.config)
-        if not is_scan(self.lidar):
-            returns = first_messages(self.indexes, self.topic, self.decoder(times).decode)
-            next((each for each in returns if len(each.points)), None)
-        return "" if is_scan(self.lidar) else times.assumed
+        if is_scan(self.lidar):
+            return ""
+        is_untimed = self.config.point_times == "none"
+        return PointTimes(self.config).assumed if is_untimed else self._sampled_times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
@@ -263,7 +280,7 @@ class Log:
         """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-        for message in self._messages(decoders, self.damage):
+        for message in self._messages(decoders, self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:
@@ -283,9 +300,9 @@ class Log:
         return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
-        """The common height of all points of the first clouds, None where they have none."""
+        """Height of all points of the first clouds, None where they differ; samples their point times, too."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        decoder = PointCloudDecoder(limits, PointTimes(self.config), cloud_reader(self.lidar))
+        decoder = PointCloudDecoder(limits, self._sampled_times, cloud_reader(self.lidar))
         height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
         if height_m is not None:
             self.notes.append(
@@ -300,5 +317,4 @@ class Log:
         return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
 
     def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
-        ahead = self.config.prefetch_chunks
-        return decoded_messages(self.indexes, decoders, self.span, ahead=ahead, damage=damage)
+        return decoded_messages(self.indexes, decoders, self.span, damage=damage)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 
+from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
@@ -53,13 +54,13 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 
 
 def find_odometry(
-    indexes: Sequence[FileIndex], wanted: str, ground_truth: str, notes: list[str]
+    indexes: Sequence[FileIndex], wanted: str, no_wheels: Container[str], notes: list[str]
 ) -> Channel | None:
-    """The wheel odometry's channel: the configured topic, else the only one apart from the ground truth."""
+    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses."""
     if wanted:
         return _chosen(indexes, wanted, "log.odometry_topic")
     channels = topics_of(indexes).values()
-    found = [channel for channel in channels if is_odometry(channel) and channel.topic != ground_truth]
+    found = [channel for channel in channels if is_odometry(channel) and channel.topic not in no_wheels]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
@@ -68,7 +69,12 @@ def find_odometry(
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -> Channel | None:
-    """The ground truth's channel; only a topic that is not the default one must exist."""
+    """The ground truth's channel; only a topic that is not the default one must exist.
+
+    None for ``NO_TRUTH``.
+    """
+    if wanted == NO_TRUTH:
+        return None
     if wanted == default and not any(channel.topic == wanted for channel in _with_poses(indexes)):
         return None
     return _chosen(indexes, wanted, "log.ground_truth_topic")

@@ -17,6 +17,8 @@ from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
+_SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
+
 
 class LoopCloser:
     """Searches from each new keyframe for older ones that it revisits and verifies them."""
@@ -24,7 +26,7 @@ class LoopCloser:
     def __init__(self, config: Config, dimension: int) -> None:
         """Raises InputError for a recognizer that cannot be loaded."""
         self.segments = Segments()
-        submaps = VoxelSubmaps(dimension, config.loops.submap_keyframes, config.local_map, self.segments)
+        submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = ScanVerifier(config, submaps)
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)

@@ -20,6 +20,7 @@ from scanchain.loops.submaps import Submap
 _MAX_COMPARED = 10  # number of descriptors with the most similar keys that are compared in full
 _MAX_NEAREST = 3  # number of descriptors nearest to the expected pose that are compared in full
 _MAX_HEADING_ERROR_RAD = 0.5  # largest error of odometry's heading in the search near the expected pose
+_MIN_SIMILARITY = 0.45  # least similarity of a candidate that is verified by matching
 _RIVAL = 0.9  # share of the best similarity, from which on a candidate elsewhere makes it ambiguous
 _MIN_APART = 0.25  # least distance in radii of a submap between two poses that are not the same
 _GROWTH = 1.25  # factor by which the database grows between two builds of its tree
@@ -53,7 +54,7 @@ class DescriptorRecognizer:
         if not similar:
             return []
         best = self._best(descriptor, similar, query)
-        candidates = [best] if best.score >= self.config.loops.min_similarity else []
+        candidates = [best] if best.score >= _MIN_SIMILARITY else []
         near = database.nearest(query.T_world, query.T_world_anchor[:3, 3], _MAX_NEAREST)
         return candidates + self._best_nearby(descriptor, near, query)
 

@@ -16,6 +16,7 @@ from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_reco
 from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier, Verification
 
+_PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
 _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 
 
@@ -161,6 +162,6 @@ class PlaceCloser:
         moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
         moved_m = float(np.linalg.norm(moved[:-1, -1]))
         traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
-        if moved_m > max(limits.place_drift * traveled_m, limits.min_radius_m):
-            return f"{moved_m:.1f} m from the prediction > loops.place_drift ({limits.place_drift:g}) of the path"
+        if moved_m > max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
+            return f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between"
         return ""

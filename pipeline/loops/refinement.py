@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config, MatchingConfig
+from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points
 from scanchain.kernels.registration.icp import refine
 from scanchain.point_store import PointStore
@@ -52,7 +52,8 @@ def refined(
     spans : (N, 2) first row and number of each scan's points in the store
     """
     surfaces, least_share = _map_of(poses, keyframes, config), config.matching.min_inlier_share
-    settings = settings_of(_briefly(config), surfaces, wide=False)
+    settings = settings_of(config.matching, surfaces, wide=False)
+    settings = settings._replace(reach=1, last_reach=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
     prior = np.diag(sigma**-2.0) * settings.variance
     result = poses.copy()
@@ -82,10 +83,3 @@ def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> Vox
     for keyframe in keyframes:
         result.insert(keyframe.points, poses[keyframe.scan_index])
     return result
-
-
-def _briefly(config: Config) -> MatchingConfig:
-    """Matching with few steps and correspondences nearby, for poses that are good already."""
-    return msgspec.structs.replace(
-        config.matching, reach_voxels=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD
-    )

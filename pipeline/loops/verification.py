@@ -20,6 +20,8 @@ from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
 
 _MIN_OVERLAP_ALONE = 0.8  # least overlap of a match that no expected pose supports
+_MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized place, as loops.min_… of others
+_MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of each submap with itself
 _COARSE = 2.0  # voxel size, in usual ones, of the first alignment of two submaps
 _VIEWS = 8  # number of views of each submap that are compared with the other
 _BINS = (90, 180)  # bins of elevation and azimuth: 2° each
@@ -134,17 +136,15 @@ class SubmapVerifier:
         return result
 
     def _problem(self, match: Match, overlap: float, agreement: float) -> str:
-        limits, information = self.config.loops, match.degeneracy_eigenvalue
+        information = match.degeneracy_eigenvalue
         if not match.is_fit:
             return match.reason
-        if overlap < limits.min_place_overlap:
-            return f"overlap {overlap:.2f} < loops.min_place_overlap ({limits.min_place_overlap:g})"
-        if information < limits.min_place_information:
-            return (
-                f"information {information:.1e} < loops.min_place_information ({limits.min_place_information:g})"
-            )
-        if agreement < limits.min_agreement:
-            return f"agreement {agreement:.2f} < loops.min_agreement ({limits.min_agreement:g})"
+        if overlap < _MIN_PLACE_OVERLAP:
+            return f"overlap {overlap:.2f} < the least of a recognized place ({_MIN_PLACE_OVERLAP:g})"
+        if information < _MIN_PLACE_INFORMATION:
+            return f"information {information:.1e} < the least of a recognized place ({_MIN_PLACE_INFORMATION:g})"
+        if agreement < _MIN_AGREEMENT:
+            return f"free-space agreement {agreement:.2f} < the least of a recognized place ({_MIN_AGREEMENT:g})"
         return ""
 
 

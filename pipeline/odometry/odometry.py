@@ -14,13 +14,14 @@ from scanchain.config import Config
 from scanchain.data import Match, Points, Pose, Prior, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.odometry.live_stamps import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import VoxelMap, create_matcher
-from scanchain.settings import check_order, load_settings
+from scanchain.settings import check_dimension, check_order, load_settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,7 @@ class Odometry:
         self.map = MapKeeper(self.dimension, config.local_map)
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
+        self.live_stamps = LiveStamps()
         self.scans = 0
 
     @property
@@ -76,8 +78,16 @@ class Odometry:
         *,
         T_odom_base: Pose | None = None,
     ) -> Tracked:
-        """Place a scan as a driver gives it; arguments as in ``Scan.of``."""
-        return self.process(Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base))
+        """Place a scan as a driver gives it; arguments as in ``Scan.of``.
+
+        Raises InputError, and forgets the scan, where its stamp is not after the last one, or where stamps or
+        ``times_s`` cannot be seconds.
+        """
+        scan = Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base)
+        self.live_stamps.check(scan)
+        tracked = self.process(scan)
+        self.live_stamps.take(scan)
+        return tracked
 
     def process(self, scan: Scan) -> Tracked:
         """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""
@@ -224,4 +234,5 @@ def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: i
         config = load_settings(len(T_base_lidar) - 1).config
     checks.instance(config, Config, "config", "load_settings(dimension).config")
     check_order(config)
+    check_dimension(config, len(T_base_lidar) - 1)
     return config, T_base_lidar

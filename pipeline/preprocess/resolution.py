@@ -10,6 +10,7 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.preprocess.sweep import Sweep, sweep_of
 
+_RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
 _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
@@ -22,7 +23,7 @@ class Resolution:
     Attributes
     ----------
     scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
-        that the median range spans about ``preprocess.range_voxels`` voxels of the local map, or more
+        that the median range spans about _RANGE_VOXELS voxels of the local map, or more
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
     """
 
@@ -62,7 +63,7 @@ class Resolution:
         return before == (self.scale, self.match_voxel_m)
 
     def _scale_for(self, median_range_m: float) -> float:
-        target = math.log2(median_range_m / (self.config.range_voxels * self.voxel_size_m))
+        target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
         if abs(target - math.log2(self.scale)) <= _HYSTERESIS:
             return self.scale
         return min(max(2.0 ** round(target), self.config.min_scale), 1.0)

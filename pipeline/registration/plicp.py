@@ -24,6 +24,7 @@ OPTIMIZERS = {
     "levenberg-marquardt": LEVENBERG_MARQUARDT,
 }
 
+_REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searched for sure; voxels
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
@@ -75,9 +76,9 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
     return Settings(
         optimizer=OPTIMIZERS[config.optimizer],
         max_iterations=config.max_iterations,
-        reach=config.wide_reach_voxels if wide else config.reach_voxels,
+        reach=_reach(config.wide_max_distance_m if wide else config.max_distance_m, target),
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
-        last_reach=config.reach_voxels,
+        last_reach=_reach(config.max_distance_m, target),
         last_distance_m=target.scale * config.max_distance_m,
         first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
         widest_scale_m=config.wide_kernel_scale_m,
@@ -89,6 +90,11 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
         tolerance_m=config.tolerance_m,
         tolerance_rad=config.tolerance_rad,
     )
+
+
+def _reach(max_distance_m: float, target: VoxelMap) -> int:
+    """Neighboring voxels searched in each direction, for the largest distance of a correspondence."""
+    return min(math.ceil(_REACH * max_distance_m / target.config.voxel_size_m), _LARGEST_REACH)
 
 
 def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConfig) -> Match:

@@ -10,6 +10,7 @@ from scanchain.data import Points, Pose
 from scanchain.kernels.voxels.voxel_shapes import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
+_MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 
 
@@ -46,7 +47,7 @@ class VoxelMap:
             self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)
         if len(self) + len(points) > len(self.voxels.cells):
             self._rebuild(2 * (len(self) + len(points)), T_map_lidar, np.inf)
-        insert(self.voxels, points, T_map_lidar, self.insertions, float(self.config.min_points_alone))
+        insert(self.voxels, points, T_map_lidar, self.insertions, _MIN_POINTS_ALONE[self.dimension])
 
     def points(self) -> Points:
         """The mean of every voxel, (V, d), map frame."""

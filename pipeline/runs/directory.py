@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
+from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -21,6 +22,16 @@ CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
 RECORDING_FILE = "recording.rrd"
 POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _UNFINISHED = "unfinished"
+_LONGEST_NAME = 200  # bytes; file systems allow 255
+
+
+def directory_name(stem: str) -> str:
+    """Name of a directory for a log, with room for what is put around it; long ones end in a hash of the whole."""
+    name = os.fsencode(stem)
+    if len(name) <= _LONGEST_NAME:
+        return stem
+    digest = sha256(name).hexdigest()[:8]
+    return f"{name[: _LONGEST_NAME - 9].decode('utf-8', 'ignore')}-{digest}"
 
 
 class RunDirectory:

@@ -21,7 +21,7 @@ from scanchain.runs.step_table import STAGES, StepTable
 from scanchain.slam import SlamResult
 from scanchain.words import counted
 
-_MOST_CONTRADICTED = 0.1  # largest share of contradicted scans of a reliable run; good real runs have up to 0.025
+MOST_CONTRADICTED = 0.1  # largest share of contradicted scans of a reliable run; good real runs have up to 0.025
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
@@ -209,11 +209,11 @@ def count_contradicted(states: Sequence[State], fits: Sequence[float]) -> int:
 def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[int]) -> str:
     """Reason why a run is unreliable; empty if few scans contradict the map and most poses are measured."""
     degenerate, lost = states[State.DEGENERATE], states[State.LOST]
-    if contradicted > _MOST_CONTRADICTED * len(points):
+    if contradicted > MOST_CONTRADICTED * len(points):
         return (
             f"{contradicted:,} of {len(points):,} scans contradict the map where they were placed (fit below "
             f"{LEAST_FIT:g}): the motion between scans may be larger than the search (scanchain doctor; "
-            "--matching.wide_reach_voxels, --matching.wide_max_distance_m), or the log is at fault"
+            "--matching.wide_max_distance_m), or the log is at fault"
         )
     if 2 * (degenerate + lost) <= len(points):
         return ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import announcing_compilation, compiled_s, working_s
-from scanchain.config import Config, RecordingConfig
+from scanchain.config import NO_TRUTH, Config, RecordingConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
@@ -153,6 +153,8 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return
     topic = named(job.overrides, "log.ground_truth_topic")
+    if topic == NO_TRUTH:
+        return
     if topic and not log.ground_truth_topic:
         raise InputError(f"{log.name}: has no topic {topic}; scanchain info lists those with poses")
     if topic:

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain import lie
+from scanchain import checks
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
 from scanchain.simulation.motion import Motion, wheel_odometry
 from scanchain.simulation.sensors import Sensor, Sweep, take_sweep
+from scanchain.trajectory import write_tum
 
 ODOMETRY_PERIOD_NS = 20_000_000
 
@@ -43,7 +44,7 @@ def simulate(
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
     check_range("drift", drift, 0.0, 100.0)
-    destination = Path(destination)
+    destination = checks.path(destination, "destination")
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
         raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
@@ -62,19 +63,8 @@ def simulate(
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
                 progress(done + 1, len(truth))
-    write_tum(truth, truth_file)
+    write_tum(truth_file, truth)
     return truth
-
-
-def write_tum(trajectory: Trajectory, path: Path) -> None:
-    """Write ``stamp x y z qx qy qz qw`` lines; stamps in seconds with all nine decimals."""
-    poses = lie.lift(trajectory.poses)
-    rows = np.column_stack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
-    lines = []
-    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        lines.append(f"{seconds}.{nanoseconds:09d} " + " ".join(f"{value:.9f}" for value in row))
-    path.write_text("\n".join(lines) + "\n")
 
 
 def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:

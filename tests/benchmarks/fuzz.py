@@ -4,17 +4,13 @@ python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--only formats] [--keep 
 """
 
 import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-import fuzzing
-import fuzzing_formats
+from tests.support import fuzzing, fuzzing_formats
 
 
 def main():

@@ -9,12 +9,11 @@ import tempfile
 from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # instrumented Python does not compile
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import atheris
 
 with atheris.instrument_imports(include=["scanchain.logs"]):
-    import fuzzing
+    from tests.support import fuzzing
 
 
 def main():

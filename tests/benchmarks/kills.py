@@ -4,16 +4,13 @@ python -m tests.benchmarks.kills --kills 50 --seed 1 [LOG END_S ...]
 """
 
 import argparse
-import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from killing import kill_at_random, start
-from scenes import shared_data
+from tests.support.killing import kill_at_random, start
+from tests.support.scenes import shared_data
 
 LOGS = ("2d/intel.mcap", "300"), ("3d/kitti_0005_first60.mcap", "3")
 LIVELY = ("--checkpoint", "0.2")

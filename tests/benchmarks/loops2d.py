@@ -23,7 +23,7 @@ from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
 from scanchain.slam import SlamResult
-from tests.drifting import drifting_slam, stretched
+from tests.support.drifting import drifting_slam, stretched
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 DRIFTS = ((0.01, 0.002), (0.01, -0.005), (-0.03, 0.01))  # share of the way, radians a meter

@@ -34,8 +34,8 @@ from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
-from tests.drifting import drifting_slam, off_by
-from tests.false_loops import MADE_UP, false_closures
+from tests.support.drifting import drifting_slam, off_by
+from tests.support.false_loops import MADE_UP, false_closures
 
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
 TRUE_M, TRUE_RAD = 2.0, np.radians(3.0)

@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.study import Estimate, Study
-from scanchain.viz.pictures.figure import write_figure
+from scanchain.viz.pictures.figure import INK, SvgFigure, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_BEFORE, _AFTER, _TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
+BEFORE, AFTER, _TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
 _FRAME = "#cccccc"
 _ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # largest width in pixels of a picture of a factor
@@ -39,10 +40,10 @@ def draw_estimate(path: Path, study: Study) -> None:
     figure = Figure(figsize=(11.0, float(np.clip(5.2 * height / width, 3.0, 9.0)) + 1.0), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, estimate, color, title in (
-        (panels[0], study.before, _BEFORE, "before"),
-        (panels[1], study.after, _AFTER, "after"),
+        (panels[0], study.before, BEFORE, "before"),
+        (panels[1], study.after, AFTER, "after"),
     ):
-        _draw_truth(axes, study)
+        _draw_truth(axes, study, _TRUTH)
         _draw_state(axes, estimate, color, title)
         accuracy = estimate.accuracy.poses_m
         error = f": poses {accuracy:.3g} m off" if np.isfinite(accuracy) else ""
@@ -53,6 +54,31 @@ def draw_estimate(path: Path, study: Study) -> None:
     panels[0].set_ylabel("y [m]", fontsize=9)
     _legend(figure)
     write_figure(path, figure, dpi=150, bbox_inches="tight")
+
+
+def svg_before(study: Study, number: int) -> Markup:
+    """Trajectory and landmarks before optimization, for a page on which it is the ``number``-th problem."""
+    with SvgFigure.of_plan(f"before{number}", *_frame(study)) as figure:
+        _draw_truth(figure.axes, study, INK)
+        _draw_state(figure.axes, study.before, BEFORE, "before")
+        return figure.svg()
+
+
+def svg_after(study: Study, number: int) -> Markup:
+    """The same after it."""
+    with SvgFigure.of_plan(f"after{number}", *_frame(study)) as figure:
+        _draw_truth(figure.axes, study, INK)
+        _draw_state(figure.axes, study.after, AFTER, "after")
+        _draw_ellipses(figure.axes, study)
+        return figure.svg()
+
+
+def svg_factor(method: MethodResult, number: int) -> Markup:
+    """Sparsity of a method's factor."""
+    with SvgFigure(f"{method.method}{number}", 4.4) as figure:
+        _draw_factor(figure.axes, method, "")
+        figure.axes.set_title("", loc="left")
+        return figure.svg()
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
@@ -97,17 +123,17 @@ def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
     return lie.transform(T, state.poses[:, :2]), lie.transform(T, state.landmarks)
 
 
-def _draw_truth(axes: Axes, study: Study) -> None:
+def _draw_truth(axes: Axes, study: Study, color: str) -> None:
     axes.set_aspect("equal")
     axes.tick_params(labelsize=9, color=_FRAME)
     axes.set_xlabel("x [m]", fontsize=9)
     for spine in axes.spines.values():
         spine.set_color(_FRAME)
     if len(study.true_poses):
-        axes.plot(*study.true_poses.T, color=_TRUTH, linewidth=1.1, linestyle=(0, (4, 2)), label="true trajectory")
+        axes.plot(*study.true_poses.T, color=color, linewidth=1.1, linestyle=(0, (4, 2)), label="true trajectory")
     if np.isfinite(study.true_landmarks).any():
         axes.plot(
-            *study.true_landmarks.T, color=_TRUTH, linestyle="none", marker="+", markersize=7,
+            *study.true_landmarks.T, color=color, linestyle="none", marker="+", markersize=7,
             markeredgewidth=0.9, label="true landmarks", zorder=4,
         )  # fmt: skip
 
@@ -131,7 +157,7 @@ def _draw_ellipses(axes: Axes, study: Study) -> None:
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     ellipses = EllipseCollection(
         axis_m[:, 1], axis_m[:, 0], angle, units="xy", offsets=_in_truth(study.after)[1],
-        offset_transform=axes.transData, facecolors="none", edgecolors=_AFTER, linewidths=0.6, alpha=0.5, zorder=2,
+        offset_transform=axes.transData, facecolors="none", edgecolors=AFTER, linewidths=0.6, alpha=0.5, zorder=2,
     )  # fmt: skip
     axes.add_collection(ellipses)
 
@@ -143,7 +169,7 @@ def _legend(figure: Figure) -> None:
     found = {}
     for axes in figure.axes:
         found |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    found["95 % ellipse of a landmark"] = Line2D([], [], color=_AFTER, linewidth=0.6, alpha=0.5)
+    found["95 % ellipse of a landmark"] = Line2D([], [], color=AFTER, linewidth=0.6, alpha=0.5)
     figure.legend(
         list(found.values()), list(found), loc="outside lower center", ncols=4, frameon=False, fontsize=9
     )

@@ -1,1 +1,6 @@
 """The rerun recording: entities, batches, sinks and the viewer."""
+
+import os
+
+# what cannot be written is told in our words; the library's own lines on it would come in between, in color
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off")

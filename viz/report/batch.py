@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from scanchain.batch.table import totals
 from scanchain.batch.task import Row, State, output_file
-from scanchain.runs.metrics import Metrics
+from scanchain.runs.metrics import MOST_CONTRADICTED, Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.figure import SvgFigure
@@ -39,6 +39,7 @@ _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a fi
 _HEADS = (
     Head("log"),
     Head("scans"),
+    Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
     Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
     Head("lost", "", "scans that could not be matched"),
     Head("warn.", "", "warnings of the run: data lost, skipped or wrong"),
@@ -58,7 +59,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     """Draw and write the page; runs are looked up in the directory."""
     done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
     missing = len(rows) - len(done)
-    unreliable = [f"{row.log} is unreliable: {row.reason}" for row in rows if row.state is State.UNRELIABLE]
+    unreliable = [f"{row.log} is unreliable: {row.why}" for row in rows if row.state is State.UNRELIABLE]
     page = Page(
         title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in its own process.",
@@ -99,11 +100,12 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
     """The figures of a log, or the reason for none."""
     m, link = row.metrics, _link(directory, row)
     if m is None:
-        return page.Row(name, (Cell(f"{row.state}: {row.reason}", is_wide=True),), link=link)
+        return page.Row(name, (Cell(f"{row.state}: {row.why}", is_wide=True),), link=link)
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
         Cell(f"{m.scans:,}"),
+        Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
         Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
         Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
         Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),

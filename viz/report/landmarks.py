@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from scanchain.errors import InputError
 from scanchain.landmarks.files.write import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Study
-from scanchain.viz.pictures.landmarks import draw_estimate, draw_factors
-from scanchain.whole_file import write_whole
+from scanchain.viz.pictures.landmarks import (
+    AFTER,
+    BEFORE,
+    draw_estimate,
+    draw_factors,
+    svg_after,
+    svg_before,
+    svg_factor,
+)
+from scanchain.viz.report.page import REPORT_FILE, Cell, Chip, Drawing, Grid, Head, Page, Row, Section, write_page
 
-_PAGE = "report.html"
+_TIMES = (
+    "Times are medians; each method solves from scratch with what it needs to know about the pattern (again: with "
+    "that kept)."
+)
+_DIFFERS = "Differs by is the largest difference of an unknown from the first method."
+_PINV = "Entries of (AᵀA)⁻¹ stand for the factor that pinv does not have."
 
 
 def write_report(directory: Path, studies: Sequence[Study]) -> None:
@@ -20,44 +32,42 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
 
     With several problems their factors stand side by side in one more picture.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     try:
-        problems = [_problem(directory, study) for study in studies]
-        together = ""
+        for study in studies:
+            draw_estimate(directory / f"{file_stem(study.name)}.png", study)
+            draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
         if len(studies) > 1:
             draw_factors(directory / "factors.png", studies)
-            together = _inline(directory / "factors.png")
-        page = environment.get_template("landmarks.html").render(problems=problems, together=together)
-        write_whole(directory / _PAGE, page.encode())
+        sections = tuple(each for number, study in enumerate(studies) for each in _sections(study, number))
+        title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
+        names = ", ".join(study.name for study in studies)
+        write_page(directory / REPORT_FILE, Page(title, names, (), (), (), sections))
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
 
-def _problem(directory: Path, study: Study) -> dict[str, object]:
-    """Pictures and figures of one problem for the page."""
-    stem = file_stem(study.name)
-    estimate, factors = directory / f"{stem}.png", directory / f"{stem}_factors.png"
-    draw_estimate(estimate, study)
-    draw_factors(factors, [study])
+def _sections(study: Study, number: int) -> Iterator[Section]:
+    """The estimate, then the linear solvers."""
     facts = [(fact.label, fact.value) for fact in study.facts]
-    return {
-        "name": study.name,
-        "facts": [*facts, *accuracy_lines(study), ("A", size_of(study))],
-        "table": table_of(study),
-        "is_comparison": len(study.methods) > 1,
-        "estimate": _inline(estimate),
-        "factors": _inline(factors),
-    }
+    chips = (Chip("before", BEFORE), Chip("after", AFTER), Chip("truth", "var(--ink)", is_dashed=True))
+    marks = "Circles: landmarks; crosses: true ones"
+    drawings = (
+        Drawing("Before optimization", f"{marks}.", svg_before(study, number)),
+        Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study, number)),
+    )
+    lines = (*facts, *accuracy_lines(study), ("A", size_of(study)))
+    yield Section(study.name, facts=lines, chips=chips, drawings=drawings)
+    factors = tuple(
+        Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method, number))
+        for method in study.methods
+    )
+    text = "Drawn is where the factor of every method is not zero."
+    yield Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
 
 
-def _inline(picture: Path) -> str:
-    """A PNG as the address of itself."""
-    return f"data:image/png;base64,{b64encode(picture.read_bytes()).decode('ascii')}"
+def _grid(study: Study) -> Grid:
+    headings, *rows = table_of(study)
+    split = [heading.partition(" ms") for heading in headings]
+    heads = tuple(Head(name, unit.strip()) for name, unit, _ in split)
+    notes = (_TIMES, *((_DIFFERS, _PINV) if len(rows) > 1 else ("--methods all compares the linear solvers.",)))
+    return Grid(heads, tuple(Row(name, tuple(map(Cell, cells))) for name, *cells in rows), notes)

@@ -83,7 +83,7 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a page; ``is_small`` puts more drawings side by side."""
+    """A part of a page; ``facts`` are label and value, ``is_small`` puts more drawings side by side."""
 
     title: str
     text: str = ""
@@ -91,6 +91,7 @@ class Section:
     drawings: tuple[Drawing, ...] = ()
     grid: Grid | None = None
     is_small: bool = False
+    facts: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from scanchain.data import Points, State
+from scanchain.data import LEAST_FIT, Points, State
 from scanchain.runs.closures import BACK_END
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import map_picture, path_over_map, surroundings
@@ -23,8 +23,8 @@ from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTraj
 from scanchain.viz.report.page import Chip, Drawing, Section
 from scanchain.words import counted
 
-_CONTRADICTED = "contradicted"
-_COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6"}
+_CONTRADICTED, _DISPUTED = "contradicted", "at closures rejected by the back end"
+_COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6", _DISPUTED: "#075e70"}
 _MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict
 
@@ -65,11 +65,7 @@ def trajectory_section(
             is_wide=not is_flat,
         ),
     )
-    joined = (
-        "Contradicted: scans of closures that the back end rejected as the rest of the graph contradicts them."
-    )
-    text = joined if any(chip.name.startswith(_CONTRADICTED) for chip in chips) else ""
-    return Section("Trajectory and map", text, chips, drawings)
+    return Section("Trajectory and map", chips=chips, drawings=drawings)
 
 
 def _lines(path: Floats, tables: Tables, truth: Floats | None) -> Iterator[tuple[PathLine, Chip]]:
@@ -106,6 +102,7 @@ def _states(tables: Tables) -> NDArray[np.int64]:
     names = list(_COLORS)
     states = tables.steps["state"].to_pylist()
     marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
+    marks[(marks < 0) & (tables.steps["fit"].to_numpy() < LEAST_FIT)] = names.index(_CONTRADICTED)
     if tables.closures is None or not tables.closures.num_rows:
         return marks
     keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
@@ -113,7 +110,7 @@ def _states(tables: Tables) -> NDArray[np.int64]:
     for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
         end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
         stretch = marks[scan:end]
-        stretch[stretch < 0] = names.index(_CONTRADICTED)
+        stretch[stretch < 0] = names.index(_DISPUTED)
     return marks
 
 

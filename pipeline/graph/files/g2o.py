@@ -11,13 +11,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
 from scanchain.graph.files.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.words import counted
 
 Indefinite = Literal["project", "refuse"]
 
@@ -61,6 +62,7 @@ class G2oFile:
     other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
     projection : of the indefinite information matrices; None without any
+    note : warning that angles may be degrees; empty where they are radians
     """
 
     graph: PoseGraph
@@ -68,6 +70,7 @@ class G2oFile:
     other_lines: tuple[str, ...]
     has_guess: bool
     projection: Projection | None
+    note: str = ""
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
@@ -84,7 +87,7 @@ def read_g2o(
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
     """
-    path = Path(path)
+    path = checks.path(path, "path")
     lines = sort_lines(path)
     dimension = lines.dimension
     pose_ids, poses = _vertices(path, lines)
@@ -114,7 +117,21 @@ def read_g2o(
         graph.add_sightings(sightings, seen, certainty)
     for index in fixed.tolist():
         graph.fix(index)
-    return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids), projection)
+    note = _degrees_note(lines.turns)
+    if note:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    return G2oFile(graph, ids, tuple(lines.others), bool(lines.vertices.ids), projection, note)
+
+
+def _degrees_note(turns: list[tuple[int, float]]) -> str:
+    """That angles lie beyond a whole turn, by the largest; empty where none does."""
+    if not turns:
+        return ""
+    line, largest = max(turns, key=lambda turn: turn[1])
+    return (
+        f"{counted(len(turns), 'line has', 'lines have')} an angle beyond a whole turn, up to {largest:.6g} in "
+        f"line {line}; degrees? they are taken as radians"
+    )
 
 
 @dataclass(frozen=True, slots=True)

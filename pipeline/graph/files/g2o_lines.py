@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import atan2, cos, hypot, sin
+from math import atan2, cos, hypot, pi, sin
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError, shown
-from scanchain.graph.edge_checks import LARGEST
 from scanchain.words import counted
 
 TORO_VERTICES = {2: "VERTEX2", 3: "VERTEX3"}
@@ -24,6 +24,7 @@ POINT, SIGHTING = "VERTEX_XY", "EDGE_SE2_XY"
 POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
 TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
 _LARGEST_ID = 2**63 - 1  # int64
+_WHOLE_TURN = 2.0 * pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 
 
 def from_toro(numbers: list[float], dimension: int) -> list[float]:
@@ -109,7 +110,10 @@ class Rows:
 
 @dataclass(slots=True)
 class G2oLines:
-    """A file's lines by kind; ``dimension`` is 2 or 3, and 0 where it holds neither poses nor edges."""
+    """A file's lines by kind; ``dimension`` is 2 or 3, and 0 where it holds neither poses nor edges.
+
+    ``turns`` : line and size of angles beyond a turn, which may be degrees
+    """
 
     dimension: int = 0
     vertices: Rows = field(default_factory=Rows)
@@ -118,6 +122,7 @@ class G2oLines:
     sightings: Rows = field(default_factory=Rows)
     fixed: Rows = field(default_factory=Rows)
     others: list[str] = field(default_factory=list)
+    turns: list[tuple[int, float]] = field(default_factory=list)
 
 
 def sort_lines(path: Path) -> G2oLines:
@@ -157,6 +162,11 @@ def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2o
     result.dimension = kind.dimension
     rows: Rows = getattr(result, kind.name)
     _append(path, number, words, kind.ids, kind.numbers, rows)
+    angles = rows.numbers[-1][3:6] if kind.is_toro and kind.dimension == 3 else rows.numbers[-1][2:3]
+    if (kind.is_toro or kind.dimension == 2) and kind.name in ("vertices", "edges"):
+        largest = max(map(abs, angles))
+        if largest > _WHOLE_TURN:
+            result.turns.append((number, largest))
     if kind.is_toro:
         rows.numbers[-1] = from_toro(rows.numbers[-1], kind.dimension)
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.files.g2o_lines import (
@@ -63,6 +63,7 @@ def write_g2o(
     ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name. Edges "in
     force" are written with their robust weight in Ω, so that the poses are the minimum of the file's own χ².
     """
+    checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
     d = graph.dimension
     names = (np.arange(len(graph)) if ids is None else ids).tolist()
     lines = []
@@ -108,7 +109,9 @@ def write_toro(
 
 
 def _write(path: Path | str, lines: list[str]) -> None:
-    write_whole(Path(path), "\n".join([*lines, ""]).encode())
+    path = checks.path(path, "path")
+    with checks.writing(path):
+        write_whole(path, "\n".join([*lines, ""]).encode())
 
 
 def _numbers(poses: Matrix) -> Matrix:

@@ -124,8 +124,8 @@ def align(problem, T, offset, range_m: float, first_scale_m: float):
     """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, ξ being the twist from the predicted
-    pose, ``offset`` (k,) at first. Points are associated anew when they have moved by more than SLACK, until PATIENCE
-    steps were taken with the kernel at its last scale: correspondences may alternate without end.
+    pose, ``offset`` (k,) at first. Points are associated anew when they have moved by more than SLACK, until
+    PATIENCE steps were taken with the kernel at its last scale: correspondences may alternate without end.
     range_m : root mean square of the points' ranges; first_scale_m : that the kernel's scale shrinks from
     """
     settings, size_m, k = problem.settings, problem.voxels.size_m, offset.shape[0]

@@ -106,7 +106,7 @@ def _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar: bool):
 
 @njit(cache=True, inline="always")
 def _residual(cell, x, y, z):
-    """Residual vector (3) of a point, its offset along the voxel's direction, and the residual's squared length."""
+    """Residual vector (3) of a point, its offset along the voxel's direction, and its squared length."""
     ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
     nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
     along = nx * ex + ny * ey + nz * ez

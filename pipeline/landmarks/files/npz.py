@@ -41,7 +41,7 @@ def read_landmark_data(path: Path) -> LandmarkData:
     observed = _indices(path, table, len(poses), len(landmarks))
     return LandmarkData(
         name=path.stem,
-        kind=_kind(poses, landmarks, observed, table[:, 2:]),
+        kind=_kind(path, poses, landmarks, observed, table[:, 2:]),
         odometry=odometry,
         observed=observed,
         measured=np.ascontiguousarray(table[:, 2:]),
@@ -116,10 +116,21 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
     return matrix
 
 
-def _kind(poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
-    """Kind of the measurements: least median distance of the measured point from the true position."""
+def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
+    """Kind of the measurements: least median distance of the measured point from the true position.
+
+    Raises InputError where they fit bearings in degrees best.
+    """
     true = landmarks[observed[:, 1]] - poses[observed[:, 0]]
     bearing, reach = measured.T
-    polar = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], axis=1)
-    as_linear, as_polar = (np.median(np.linalg.norm(guess - true, axis=1)) for guess in (measured, polar))
+    polar, by_degrees = (
+        np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+        for angle in (bearing, np.radians(bearing))
+    )
+    as_linear, as_polar, as_degrees = (
+        np.median(np.linalg.norm(guess - true, axis=1)) for guess in (measured, polar, by_degrees)
+    )
+    largest = float(np.abs(bearing).max())
+    if largest > 2.0 * np.pi and 2.0 * as_degrees < min(as_linear, as_polar):
+        raise InputError(f"{path}: bearings of observations reach {largest:.6g}: degrees? give radians")
     return "linear" if as_linear <= as_polar else "bearing-range"

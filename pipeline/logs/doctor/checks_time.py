@@ -24,7 +24,7 @@ _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
-_WIDE_VOXELS, _WIDE_M = 4, 6  # of a search for motions of meters between scans; either alone does not help
+_WIDE_M = 8  # least radius of a search for motions of meters between scans
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
 _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 
@@ -46,8 +46,8 @@ def _rate(seen: Survey, matching: MatchingConfig) -> Finding:
     found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
     if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not seen.wheels:
         effect = "the motion between two scans is long and predicted without wheels; the first ones may be missed"
-        remedy = f"--matching.wide_reach_voxels {_WIDE_VOXELS} --matching.wide_max_distance_m {_WIDE_M}"
-        is_wide = matching.wide_reach_voxels >= _WIDE_VOXELS and matching.wide_max_distance_m >= _WIDE_M
+        remedy = f"--matching.wide_max_distance_m {_WIDE_M}"
+        is_wide = matching.wide_max_distance_m >= _WIDE_M
         is_of_use = seen.log.dimension == 3 and not is_wide  # the plane is searched by correlation instead
         return Finding("rate", Severity.NOTE, found, effect, remedy if is_of_use else "")
     return Finding("rate", Severity.OK, found)

@@ -22,6 +22,7 @@ from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.messages.returns import Returns
+from scanchain.words import grouped
 
 _FORGOTTEN = np.empty(0)
 _NO_POINTS = np.empty((0, 2), np.float32)
@@ -89,16 +90,14 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     """Statistics of every scan of the chosen part. Raises InputError where none is readable."""
     times = PointTimes(log.config)
     decoders = {log.topic: facts_of(log.decoder(times)), **log.pose_decoders}
-    damage = list(log.damage)
+    damage = [line for index in log.indexes for line in index.damage]
     scans: list[ScanFacts] = []
     log_ns: list[int] = []
     samples: list[RawPoints] = []
     wheels: list[StampedPose] = []
     malformed: list[str] = []
     watch, read = RestWatch(log.dimension), 0
-    for message in decoded_messages(
-        log.indexes, decoders, log.span, ahead=log.config.prefetch_chunks, damage=damage
-    ):
+    for message in decoded_messages(log.indexes, decoders, log.span, damage=damage):
         match message.value:
             case ScanFacts() as facts:
                 read += 1
@@ -117,7 +116,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
                 malformed.append(str(error))
     watch.close()
     if not scans:
-        reasons = "; ".join([*malformed[:1], *damage]) or "the chosen part is empty"
+        reasons = "; ".join([*malformed[:1], *grouped(damage)]) or "the chosen part is empty"
         raise InputError(f"{log.name}: no scan of {log.topic} could be read: {reasons}")
     stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
     assumed = "" if is_scan(log.lidar) else times.assumed
@@ -131,7 +130,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
         wheels=tuple(wheels),
         malformed=tuple(malformed),
         point_times=assumed,
-        damage=tuple(damage),
+        damage=tuple(grouped(damage)),
     )
 
 

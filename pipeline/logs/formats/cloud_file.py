@@ -95,7 +95,7 @@ def read_npy(path: Path) -> NDArray[np.void]:
     try:
         array = np.load(path, allow_pickle=False)
     except (ValueError, EOFError) as error:
-        raise CloudFileError(f"is no .npy array of numbers ({' '.join(str(error).split())})") from error
+        raise CloudFileError("is no .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
         raise CloudFileError("is an archive of arrays, no .npy array; save each cloud in a file of its own")
     if array.dtype.names and array.ndim == 1:

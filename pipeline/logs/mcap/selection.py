@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.blocks import DamagedBlockError, read_block
 from scanchain.logs.mcap.records import Block, FileIndex, Message, name_of
+from scanchain.words import duration
 
 
 class Span(NamedTuple):
@@ -35,13 +37,14 @@ class Span(NamedTuple):
         return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
 
 
+_LONG_GAP_NS = 60_000_000_000  # without any message
+
 EVERYTHING = Span(0, (1 << 64) - 1)
 
 
 def whole_span(indexes: Sequence[FileIndex]) -> Span:
     """From the first message of all topics to the last, (0, 0) where there is none."""
-    blocks = [block for index in indexes for block in index.blocks]
-    blocks = [block for block in blocks if not block.may_be_empty] or blocks
+    blocks = _timed(indexes)
     begin_ns = min((block.start_ns for block in blocks), default=0)
     return Span(begin_ns, max((block.end_ns for block in blocks), default=0))
 
@@ -53,6 +56,35 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
     begin_ns = whole.begin_ns + round(config.start_s * 1e9)
     end_s = min(config.end_s, whole.duration_s)
     return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
+
+
+def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
+    """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
+    whole = whole_span(indexes)
+    span, notes = chosen_span(whole, config), []
+    if whole.duration_s < config.end_s < inf:
+        notes.append(f"--end {config.end_s:g} s has no effect: the log ends at {whole.duration_s:.1f} s")
+    end_ns, before = None, None
+    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
+        if not span.meets(block):
+            continue
+        if end_ns is not None and before is not None and block.start_ns - end_ns > _LONG_GAP_NS:
+            files = [indexes[number].path.name for number in (before, block.file)]
+            where = f" between {files[0]} and {files[1]}" if files[0] != files[1] else ""
+            notes.append(
+                f"no message for {duration(1e-9 * (block.start_ns - end_ns))} from "
+                f"{1e-9 * (end_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
+                "--start and --end choose a part"
+            )
+        if end_ns is None or block.end_ns > end_ns:
+            end_ns, before = block.end_ns, block.file
+    return notes
+
+
+def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
+    """Blocks that hold messages; all of them if none is known to."""
+    blocks = [block for index in indexes for block in index.blocks]
+    return [block for block in blocks if not block.may_be_empty] or blocks
 
 
 def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
@@ -82,10 +114,13 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
         raise InputError(f"{name}: topic {topic} has no messages; scanchain info lists what there is")
     chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
-        raise InputError(
-            f"{name}: no scan of {topic} lies {_part_in_words(config)}; the log is {whole.duration_s:.1f} s long"
-        )
+        raise nothing_in_part(f"{name}: no scan of {topic}", whole, config)
     return -(-chosen // config.every)
+
+
+def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
+    """Error of a part that holds nothing."""
+    return InputError(f"{what} lies {_part_in_words(config)}; the log is {whole.duration_s:.1f} s long")
 
 
 def _part_in_words(config: LogConfig) -> str:

@@ -19,6 +19,7 @@ from scanchain.logs.messages.cdr import MalformedMessageError
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
 _THREADS = 2
+_BLOCKS_AHEAD = 4  # that wait decoded, at most
 _MOST_BYTES_AHEAD = 256_000_000
 
 T = TypeVar("T")
@@ -34,7 +35,7 @@ class Decoded(NamedTuple):
 
 
 def decoded_messages(
-    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, ahead: int, damage: list[str]
+    indexes: Sequence[FileIndex], decoders: Decoders, span: Span, *, damage: list[str], ahead: int = _BLOCKS_AHEAD
 ) -> Iterator[Decoded]:
     """Every message of a topic that has a decoder, by log time; ties in the order of the files.
 

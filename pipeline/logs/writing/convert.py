@@ -10,12 +10,20 @@ from pathlib import Path
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import EVERYTHING, chosen_span, whole_span
+from scanchain.logs.mcap.selection import (
+    EVERYTHING,
+    chosen_span,
+    count_messages,
+    notes_on,
+    nothing_in_part,
+    whole_span,
+)
 from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, HAS_STAMPS, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.source import Source
+from scanchain.words import grouped
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
@@ -51,9 +59,14 @@ def convert(
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
     is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
     if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part and config.format == AUTO:
-        raise InputError(f"{sources[0]}: is MCAP already; scanchain run takes it as it is")
+        raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
+    span = chosen_span(whole_span(indexes), config)
+    if span != EVERYTHING and not any(
+        count_messages(indexes, topic, span) for topic in counts if not _is_fixed(topic)
+    ):
+        raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
     with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
         for message in _messages(indexes, counts, config, damage):
@@ -64,30 +77,35 @@ def convert(
                 progress(sum(counts.values()), total)
         if not sum(counts.values()):
             raise InputError(
-                f"{name_of(indexes)}: holds no message that could be read: {'; '.join(damage) or 'it is empty'}"
+                f"{name_of(indexes)}: holds no message that could be read: "
+                f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
-    notes = tuple(line for index in indexes for line in index.notes)
+    notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
     if config.rate_hz and not any(index.takes_rate for index in indexes):
         notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
-    return Converted(destination, counts, notes, tuple(damage))
+    return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
 def _messages(
     indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
-    span, ahead = chosen_span(whole_span(indexes), config), config.prefetch_chunks
-    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith("tf_static")}
-    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, ahead=ahead, damage=[]):
+    span = chosen_span(whole_span(indexes), config)
+    fixed = set() if span == EVERYTHING else {topic for topic in topics if _is_fixed(topic)}
+    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
     scans = Counter[str]()
-    for message in decoded_messages(indexes, others, span, ahead=ahead, damage=damage):
+    for message in decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
         if not message.value:  # of a file that could not be read
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message
+
+
+def _is_fixed(topic: str) -> bool:
+    return topic.endswith("tf_static")
 
 
 def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:

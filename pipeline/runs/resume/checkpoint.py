@@ -19,7 +19,7 @@ from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier
-from scanchain.odometry import FrontEnd, Odometry
+from scanchain.odometry import FrontEnd, LiveStamps, Odometry
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.map_keeper import MapKeeper
@@ -61,8 +61,8 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Odometry, Predictor, MotionFilter, Intervals, ErrorStatistics, Recovery,
-        MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
+        Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
+        Recovery, MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
         PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift,
         PoseGraph, GrowingArray, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,

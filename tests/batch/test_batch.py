@@ -1,0 +1,399 @@
+"""Many logs: each is isolated, each is a row, and what is done stays done."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from urllib.parse import unquote
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain.__main__ import main
+from scanchain.batch.batch import collect
+from scanchain.errors import InputError
+from scanchain.logs.writing.writer import LogWriter
+from scanchain.processes import resident_mib
+from scanchain.runs.directory import directory_name
+from scanchain.simulation import simulate
+from scanchain.source import Address
+from scanchain.viz.report.batch import names_of
+from tests.support.browser import look
+from tests.support.scenes import ROOT
+from tests.support.web_server import serving
+
+POISON = """
+import sys
+words = " ".join(sys.argv)
+if "-m" in sys.orig_argv and "crashing" in words:
+    import ctypes
+    ctypes.string_at(0)
+if "-m" in sys.orig_argv and "hungry" in words:
+    import time
+    eaten = []
+    for _ in range(64):
+        eaten.append(b"x" * (64 << 20))
+        time.sleep(0.05)
+"""
+
+
+@pytest.fixture(scope="module")
+def drawers(tmp_path_factory):
+    """24 logs of two seconds each, no two alike, one in a drawer of its own; two of them are poison."""
+    folder = tmp_path_factory.mktemp("logs")
+    names = [f"log_{k:02}" for k in range(22)] + ["crashing", "hungry"]
+    for seed, name in enumerate(names):
+        simulate("office", folder / f"{name}.mcap", duration_s=2.0, seed=seed)
+    return folder
+
+
+@pytest.fixture
+def poisoned(tmp_path, monkeypatch):
+    """Interpreters in which two of the logs crash the process, or eat its memory."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(POISON)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}")
+
+
+def table(folder):
+    return {row["log"].rsplit("/", 1)[1]: row for row in pq.read_table(folder / "batch.parquet").to_pylist()}
+
+
+def made(folder):
+    """When each run directory came to be."""
+    return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
+
+
+def test_of_24_logs_two_are_poison_and_22_have_results_and_a_second_call_runs_only_the_rest(
+    drawers, poisoned, tmp_path, capfd
+):
+    out = tmp_path / "out"
+    words = ["batch", f"{drawers}/*.mcap", "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
+    assert main(words) == 1
+    output, errors = capfd.readouterr()
+    rows, first = table(out), made(out)
+    done = {name: row for name, row in rows.items() if row["state"] == "done"}
+    assert len(rows) == 24 and len(done) == len(first) == 22
+    assert (rows["crashing.mcap"]["state"], rows["crashing.mcap"]["reason"]) == ("crashed", "ended by SIGSEGV")
+    assert (rows["crashing.mcap"]["tries"], rows["hungry.mcap"]["tries"]) == (2, 1)
+    assert rows["hungry.mcap"]["state"] == "out of memory"
+    assert rows["hungry.mcap"]["reason"] == "took more than --memory-limit (1.5 GiB)"
+    assert rows["hungry.mcap"]["scans"] is None
+    for row in done.values():
+        metrics = json.loads((out / row["run"] / "metrics.json").read_text())
+        assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
+        assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
+    assert "24: 22 done, 1 crashed, 1 out of memory" in output
+    assert errors == f"error: 2 of 24 logs have no result; {out}/summary.txt has the reason\n"
+
+    assert main(words) == 1  # only the two are tried again
+    assert made(out) == first and "22 results from before" in capfd.readouterr()[0]
+
+
+def test_logs_of_the_longest_names_have_directories_of_their_own_and_keep_their_names(drawers, tmp_path):
+    names = [f"{'ä' * 121}{k}.mcap" for k in range(2)]
+    for k, name in enumerate(names):
+        (tmp_path / name).write_bytes((drawers / f"log_0{k}.mcap").read_bytes())
+    out = tmp_path / "out"
+    assert main(["batch", f"{tmp_path}/*.mcap", "--out", str(out), "--end", "1"]) == 0
+    rows = table(out)
+    assert sorted(rows) == names and len({row["run"] for row in rows.values()}) == 2
+    assert directory_name("log") == "log" and directory_name("a" * 240 + "b") != directory_name("a" * 240 + "c")
+
+
+def test_what_is_done_is_done_until_the_contents_or_the_configuration_change(drawers, tmp_path, capfd):
+    log, out = tmp_path / "log.mcap", tmp_path / "out"
+    log.write_bytes((drawers / "log_00.mcap").read_bytes())
+    words = ["batch", str(log), "--out", str(out)]
+    assert main(words) == 0
+    first = made(out)
+    log.rename(tmp_path / "renamed.mcap")
+    assert main(["batch", str(tmp_path / "renamed.mcap"), "--out", str(out)]) == 0
+    assert made(out) == first and list(table(out)) == ["renamed.mcap"]
+    assert main([*words[:1], str(tmp_path / "renamed.mcap"), *words[2:], "--matching.matcher", "svd"]) == 0
+    assert len(made(out)) == 2
+    log.write_bytes((drawers / "log_01.mcap").read_bytes())
+    assert main(words) == 0
+    assert len(made(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
+
+
+def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
+    radar, out = tmp_path / "radar.mcap", tmp_path / "out"
+    rng = np.random.default_rng(0)
+    with LogWriter(radar) as log:
+        for k in range(20):
+            log.point_cloud("/radar", 10**18 + k * 10**8, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
+    words = ["batch", str(radar), str(drawers / "log_03.mcap"), "--out", str(out)]
+    assert main(words) == 1
+    output, errors = capfd.readouterr()
+    rows, first = table(out), made(out)
+    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("unreliable", "done")
+    assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
+    assert len(first) == 2 and "2: 1 done, 1 unreliable" in output
+    assert errors == f"error: 1 of 2 logs are unreliable; {out}/summary.txt has the reason\n"
+    assert f"{radar} is unreliable" in (out / "report.html").read_text()
+    assert main(words) == 1
+    assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
+
+
+def test_a_result_that_was_thrown_away_is_missing(drawers, tmp_path):
+    words = ["batch", str(drawers / "log_02.mcap"), "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    (run,) = made(tmp_path / "out")
+    (run / "metrics.json").unlink()
+    assert main(words) == 0
+    assert (run / "metrics.json").exists()
+
+
+def test_logs_that_are_damaged_absent_or_slow_are_rows(drawers, tmp_path):
+    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
+    logs = [tmp_path / "bad.mcap", tmp_path / "absent.mcap", drawers / "log_03.mcap"]
+    out = tmp_path / "out"
+    assert main(["batch", *map(str, logs), "--out", str(out), "--time-limit", "0.2"]) == 1
+    rows = table(out)
+    assert rows["absent.mcap"]["state"] == "failed" and "no such file" in rows["absent.mcap"]["reason"]
+    assert rows["log_03.mcap"]["reason"] == "took longer than --time-limit (0.2 s)"
+    assert main(["batch", *map(str, logs), "--out", str(out)]) == 1
+    rows = table(out)
+    assert rows["bad.mcap"]["state"] == "failed" and "bad.mcap" in rows["bad.mcap"]["reason"]
+    assert rows["log_03.mcap"]["state"] == "done"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes there")
+def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, tmp_path, capfd):
+    content = (drawers / "log_00.mcap").read_bytes()
+    bad = tmp_path / os.fsdecode(b"bad\xff.mcap")
+    bad.write_bytes(content)
+    (tmp_path / os.fsdecode(b"parts\xff")).mkdir()
+    (tmp_path / os.fsdecode(b"parts\xff") / "part.mcap").write_bytes(content)
+    for name in (bad, bad.with_name(os.fsdecode(b"parts\xff"))):
+        assert main(["run", str(name), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+        errors = capfd.readouterr()[1]
+        assert errors.startswith(f"error: {tmp_path}/") and errors.count("\n") == 1
+        assert "\\xff" in errors and errors.endswith(": the name is not UTF-8; rename it\n")
+    out = tmp_path / "out"
+    logs = [str(bad), str(bad.with_name(os.fsdecode(b"parts\xff"))), str(drawers / "log_01.mcap")]
+    assert main(["batch", *logs, "--out", str(out)]) == 1
+    rows = table(out)
+    assert [row["state"] for row in rows.values()] == ["failed", "failed", "done"]
+    assert rows["bad\\xff.mcap"]["reason"] == f"{tmp_path}/bad\\xff.mcap: the name is not UTF-8; rename it"
+    assert "bad\\xff.mcap" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_path, capfd):
+    content = (drawers / "log_00.mcap").read_bytes()
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out"
+    cut.write_bytes(content[:-20])
+    assert main(["batch", str(cut), str(drawers / "log_01.mcap"), "--out", str(out)]) == 0
+    rows, (output, _) = table(out), capfd.readouterr()
+    metrics = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())
+    assert rows["cut.mcap"]["warnings"] == len(metrics["warnings"]) > 0 == rows["log_01.mcap"]["warnings"]
+    assert f"warned         {cut}: {metrics['warnings'][0]}" in output and "in 1 log" in output
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert f'<td class="bad">{len(metrics["warnings"])}</td>' in page
+
+
+def test_a_log_that_fails_is_not_blamed_on_another_of_the_same_contents(tmp_path):
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "empty.mcap").touch()
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(b"no log at all")
+    out = tmp_path / "out"
+    logs = [str(tmp_path / f"{name}.mcap") for name in ("folder", "empty", "a", "b")]
+    assert main(["batch", *logs, "--out", str(out)]) == 1
+    reasons = {name: row["reason"] for name, row in table(out).items()}
+    for name in ("folder.mcap", "empty.mcap"):
+        assert reasons[name].startswith(f"{tmp_path / name}: ")
+    assert "is a folder" in reasons["folder.mcap"] and "is a folder" not in reasons["empty.mcap"]
+    one, other = sorted(("a.mcap", "b.mcap"), key=lambda name: reasons[name].startswith("has the contents"))
+    assert reasons[one].startswith(f"{tmp_path / one}: is no log")
+    assert reasons[other] == f"has the contents of {tmp_path / one}: {reasons[one]}"
+
+
+def test_a_wrong_configuration_ends_the_batch_before_any_log(drawers, tmp_path, capfd):
+    words = ["batch", str(drawers / "log_00.mcap"), "--out", str(tmp_path / "out"), "--matching.reach", "2"]
+    assert main(words) == 2 and not (tmp_path / "out").exists()
+    assert "--matching.reach" in capfd.readouterr()[1]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "scanchain", "batch", f"{drawers}/log_*.mcap", "--out", str(out)]
+    child = subprocess.Popen(
+        [*command, "--workers", "1"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    while not list(out.glob("rows/*.json")):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    output, errors = child.communicate(timeout=20)
+    assert child.returncode == 1 and b"logs have no result" in errors and b"not run" in output
+    states = [row["state"] for row in table(out).values()]
+    assert len(states) == 22 and 1 <= states.count("done") < 22
+    assert states.count("done") + states.count("not run") == 22
+
+
+def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
+    for name in ("a", "b", "c", "d"):
+        (tmp_path / f"{name}.mcap").touch()
+    (tmp_path / "list.txt").write_text("c.mcap  # the third\n\n# nothing\nd*.mcap\na.mcap\n")
+    found = collect([tmp_path / "[ab].mcap"], [tmp_path / "list.txt"])
+    assert [path.name for path in found] == ["a.mcap", "b.mcap", "c.mcap", "d.mcap"]
+    with pytest.raises(InputError, match=r"x\*\.mcap: matches nothing"):
+        collect([tmp_path / "x*.mcap"], [])
+    with pytest.raises(InputError, match="no log is named"):
+        collect([], [])
+    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
+        collect([], [tmp_path / "none.txt"])
+
+
+def test_logs_of_the_same_name_are_told_apart_by_their_folders():
+    logs = ["/a/x/log.bag", "/b/x/log.bag", "/c/other.bag", "https://host/a/one.mcap"]
+    assert list(names_of(logs).values()) == ["a/x/log.bag", "b/x/log.bag", "other.bag", "one.mcap"]
+
+
+def test_a_batch_is_not_written_among_logs_nor_into_a_run(tmp_path, capsys):
+    logs, run = tmp_path / "logs", tmp_path / "run"
+    (logs / "folder").mkdir(parents=True)
+    (logs / "folder" / "0.pcd").write_bytes(b"x")
+    run.mkdir()
+    (run / "run.json").write_text('{"versions": {"scanchain": "1"}}')
+    for log, out, says in (
+        (logs / "a.mcap", logs, "is not empty and not a batch"),
+        (logs / "folder", logs / "folder" / "out", "lies in the log"),
+        (logs / "a.mcap", run / "deep" / "out", "lies in the run directory"),
+    ):
+        assert main(["batch", str(log), "--out", str(out)]) == 2
+        assert re.fullmatch(rf"error: {out}: {says}.*; choose another --out\n", capsys.readouterr().err)
+    assert not (logs / "rows").exists() and not (logs / "folder" / "out").exists()
+
+
+def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, capfd):
+    log, out = tmp_path / "still.mcap", tmp_path / "out"
+    angles = np.radians(np.arange(360.0))
+    ranges = 4.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))  # a square room
+    with LogWriter(log) as writer:
+        for stamp_ns in range(0, 2_000_000_000, 100_000_000):
+            writer.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(4))
+            writer.laser_scan(
+                "/scan", stamp_ns, "lidar", 0.0, np.radians(1.0), 0.0, ranges, range_min_m=0.1, range_max_m=20.0
+            )
+    assert main(["batch", str(log), "--out", str(out)]) == 0
+    assert main(["batch", str(log), "--out", str(out)]) == 0
+    (row,) = table(out).values()
+    assert (row["state"], row["scans"], row["ate_share_of_path"]) == ("done", 20, None)
+    assert "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
+
+
+def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):
+    pytest.importorskip("fsspec", reason="the extra remote is not installed")
+    out = tmp_path / "out"
+    bad = tmp_path / "<bad>.mcap"
+    bad.write_bytes(b"no log at all")
+    with serving({"/far.mcap?key=secret": (drawers / "log_04.mcap").read_bytes()}) as site:
+        words = [
+            "batch",
+            f"{site.url}/far.mcap?key=secret",
+            str(drawers / "log_05.mcap"),
+            str(bad),
+            "--memory-limit",
+            "2",
+            "--out",
+            str(out),
+        ]
+        monkeypatch.setattr(sys, "argv", ["scanchain", *words])
+        assert main(words) == 1
+        assert table(out)["far.mcap"]["reason"] == table(out)["log_05.mcap"]["reason"] == ""
+        first = made(out)
+        assert main(words) == 1 and made(out) == first
+        site.etag = '"two"'
+        assert main(words) == 1 and len(made(out)) == len(first) + 1 == 3
+    rows = table(out)
+    assert rows["far.mcap"]["log"] == f"{site.url}/far.mcap" and rows["far.mcap"]["scans"] == 20
+    page = (out / "report.html").read_text()
+    assert "Batch of 3 logs" in page and "&lt;bad&gt;.mcap" in page and "<bad>" not in page
+    assert page.count("<svg") == 3 + 2  # errors, speeds and memory; two ways
+    written = [file.read_bytes() for file in out.rglob("*") if file.is_file()]
+    assert not any(b"secret" in content for content in written)
+
+
+@pytest.fixture
+def two_lidars(tmp_path):
+    """Two logs of a long name with two lidars each; the first sees one wall alone, along which all is open."""
+    logs = [tmp_path / f"2026-11-22_warehouse_north_aisle_{name}_second_attempt.mcap" for name in ("wall", "room")]
+    angles = np.radians(np.arange(-90.0, 90.5, 0.5))
+    wall = 3.0 / np.maximum(np.cos(angles), 1e-3)
+    room = np.minimum(wall, 4.0 / np.maximum(np.abs(np.sin(angles)), 1e-3))
+    for log, ranges in zip(logs, (wall, room), strict=True):
+        with LogWriter(log) as writer:
+            for stamp_ns in range(0, 2_000_000_000, 100_000_000):
+                for topic in ("/front", "/rear"):
+                    writer.laser_scan(
+                        topic, stamp_ns, "lidar", angles[0], np.radians(0.5), 0.0, ranges,
+                        range_min_m=0.1, range_max_m=20.0,
+                    )  # fmt: skip
+    return logs
+
+
+def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars, tmp_path):
+    words = ["batch", *map(str, two_lidars), "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    assert all("choose one with --topic" in row["reason"] for row in table(tmp_path / "out").values())
+    assert main([*words, "--topic", "/rear", "--every", "2", "--no-loops"]) == 1  # beside one wall nothing is sure
+    assert [row["state"] for row in table(tmp_path / "out").values()] == ["unreliable", "done"]
+    rows = table(tmp_path / "out")
+    assert [row["scans"] for row in rows.values()] == [10, 10]
+    for row in rows.values():
+        config = (tmp_path / "out" / row["run"] / "config.toml").read_text()
+        assert 'topic = "/rear"' in config and "every = 2" in config and "enabled = false" in config
+    assert main([*words, "--gt", "truth.tum"]) == 2
+
+
+def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
+    out = tmp_path / "out"
+    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
+    logs = [*map(str, two_lidars), str(tmp_path / "bad.mcap")]
+    assert main(["batch", *logs, "--out", str(out), "--topic", "/front"]) == 1
+    rows = table(out)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
+    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
+    assert blind[0] == ("", "20") and blind[2] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
+    assert fine[1] == fine[2] == fine[3] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    links = re.findall(r'<a href="([^"]+)">', page)
+    assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
+    assert links[0].endswith("/report.html") and links[2].startswith("rows/")
+    seen = look(out / "report.html", tmp_path, width=390)
+    assert (
+        0.0 < seen["reasons"] <= 390
+        and seen["names"] < 0.45 * 390
+        and seen["wide"] <= seen["width"]
+        and seen["outside"] == []
+    )
+
+
+def test_of_remote_logs_a_pattern_names_those_that_match(monkeypatch):
+    fsspec = pytest.importorskip("fsspec", reason="the extra remote is not installed")
+    memory = fsspec.filesystem("memory")
+    for name in ("b.mcap", "a.mcap", "c.txt"):
+        memory.pipe_file(f"/drives/{name}", b"x")
+    found = collect([Address("memory://drives/*.mcap"), Address("https://host/log.mcap?take=[1]")], [])
+    assert [each.name for each in found] == ["a.mcap", "b.mcap", "log.mcap"]
+    with pytest.raises(InputError, match=r"none\*: matches nothing"):
+        collect([Address("memory://drives/none*")], [])
+
+
+def test_the_memory_of_children_counts():
+    before = resident_mib(os.getpid())
+    code = "x = b'x' * (64 << 20); print(len(x), flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        child.stdout.readline()
+        with_child = resident_mib(os.getpid())
+        child.communicate("\n")
+    assert with_child > before + 60.0 and resident_mib(child.pid) == 0.0

@@ -1,0 +1,53 @@
+"""A batch on a Ray cluster of two nodes, one of which dies half-way."""
+
+import os
+
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain.batch.batch import Batch, run_batch
+from scanchain.simulation import simulate
+from tests.support.scenes import ROOT
+
+pytest.importorskip("ray", reason="the extra cluster is not installed")
+
+
+class Watching:
+    """Kills a node once so many logs are done."""
+
+    def __init__(self, after, kill):
+        self.after, self.kill = after, kill
+
+    def say(self, line):
+        pass
+
+    def count(self, done, total):
+        if done == self.after:
+            self.kill()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a local cluster")
+def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
+    from ray.cluster_utils import Cluster
+
+    from scanchain.batch.cluster import on_cluster
+
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    logs = [tmp_path / f"log_{k}.mcap" for k in range(6)]
+    for seed, log in enumerate(logs):
+        simulate("office", log, duration_s=2.0, seed=seed)
+    options = {"num_cpus": 1, "object_store_memory": 80 << 20}
+    cluster = Cluster(initialize_head=True, head_node_args={**options, "include_dashboard": False})
+    try:
+        doomed = cluster.add_node(**options)
+        cluster.wait_for_nodes()
+        work = on_cluster(cluster.address)
+        watching = Watching(2, lambda: cluster.remove_node(doomed, allow_graceful=False))
+        batched = run_batch(Batch(tuple(logs), tmp_path / "out", arguments=("--rerun", "off")), watching, work)
+    finally:
+        cluster.shutdown()
+    assert batched.failures == ""
+    table = pq.read_table(tmp_path / "out" / "batch.parquet").to_pylist()
+    assert [row["state"] for row in table] == ["done"] * 6 and [row["scans"] for row in table] == [20] * 6
+    assert len(list((tmp_path / "out").glob("log_*/metrics.json"))) == 6

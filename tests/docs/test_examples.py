@@ -1,0 +1,170 @@
+"""Every example of README and docs runs as it stands and comes out as printed beside it.
+
+Of a page, in order and in one empty folder:
+``python`` fences run alone; after ``# -> `` stands what their statement prints,
+``console`` fences run the ``scanchain`` commands after ``$ ``; the lines below are printed in that order,
+fences whose first line is a comment with nothing but a name, as ``# mine.toml``, are files.
+Whole numbers agree exactly, others within one unit of the last digit shown.
+"""
+
+import ast
+import re
+import shlex
+
+import pytest
+
+import scanchain
+from scanchain.__main__ import main
+from tests.support.scenes import ROOT
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+GIVEN = {  # what a page takes as done
+    "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off"),
+}
+FENCE = re.compile(r"^(`{3,})(\w+)\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
+FILE = re.compile(r"# (\w+\.\w+)\n")
+NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d*)?(?:e[-+]?\d+)?", re.IGNORECASE)
+PRINTS = re.compile(r"# -> (.*)$")
+
+
+def fences(text):
+    """Language and contents of each fence that names a language."""
+    return [(language, contents) for _, language, contents in FENCE.findall(text)]
+
+
+def agree(said, printed):
+    """Whether a line printed is the one that the page says; ``...`` at its end leaves out the further words."""
+    if said.endswith("..."):
+        words = said.removesuffix("...").split()
+        return agree(" ".join(words), " ".join(printed.split()[: len(words)]))
+    if re.sub(r"\s", "", NUMBER.sub("#", said)) != re.sub(r"\s", "", NUMBER.sub("#", printed)):
+        return False
+    wanted, found = (NUMBER.findall(text.replace(",", "")) for text in (said, printed))
+    decimals = [len(number.partition(".")[2].lower().partition("e")[0]) for number in wanted]
+    return all(
+        abs(float(a) - float(b)) <= (unit(a, n or max(decimals)) if "." in a or "e" in a.lower() else 0.0)
+        for a, b, n in zip(wanted, found, decimals, strict=True)
+    )
+
+
+def unit(number, decimals):
+    """One unit of the last digit shown, and what rounding leaves."""
+    _, _, exponent = number.lower().partition("e")
+    return 1.000001 * 10.0 ** (int(exponent or 0) - decimals)
+
+
+def run_python(source, name, capsys):
+    """Run a block statement by statement, and compare what is printed with what is said."""
+    lines, scope, compared = source.splitlines(), {"__name__": "example"}, 0
+    for statement in ast.parse(source).body:
+        exec(compile(ast.Module([statement], []), name, "exec"), scope)
+        printed = " ".join(capsys.readouterr().out.split("\n")).strip()
+        said = PRINTS.search(lines[statement.end_lineno - 1])
+        if said:
+            assert agree(said[1], printed), f"{name}: says {said[1]!r}, prints {printed!r}"
+            compared += 1
+    assert compared == len(re.findall("# ->", source)), f"{name}: `# ->` stands at the end of a statement"
+    return compared
+
+
+def run_console(text, name, capsys):
+    """Run the commands of a block, and look for the lines that follow them in what they print."""
+    compared = 0
+    for command, said in re.findall(r"^\$ (.*)\n((?:[^$].*\n|\n)*)", text, re.MULTILINE):
+        words = shlex.split(command, comments=True)
+        assert words[0] == "scanchain", f"{name}: {command}: only scanchain is run; make it a `sh` fence"
+        code = main(words[1:])
+        output, errors = capsys.readouterr()
+        assert code == 0, f"{name}: {command} ended with {code}: {errors}"
+        printed = iter(output.splitlines())
+        for line in said.strip().splitlines():
+            assert any(agree(line, other) for other in printed), (
+                f"{name}: {command} does not print {line!r}:\n{output}"
+            )
+            compared += 1
+    return compared
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty folder to work in, in which this process and those it starts find modules."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_example_prints_what_the_page_says(page, folder, capsys):
+    compared = ran = 0
+    text = page.read_text(encoding="utf-8")
+    for command in GIVEN.get(page.name, ()) if "```python" in text else ():
+        assert main(command.split()) == 0
+    capsys.readouterr()
+    for number, (language, contents) in enumerate(fences(text), start=1):
+        name = f"{page.name}, block {number}"
+        if file := FILE.match(contents):
+            (folder / file[1]).write_text(contents, encoding="utf-8")
+        elif language in ("python", "console"):
+            compared += (run_python if language == "python" else run_console)(contents, name, capsys)
+            ran += 1
+    assert compared or not ran, f"{page.name}: no example says what it prints"
+
+
+@pytest.mark.parametrize(
+    ("said", "printed", "verdict"),
+    [
+        ("1.69 True", "1.6981 True", True),
+        ("1.69 True", "1.7011 True", False),
+        ("1.69 True", "1.69 False", False),
+        ("[4.60 0. 0.]", "[ 4.60069998e+00 -4.84514965e-04 -8.21846223e-03]", True),
+        ("[4.60 0. 0.]", "[ 4.60069998e+00 -4.84514965e-02 -8.21846223e-03]", False),
+        ("2.3e-05", "2.38e-05", True),
+        ("2.3e-05", "2.51e-05", False),
+        ("30 ok", "29 ok", False),
+        ("1,234 points", "1234 points", True),
+        ("30", "30 ok", False),
+        ("plicp 0.0016* ...", "plicp   0.0017*  29.0  285", True),
+        ("plicp 0.0016* ...", "plicp   0.0019*  29.0  285", False),
+    ],
+)
+def test_numbers_agree_within_the_last_digit_and_words_exactly(said, printed, verdict):
+    assert agree(said, printed) is verdict
+
+
+def test_fences_are_found_with_their_language():
+    text = "a\n```python\nb = 1\n```\n```\nno\n```\n```toml\n# mine.toml\nc = 2\n```\n"
+    assert fences(text) == [("python", "b = 1\n"), ("toml", "# mine.toml\nc = 2\n")]
+    assert [bool(FILE.match(contents)) for _, contents in fences(text)] == [False, True]
+
+
+@pytest.mark.parametrize("source", ["print(1)  # -> 2\n", "for k in (1,):\n    x = 1  # -> 2\n    y = 1\n"])
+def test_an_example_that_prints_something_else_fails(source, capsys):
+    with pytest.raises(AssertionError):
+        run_python(source, "example", capsys)
+
+
+def test_a_command_that_prints_something_else_fails(capsys):
+    assert run_console("$ scanchain config dump --lidar 2d\n[log]\n[matching]\n", "example", capsys) == 2
+    for text in ("$ scanchain config dump\n[matching]\n[log]\n", "$ scanchain info absent.mcap\n", "$ ls\n"):
+        with pytest.raises(AssertionError):
+            run_console(text, "example", capsys)
+
+
+def test_every_public_name_is_in_the_reference_of_the_api():
+    assert {name for name in dir(scanchain) if not name.startswith("_")} == set(scanchain.__all__)
+    documented = re.findall(r"^\.\. auto\w+:: (\w+)(?:\(.*)?$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    assert sorted(documented) == sorted(scanchain.__all__)
+
+
+def test_every_page_is_in_the_table_of_contents_and_the_readme_is_short():
+    listed = re.findall(r"^(\w+)$", (ROOT / "docs/index.md").read_text(), re.MULTILINE)
+    assert sorted([*listed, "index"]) == sorted(page.stem for page in PAGES[1:])
+    assert len((ROOT / "README.md").read_bytes()) <= 8000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_a_page_links_exists(page):
+    links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", FENCE.sub("", page.read_text(encoding="utf-8")))
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    assert not missing

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.robust.losses import RobustLoss, robust_loss
+from scanchain.kernels.graph import between_se2
+from tests.support import naive_graph
+
+ANGLES = [0.0, 1e-9, 1e-5, 1e-3, 0.05, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-5]
+
+
+def _problem_with_error(dimension, angle, seed=0):
+    """Two poses far from the origin and a measurement whose error turns by the given angle."""
+    rng = np.random.default_rng(seed)
+    k = 3 if dimension == 2 else 6
+    poses = lie.exp(
+        np.concatenate([rng.uniform(-20, 20, (2, dimension)), rng.uniform(-1.5, 1.5, (2, k - dimension))], 1)
+    )
+    error = rng.normal(size=k)
+    error[dimension:] *= angle / np.linalg.norm(error[dimension:])
+    Z = lie.inverse(poses[0]) @ poses[1] @ lie.inverse(lie.exp(error))
+    A = rng.normal(size=(k, k))
+    problem = BetweenProblem(np.array([[0, 1]]), Z[None], (A @ A.T + np.eye(k))[None], np.array([True, False]))
+    return problem, poses, error
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_error_is_the_logarithm_of_the_mismatch(dimension, angle):
+    problem, poses, error = _problem_with_error(dimension, angle)
+    found = problem.errors(poses)[0]
+    assert np.allclose(found, error, atol=1e-8)
+    assert np.allclose(found, naive_graph.error(*poses, problem.measurements[0]), atol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_jacobians_equal_finite_differences_from_zero_to_nearly_pi(dimension, angle):
+    problem, poses, _ = _problem_with_error(dimension, angle)
+    J = problem.jacobians(poses, problem.errors(poses))[0]
+    step = 1e-6
+    for a in range(len(J)):
+        for end, sign in ((1, 1.0), (0, -1.0)):
+            ahead = naive_graph.moved(poses, 0, 1, end, a, step, problem.measurements[0])
+            back = naive_graph.moved(poses, 0, 1, end, a, -step, problem.measurements[0])
+            assert np.allclose(sign * J[:, a], (ahead - back) / (2.0 * step), rtol=2e-6, atol=2e-6)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_blocks_in_coordinates_equal_finite_differences(angle):
+    problem, poses, _ = _problem_with_error(2, angle)
+    Z = problem.measurements[0]
+    coordinates = np.array([[*T[:2, 2], lie.yaw(T)] for T in poses])
+
+    def residual(values):
+        r = np.empty(3)
+        T_i, T_j = (lie.pose_2d(*row) for row in values)
+        between_se2.chart_blocks(T_i, T_j, Z, r, np.empty((3, 3)), np.empty((3, 3)))
+        return r
+
+    A, B = np.empty((3, 3)), np.empty((3, 3))
+    between_se2.chart_blocks(*poses, Z, np.empty(3), A, B)
+    for end, block in ((0, A), (1, B)):
+        for a in range(3):
+            shift = np.zeros((2, 3))
+            shift[end, a] = 1e-6
+            slope = (residual(coordinates + shift) - residual(coordinates - shift)) / 2e-6
+            assert np.allclose(block[:, a], slope, atol=1e-7)
+
+
+def test_the_blocks_in_coordinates_are_those_of_the_textbook():
+    problem, (T_i, T_j), _ = _problem_with_error(2, 0.4)
+    Z = problem.measurements[0]
+    R_i, R_z, theta = T_i[:2, :2], Z[:2, :2], lie.yaw(T_i)
+    slope = np.array([[-np.sin(theta), np.cos(theta)], [-np.cos(theta), -np.sin(theta)]])  # ∂R_iᵀ/∂θ_i
+    A, B, r = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    between_se2.chart_blocks(T_i, T_j, Z, r, A, B)
+    assert np.allclose(A[:2, :2], -R_z.T @ R_i.T)
+    assert np.allclose(A[:2, 2], R_z.T @ slope @ (T_j[:2, 2] - T_i[:2, 2]))
+    assert np.allclose(B[:2, :2], R_z.T @ R_i.T)
+    assert np.allclose(A[2], [0, 0, -1]) and np.allclose(B[2], [0, 0, 1]) and np.allclose(B[:2, 2], 0)
+    assert np.allclose(r[:2], R_z.T @ (R_i.T @ (T_j[:2, 2] - T_i[:2, 2]) - Z[:2, 2]))
+    assert r[2] == pytest.approx(float(lie.wrap(lie.yaw(T_j) - lie.yaw(T_i) - lie.yaw(Z))))
+
+
+def test_an_angle_difference_across_pi_is_wrapped():
+    Z = lie.identity(2)
+    poses = np.array([lie.pose_2d(0, 0, np.pi - 0.01), lie.pose_2d(0, 0, -np.pi + 0.02)])
+    problem = BetweenProblem(np.array([[0, 1]]), Z[None], np.eye(3)[None], np.array([True, False]))
+    assert problem.errors(poses)[0] == pytest.approx([0.0, 0.0, 0.03])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_normal_equations_equal_dense_finite_differences(dimension):
+    rng = np.random.default_rng(4)
+    k, count = (3, 6)[dimension - 2], 5
+    poses = lie.exp(rng.normal(size=(count, k)))
+    edges = np.array([[0, 1], [1, 2], [3, 2], [3, 4], [0, 4], [4, 0], [0, 4], [1, 3], [2, 4]])  # one pair thrice
+    A = rng.normal(size=(len(edges), k, k))
+    information = A @ np.swapaxes(A, 1, 2)
+    measured = (
+        lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.3 * rng.normal(size=(len(edges), k)))
+    )
+    fixed = np.array([False, False, True, False, False])
+    weights = rng.uniform(0.2, 1.0, len(edges))
+    problem = BetweenProblem(edges, measured, information, fixed)
+    equations = problem.linearize(poses, problem.errors(poses), weights)
+    H, g = naive_graph.normal_equations(poses, edges, measured, information, weights, fixed)
+    assert np.allclose(
+        naive_graph.dense(problem.pattern, equations.values), H, rtol=1e-5, atol=1e-5 * np.abs(H).max()
+    )
+    assert np.allclose(equations.gradient, g, rtol=1e-5, atol=1e-5 * np.abs(g).max())
+    e = problem.errors(poses)
+    assert np.allclose(problem.chi2(e), [v @ omega @ v for v, omega in zip(e, information, strict=True)])
+
+
+LOSSES = [
+    robust_loss("none", 3.0, 3),
+    robust_loss("huber", 1.5, 3),
+    robust_loss("cauchy", 2.0, 3),
+    robust_loss("geman-mcclure", 3.0, 3),
+    RobustLoss("geman-mcclure", 3.0, 7.0),
+    robust_loss("tukey", 7.0, 3),
+    RobustLoss("tukey", 3.0, 20.0),
+    RobustLoss("truncated", 3.0, 0.5),
+]
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: f"{loss.kernel}-{loss.control}")
+def test_a_weight_is_the_slope_of_its_loss_and_one_at_zero(loss):
+    chi2 = np.array([1e-6, 0.5, 2.0, 8.7, 12.0, 40.0, 1e3])
+    step = 1e-6 * chi2
+    slope = (loss.loss(chi2 + step) - loss.loss(chi2 - step)) / (2.0 * step)
+    assert np.allclose(loss.weight(chi2), slope, rtol=1e-5, atol=1e-8)
+    assert loss.weight(np.zeros(1))[0] == pytest.approx(1.0)
+    assert loss.loss(np.array([1e-9]))[0] == pytest.approx(1e-9, rel=1e-6)
+
+
+def test_geman_mcclure_is_unit_true():
+    s, chi2 = 3.0, np.array([0.0, 1.0, 9.0, 100.0])
+    assert np.allclose(robust_loss("geman-mcclure", s, 3).weight(chi2), (s**2 / (s**2 + chi2)) ** 2)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("angle", [0.0, 0.1, 3.0])
+def test_an_edge_of_position_alone_measures_the_position_whatever_the_rotation(dimension, angle):
+    full, poses, _ = _problem_with_error(dimension, angle)
+    Z, information = full.measurements, full.information.copy()
+    information[:, dimension:], information[:, :, dimension:] = 0.0, 0.0
+    problem = BetweenProblem(full.edges, Z, information, np.array([True, False]))
+    mismatch = lie.inverse(Z[0]) @ lie.inverse(poses[0]) @ poses[1]
+    assert np.allclose(problem.errors(poses)[0, :dimension], mismatch[:-1, -1])
+    assert not problem.errors(poses)[0, dimension:].any()
+    J, step = problem.jacobians(poses, problem.errors(poses))[0], 1e-6
+    for axis, twist in enumerate(step * np.eye(len(J))):
+        ends = [np.stack([poses[0], lie.exp(sign * twist) @ poses[1]]) for sign in (1.0, -1.0)]
+        ahead, back = (problem.errors(pair)[0] for pair in ends)
+        assert np.allclose(J[:, axis], (ahead - back) / (2.0 * step), atol=1e-7)

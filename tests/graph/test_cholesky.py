@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
+from tests.support import naive_graph
+
+
+def _matrix(sizes, pairs, seed):
+    """A positive definite matrix of the given blocks: the pattern, its values, the dense matrix."""
+    rng = np.random.default_rng(seed)
+    pattern = BlockPattern(np.array(sizes, np.int64), np.array(pairs, np.int64).reshape(-1, 2))
+    values = rng.normal(size=pattern.value_count)
+    at = 0
+    for size in sizes:
+        block = values[at : at + size**2].reshape(size, size)
+        block[:] = block + block.T
+        at += size**2
+    values[pattern.diagonal] += 4.0 * np.abs(naive_graph.dense(pattern, values)).sum(axis=1)
+    return pattern, values, naive_graph.dense(pattern, values)
+
+
+@st.composite
+def _graphs(draw):
+    sizes = draw(st.lists(st.integers(1, 6), min_size=1, max_size=25))
+    n = len(sizes)
+    possible = [(a, b) for a in range(n) for b in range(n) if a != b]
+    chosen = draw(st.lists(st.sampled_from(possible), max_size=3 * n)) if possible else []
+    unique = {frozenset(pair): pair for pair in chosen}
+    return sizes, list(unique.values()), draw(st.integers(0, 1000))
+
+
+@settings(max_examples=150, deadline=None)
+@given(_graphs())
+def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_sizes(graph):
+    pattern, values, A = _matrix(*graph)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
+    b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
+    assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
+    assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
+    assert np.allclose(pattern.multiply(values, b[:, 0]), A @ b[:, 0], rtol=1e-12, atol=1e-9)
+
+
+@settings(max_examples=150, deadline=None)
+@given(_graphs())
+def test_the_selected_inverse_equals_the_dense_one_for_any_pattern_and_block_sizes(graph):
+    pattern, values, A = _matrix(*graph)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
+    inverse = naive_graph.dense(pattern, cholesky.inverse_blocks())
+    there = naive_graph.dense(pattern, np.ones(pattern.value_count)) != 0.0
+    assert np.allclose(inverse[there], np.linalg.inv(A)[there], rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_wide_fronts_are_eliminated_in_panels_and_tiles(size):
+    n = 420 // size
+    rng = np.random.default_rng(0)
+    pairs = [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.5 or i - j == 1]
+    pattern, values, A = _matrix([size] * n, pairs, 3)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    cholesky.factorize(values)
+    b = rng.normal(size=len(A))
+    assert np.allclose(A @ cholesky.solve(b), b, atol=1e-10)
+
+
+def test_a_new_factorization_forgets_the_values_of_the_last():
+    pattern, values, A = _matrix([3, 2, 3, 1], [(0, 1), (3, 1), (2, 0)], 1)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    b = np.arange(9.0)
+    cholesky.factorize(5.0 * values)
+    cholesky.factorize(values)
+    assert np.allclose(A @ cholesky.solve(b), b)
+
+
+def test_a_grid_fills_in_far_less_than_a_dense_factor():
+    side = 40
+    index = np.arange(side * side).reshape(side, side)
+    pairs = np.concatenate(
+        [
+            np.stack([index[1:], index[:-1]], -1).reshape(-1, 2),
+            np.stack([index[:, 1:], index[:, :-1]], -1).reshape(-1, 2),
+        ]
+    )
+    pattern = BlockPattern(np.full(side * side, 3, np.int64), pairs)
+    cholesky = SparseCholesky(pattern, analyze(pattern))
+    n = 3 * side * side
+    assert cholesky.entries < 0.03 * n * (n + 1)
+
+
+def test_a_singular_matrix_names_the_undetermined_variable():
+    pattern = BlockPattern(np.array([2, 2, 2]), np.array([[1, 0]]))
+    values = np.concatenate([np.eye(2).ravel(), 2.0 * np.eye(2).ravel(), np.diag([1.0, 0.0]).ravel(), np.zeros(4)])
+    with pytest.raises(SingularMatrixError, match="variable 2"):
+        SparseCholesky(pattern, analyze(pattern)).factorize(values)
+
+
+def test_an_indefinite_matrix_is_refused():
+    pattern = BlockPattern(np.array([1, 1]), np.array([[1, 0]]))
+    with pytest.raises(SingularMatrixError):
+        SparseCholesky(pattern, analyze(pattern)).factorize(np.array([1.0, 1.0, 2.0]))
+
+
+def test_the_same_factorization_twice_is_equal_to_the_bit():
+    pattern, values, A = _matrix([6] * 30, [(i, i - d) for i in range(30) for d in (1, 5) if i >= d], 2)
+    answers = []
+    for _ in range(2):
+        cholesky = SparseCholesky(pattern, analyze(pattern))
+        cholesky.factorize(values)
+        answers.append(cholesky.solve(A[:, 7]))
+    assert np.array_equal(*answers)

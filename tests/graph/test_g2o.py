@@ -1,0 +1,310 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.edge_checks import check_connected, nearest_semidefinite
+from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.files.g2o_write import write_g2o, write_toro
+from scanchain.graph.pose_graph import PoseGraph
+from tests.support.scenes import shared_data
+
+SQUARE = """\
+# a comment
+VERTEX_SE2 10 0 0 0
+VERTEX_SE2 20 1.1 0.1 1.5
+VERTEX_XY 7 3 4
+FIX 20
+VERTEX_SE2 30 1 1.2 3.1
+EDGE_SE2 10 20 1 0 1.5707963267948966 4 0.5 0.25 5 0 6
+EDGE_SE2 20 30 1 0 1.5707963267948966 4 0 0 5 0 6
+EDGE_SE2 30 10 1.4142135623730951 0 0 4 0 0 5 0 6
+EDGE_SE2_XY 10 7 1 2 1 0.5 3
+EDGE_BEARING_SE2_XY 10 7 1 2
+"""
+
+
+@pytest.mark.parametrize("name", ["manhattan", "intel", "MIT", "sphere2500", "smallGrid3D"])
+def test_what_is_written_reads_back_the_same(name, tmp_path):
+    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
+    path = tmp_path / "again.g2o"
+    write_g2o(path, first.graph, ids=first.ids, other_lines=first.other_lines)
+    second = read_g2o(path)
+    assert np.array_equal(first.graph.edges, second.graph.edges)
+    assert np.array_equal(first.graph.information, second.graph.information)
+    assert np.allclose(first.graph.measurements, second.graph.measurements, rtol=0, atol=1e-12)
+    assert np.allclose(first.graph.poses, second.graph.poses, rtol=0, atol=1e-12)
+    assert second.has_guess
+
+
+def test_the_numbers_of_a_line_go_where_they_belong(tmp_path):
+    path = tmp_path / "square.g2o"
+    path.write_text(SQUARE)
+    file = read_g2o(path)
+    graph = file.graph
+    assert file.ids.tolist() == [10, 20, 30, 7]
+    assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0], [0, 3]]
+    assert graph.is_point.tolist() == [False, False, False, True]
+    assert np.allclose(graph.poses[3], lie.pose_2d(3.0, 4.0, 0.0))
+    assert np.allclose(graph.measurements[3], lie.pose_2d(1.0, 2.0, 0.0))
+    assert graph.information[3].tolist() == [[1, 0.5, 0], [0.5, 3, 0], [0, 0, 0]]
+    assert np.allclose(graph.poses[1], lie.pose_2d(1.1, 0.1, 1.5))
+    assert np.allclose(graph.measurements[0], lie.pose_2d(1.0, 0.0, np.pi / 2))
+    assert graph.information[0].tolist() == [[4, 0.5, 0.25], [0.5, 5, 0], [0.25, 0, 6]]
+    assert graph.held == [1] and graph.fixed.tolist() == [False, True, False, False]
+    assert not graph.is_loop.any()
+
+
+def test_lines_not_understood_are_counted_and_kept(tmp_path):
+    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
+    path.write_text(SQUARE)
+    file = read_g2o(path)
+    assert dict(file.other_tags) == {"#": 1, "EDGE_BEARING_SE2_XY": 1}
+    write_g2o(copy, file.graph, ids=file.ids, other_lines=file.other_lines)
+    again = read_g2o(copy)
+    assert again.other_lines == file.other_lines
+    assert again.ids.tolist() == [10, 20, 30, 7] and again.graph.held == [1]
+
+
+def test_points_and_their_sightings_read_back_the_same(tmp_path):
+    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
+    path.write_text(SQUARE)
+    first = read_g2o(path)
+    write_g2o(copy, first.graph, ids=first.ids)
+    second = read_g2o(copy).graph
+    for name in ("edges", "is_point", "information"):
+        assert np.array_equal(getattr(first.graph, name), getattr(second, name))
+    for name in ("poses", "measurements"):
+        assert np.allclose(getattr(first.graph, name), getattr(second, name), rtol=0, atol=1e-12)
+
+
+def test_points_without_vertices_begin_where_they_are_seen(tmp_path):
+    path = tmp_path / "seen.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2_XY 1 9 2 0.5 1 0 1\n")
+    file = read_g2o(path)
+    assert file.ids.tolist() == [0, 1, 9] and not file.has_guess
+    assert np.allclose(file.graph.poses[2][:2, 2], [0.5, 2.0])
+
+
+@pytest.mark.parametrize("name", ["intel", "MIT", "sphere2500", "torus3D"])
+def test_what_is_written_as_toro_reads_back_the_same(name, tmp_path):
+    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
+    path = tmp_path / "again.graph"
+    write_toro(path, first.graph, ids=first.ids)
+    second = read_g2o(path).graph
+    assert np.array_equal(first.graph.edges, second.edges)
+    assert np.array_equal(first.graph.information, second.information)
+    assert np.allclose(first.graph.measurements, second.measurements, rtol=0, atol=1e-12)
+    assert np.allclose(first.graph.poses, second.poses, rtol=0, atol=1e-12)
+
+
+def test_toro_orders_the_information_of_the_plane_in_its_own_way(tmp_path):
+    path = tmp_path / "pair.graph"
+    path.write_text("VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0.1 11 12 22 33 13 23\n")
+    graph = read_g2o(path).graph
+    assert graph.information[0].tolist() == [[11, 12, 13], [12, 22, 23], [13, 23, 33]]
+
+
+@pytest.mark.parametrize("pitch", [0.0, 1.0, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
+def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_path):
+    graph = PoseGraph(3)
+    angles = [(0.3, pitch, -2.0), (-3.0, pitch, 0.5)]
+    for index, (roll, nod, yaw) in enumerate(angles):
+        T = lie.identity(3)
+        T[:3, :3] = Rotation.from_euler("ZYX", [yaw, nod, roll]).as_matrix()
+        graph.add_pose(T, index)
+    graph.add_edge(0, 1, graph.poses[1], np.eye(6))
+    path = tmp_path / "up.graph"
+    write_toro(path, graph)
+    assert np.allclose(read_g2o(path).graph.poses, graph.poses, rtol=0, atol=1e-12)
+    if abs(pitch) < 1.5:
+        assert np.allclose(np.array(path.read_text().split()[5:8], float), angles[0])
+
+
+def test_toro_cannot_hold_points(tmp_path):
+    path = tmp_path / "square.g2o"
+    path.write_text(SQUARE)
+    with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
+        write_toro(tmp_path / "x.graph", read_g2o(path).graph)
+
+
+def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
+    path = tmp_path / "pair.g2o"
+    upper = " ".join(str(float(v)) for v in _triangle(np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01))
+    half = np.sqrt(0.5)
+    path.write_text(
+        f"EDGE_SE3:QUAT 0 1 1 2 3 {2 * half} 0 0 {2 * half} {upper}\n"
+    )  # a quarter about x, not of length 1
+    graph = read_g2o(path).graph
+    assert np.allclose(graph.measurements[0], [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
+    assert np.allclose(graph.information[0], np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01)
+
+
+def _triangle(matrix):
+    return matrix[np.triu_indices(len(matrix))]
+
+
+def test_a_file_without_vertices_starts_from_its_odometry():
+    file = read_g2o(shared_data("graphs/manhattan.g2o"))
+    graph = file.graph
+    assert not file.has_guess and len(graph) == 3500
+    steps = graph.edges[:, 1] == graph.edges[:, 0] + 1
+    i, j = graph.edges[steps].T
+    relative = lie.inverse(graph.poses[i]) @ graph.poses[j]
+    assert np.allclose(relative, graph.measurements[steps], atol=1e-9)
+
+
+def test_suspect_loops_are_the_edges_that_skip_poses():
+    graph = read_g2o(shared_data("graphs/intel.g2o"), loops="robust").graph
+    apart = np.abs(graph.edges[:, 0] - graph.edges[:, 1])
+    assert np.array_equal(graph.is_loop, apart != 1)
+
+
+def test_an_optimized_graph_can_be_written_and_is_still_optimal(tmp_path):
+    graph = read_g2o(shared_data("graphs/intel.g2o")).graph
+    answer = graph.optimize(GraphConfig())
+    write_g2o(tmp_path / "intel.g2o", graph)
+    again = read_g2o(tmp_path / "intel.g2o").graph.optimize(GraphConfig())
+    assert again.chi2_before == pytest.approx(answer.chi2_after, rel=1e-9)
+
+
+EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "holds no EDGE_SE2"),
+        ("VERTEX_SE2 0 0 0 0\n", "holds no EDGE_SE2"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", r":1: EDGE_SE2 has 10 values, needs 11"),
+        (f"{EDGE}\nEDGE_SE2 1 two 1 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2: vertex id 'two' is not a whole number"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 zero 1 0 0 1 0 1\n", r":2: EDGE_SE2: could not convert"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 0 1e300 0 0 1 0 1\n", r":2: EDGE_SE2 1 2 has the value 1e\+300, over 1e\+50"),
+        (f"{EDGE}\nEDGE_SE2 1 2 -2e50 0 0 1 0 0 1 0 1\n", r":2: EDGE_SE2 1 2 has the value -2e\+50, over 1e\+50"),
+        (f"{EDGE}\nEDGE_SE2 1 2 1 0 nan 1 0 0 1 0 1\n", r":2: EDGE_SE2 has a value that is not finite"),
+        (f"VERTEX_SE2 0 0 0 0\n{EDGE}\n", r":2: vertex 1 is not in the file"),
+        (f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nVERTEX_SE2 0 1 0 0\n{EDGE}\n", r":3: vertex 0 stands .* twice"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1\n", r":1: information matrix of edge 0-1 is not positive semidefinite"),
+        ("EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1\n", r":1: edge 1-1 joins a vertex to itself"),
+        (
+            f"{EDGE}\nVERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\nEDGE_SE2_XY 0 8 1 1 1 0 1\n",
+            r":4: vertex 8 is not in",
+        ),
+        (f"{EDGE}\nEDGE_SE2_XY 0 1 1 1 1 0 1\n", r"vertex 1 is a pose and a point"),
+        (
+            f"{EDGE}\nEDGE_SE2_XY 0 8 1 1 1 5 1\n",
+            r":2: information matrix of edge 0-8 is not positive semidefinite",
+        ),
+        (f"{EDGE}\nFIX 5\n", r":2: vertex 5 is not in the file"),
+        (f"{EDGE}\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", r":2: VERTEX_SE3:QUAT in an SE\(2\) graph"),
+        ("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 " + "0 " * 21 + "\n", r":1: quaternion of length 0"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line_that_names_the_place(text, words, tmp_path):
+    path = tmp_path / "bad.g2o"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_g2o(path, indefinite="refuse")
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
+    (tmp_path / "bytes.g2o").write_bytes(b"\xff\xfe\x00\x81")
+    for path in (tmp_path / "none.g2o", tmp_path, tmp_path / "bytes.g2o"):
+        with pytest.raises(InputError, match="cannot be read as g2o"):
+            read_g2o(path)
+
+
+def test_poses_that_nothing_holds_are_called_by_their_ids():
+    held = np.array([True, False, False, False])
+    with pytest.raises(InputError, match="not joined to a fixed one: 30, 40"):
+        check_connected(np.array([[0, 1], [2, 3]]), held, np.array([10, 20, 30, 40]))
+
+
+def with_indefinite_matrices(path, copy, share):
+    """A published graph of which some edges have entries off the diagonal that no covariance has: their ids."""
+    rng = np.random.default_rng(0)
+    lines, changed = path.read_text().splitlines(), []
+    for number, line in enumerate(lines):
+        words = line.split()
+        if words[0].startswith("EDGE") and rng.random() < share:
+            k = 3 if words[0] == "EDGE_SE2" else 6
+            upper = np.array(words[-k * (k + 1) // 2 :], float)
+            upper[1] = 1.5 * np.sqrt(upper[0] * upper[k])
+            lines[number] = " ".join([*words[: -k * (k + 1) // 2], *map(repr, upper.tolist())])
+            changed.append([int(words[1]), int(words[2])])
+    copy.write_text("\n".join(lines) + "\n")
+    return changed
+
+
+@pytest.mark.parametrize("name", ["smallGrid3D", "intel"])
+def test_indefinite_matrices_are_projected_with_a_warning_that_says_how_many_how_far_and_which_first(
+    name, tmp_path
+):
+    """As the cubicle of the SE-Sync set has them."""
+    path = tmp_path / "bad.g2o"
+    published = shared_data(f"graphs/{name}.g2o")
+    changed = with_indefinite_matrices(published, path, 0.3)
+    with pytest.warns(
+        UserWarning, match=f"{len(changed)} of .* edges have an indefinite information matrix"
+    ) as caught:
+        file = read_g2o(path)
+    assert f"first {changed[0][0]}-{changed[0][1]} in line" in str(caught[0].message)
+    assert (file.projection.edges, file.projection.of) == (len(changed), len(file.graph.edges))
+    assert 0.0 < file.projection.median <= file.projection.most < 1.0
+    sound = read_g2o(published).graph.information
+    same = (file.graph.information == sound).all(axis=(1, 2))
+    assert (~same).sum() == len(changed)
+    assert np.linalg.eigvalsh(file.graph.information)[:, 0].min() > -1e-9 * sound.max()
+    with pytest.raises(
+        InputError, match=f"edge {changed[0][0]}-{changed[0][1]} is not .* first of {len(changed)};"
+    ):
+        read_g2o(path, indefinite="refuse")
+
+
+@pytest.mark.parametrize("tag", ["EDGE2 0 1 1 0 0 1 0 1 1 5 0", "EDGE_SE2 0 1 1 0 0 1 0 5 1 0 1"])
+def test_toro_has_its_indefinite_matrices_projected_too(tag, tmp_path):
+    path = tmp_path / "bad.graph"
+    path.write_text(f"{tag}\n")
+    with pytest.warns(UserWarning, match="1 of 1 edges .* first 0-1 in line 1"):
+        information = read_g2o(path).graph.information[0]
+    assert np.allclose(information, [[3, 0, 3], [0, 1, 0], [3, 0, 3]])
+
+
+def test_the_projected_matrix_is_the_nearest_semidefinite_one():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(50, 6, 6))
+    A += np.swapaxes(A, 1, 2)
+    nearest = nearest_semidefinite(A)
+    assert np.linalg.eigvalsh(nearest)[:, 0].min() > -1e-12
+    # optimal: what is left over is negative semidefinite and orthogonal to the projection
+    assert np.linalg.eigvalsh(A - nearest)[:, -1].max() < 1e-12
+    assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11
+
+
+def test_angles_beyond_a_turn_are_asked_about(call, tmp_path):
+    lines = ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1 0 90", "EDGE_SE2 0 1 1 0 90 1 0 0 1 0 1"]
+    (tmp_path / "a.g2o").write_text("\n".join(lines))
+    with pytest.warns(
+        UserWarning, match="2 lines have an angle beyond a whole turn, up to 90 in line 2; degrees?"
+    ):
+        assert "degrees?" in read_g2o(tmp_path / "a.g2o").note
+    assert "degrees?" in call("optimize", tmp_path / "a.g2o")[1]
+
+
+def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call, tmp_path):
+    lines = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(8)]
+    lines += [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 100" for k in range(7)]
+    lines += [f"EDGE_SE2 {k} {k + 2} 2 0 0 100 0 0 100 0 100" for k in range(6)]
+    lines.append("EDGE_SE2 0 7 0 0 0 1000 0 0 1000 0 1000")
+    (tmp_path / "false.g2o").write_text("\n".join(lines))
+    _, output, _ = call("optimize", tmp_path / "false.g2o")
+    assert "per degree of freedom, where 1 is expected" in output and "--robust truncated" in output
+    for loss in ("truncated", "huber"):
+        out = tmp_path / f"{loss}.g2o"
+        _, output, _ = call("optimize", tmp_path / "false.g2o", "--robust", loss, "--out", out)
+        assert "where 1 is expected" not in output
+        assert "on 7 loop edges; the other 7 edges (odometry, points) in full weight" in output
+        assert read_g2o(out).graph.poses[-1][0, 2] == pytest.approx(7.0, abs=0.01)

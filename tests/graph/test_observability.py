@@ -1,0 +1,169 @@
+"""Poses that their edges leave free are found and named, in their own axes, before anything is certified."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.edge_checks import ranks
+from scanchain.graph.observability import free_poses
+from scanchain.graph.pose_graph import PoseGraph
+from tests.support import naive_graph
+
+PLAIN = GraphConfig(robust="none")
+NAMES = {2: ("x", "y", "yaw"), 3: ("x", "y", "z", "roll", "pitch", "yaw")}
+
+
+def chain(dimension, silent=None, loops=(), count=6):
+    """Poses far from the origin, each measured from the one before; edge (4, 5) says nothing of some axes.
+
+    silent : slice of the axes of the twist; or a number by which all its information is multiplied
+    """
+    rng = np.random.default_rng(0)
+    k = (3, 6)[dimension - 2]
+    twists = rng.normal(size=(count, k))
+    twists[:, :dimension] = 5.0 * twists[:, :dimension] + 1000.0
+    true = lie.exp(twists)
+    graph = PoseGraph(dimension, 10 * np.arange(count))
+    for index, pose in enumerate(true):
+        graph.add_pose(pose, index)
+    for i, j in [*((i, i + 1) for i in range(count - 1)), *loops]:
+        information = 100.0 * np.eye(k)
+        if (i, j) == (count - 2, count - 1) and isinstance(silent, slice):
+            information[silent] = 0.0
+            information[:, silent] = 0.0
+        elif (i, j) == (count - 2, count - 1) and silent is not None:
+            information *= silent
+        graph.add_edge(i, j, lie.inverse(true[i]) @ true[j] @ lie.exp(0.01 * rng.normal(size=k)), information)
+    return graph
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("silent", [slice(0, 1), slice(1, 2), slice(-1, None), "positions", "rotations"])
+def test_the_axes_that_its_edges_say_nothing_of_are_named_and_nothing_is_certified(dimension, silent):
+    if isinstance(silent, str):
+        silent = slice(0, dimension) if silent == "positions" else slice(dimension, None)
+    graph = chain(dimension, silent)
+    answer = graph.optimize(PLAIN)
+    assert answer.converged and answer.chi2_after < 1e-9
+    [free] = graph.free_poses()
+    assert (free.name, free.axes) == (50, NAMES[dimension][silent])
+    certificate = graph.certify()
+    assert not certificate.certified
+    assert certificate.verdict == f"not certified: the edges leave 1 pose free: 50 ({', '.join(free.axes)})"
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_loop_that_holds_them_is_seen(dimension):
+    for silent in (slice(0, 1), slice(0, dimension), slice(dimension, None)):
+        assert chain(dimension, silent).free_poses() and not chain(dimension, silent, [(0, 5)]).free_poses()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_all_zero_information_is_refused_with_the_names_of_the_poses(dimension):
+    """It was called globally optimal."""
+    with pytest.raises(InputError, match=r"1 of 6 poses are not joined to a fixed one: 50; .* is not zero"):
+        chain(dimension, 0.0).optimize(PLAIN)
+    with pytest.raises(InputError, match=r"1 of 6 poses are not joined"):
+        chain(dimension, 0.0).certify()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_poses_that_hang_on_next_to_no_information_are_named(dimension):
+    assert chain(dimension, 1e-9).weakly_joined().tolist() == [50]
+    assert chain(dimension, 1e-9, [(0, 5)]).weakly_joined().tolist() == []
+    assert chain(dimension, 1e-3).weakly_joined().tolist() == []
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("share", [1e-30, 1e-18, 1e-12, 1e-9, 1e-7])
+@pytest.mark.parametrize("axes", [slice(None), slice(0, 1), slice(-1, None)])
+@pytest.mark.parametrize("far_m", [0.0, 5e6])
+def test_a_group_on_next_to_no_information_is_named_whole_by_certificate_and_covariances(
+    dimension, share, axes, far_m
+):
+    """The certificate called it globally optimal while the covariances refused, and named one pose of the five."""
+    rng, k, graph = np.random.default_rng(4), (3, 6)[dimension - 2], PoseGraph(dimension)
+    true = np.tile(lie.identity(dimension), (10, 1, 1))
+    true[:, 0, -1] = far_m
+    for index in range(1, 10):
+        true[index] = true[index - 1] @ lie.exp(rng.normal(size=k))
+    for index, pose in enumerate(true):
+        graph.add_pose(pose, index)
+    for i, j in [*((i, i + 1) for i in range(9)), (0, 4), (5, 9), (0, 2), (6, 8)]:
+        information = np.full(k, 100.0)
+        information[axes] *= share if (i, j) == (4, 5) else 1.0
+        noise = lie.exp(0.01 * rng.normal(size=k))
+        graph.add_edge(i, j, lie.inverse(true[i]) @ true[j] @ noise, np.diag(information))
+    assert graph.optimize(PLAIN).converged
+    certificate, refusal = graph.certify(), ""
+    try:
+        assert np.isfinite(graph.covariances()).all()
+    except InputError as error:
+        refusal = str(error)
+    assert certificate.reason in refusal and ("5 to 9 (" in refusal) == (share < 1e-10) != certificate.certified
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_moves_together_is_named_together(dimension):
+    """The middle of a chain is free along x: whatever follows goes with it."""
+    graph = chain(dimension)
+    free = PoseGraph(dimension)
+    for index, pose in enumerate(graph.poses):
+        free.add_pose(pose, index)
+    information = graph.information.copy()
+    information[2, 0, 0] = 0.0
+    free.add_edges(graph.edges, graph.measurements, information, graph.is_loop)
+    [body] = free.free_poses()
+    assert (body.name, body.axes, body.followers) == (3, ("x",), (4, 5))
+    with pytest.raises(InputError, match=r"leave 3 poses free: 3 to 5 \(x\) as one body"):
+        free.optimize(GraphConfig(robust="none", optimizer="gauss-newton"))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
+    rng = np.random.default_rng(1)
+    k, count, seen = (3, 6)[dimension - 2], 8, set()
+    for _ in range(40):
+        poses = lie.exp(rng.normal(size=(count, k)))
+        edges = np.array([*((i, i + 1) for i in range(count - 1)), (0, 3), (2, 6)])
+        Z = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]]
+        silent = rng.random((len(edges), k)) < 0.15
+        information = (~silent).astype(float)[:, :, None] * np.eye(k)
+        fixed = np.arange(count) == 0
+        problem = BetweenProblem(edges, Z, information, fixed)
+        found = free_poses(problem, poses, np.ones(len(edges)), ranks(information), np.arange(count))
+        equations = problem.linearize(poses, problem.errors(poses), np.ones(len(edges)))
+        H = naive_graph.dense(problem.pattern, equations.values)
+        values, vectors = np.linalg.eigh(H)
+        null = vectors[:, values < 1e-10 * values[-1]].reshape(count - 1, k, -1)
+        moving = 1 + np.flatnonzero((np.abs(null) > 1e-6).any(axis=(1, 2)))
+        named = [name for body in found for name in (body.name, *body.followers)]
+        assert sorted(named) == moving.tolist()
+        seen.add(len(moving))
+    assert len(seen) >= 3
+
+
+@pytest.mark.parametrize("initialize", ["auto", "given", "odometry", "spanning-tree", "chordal"])
+@pytest.mark.parametrize("robust", ["none", "huber", "truncated"])
+def test_graphs_of_any_information_end_in_an_answer_or_in_an_error_that_names_poses(initialize, robust):
+    rng = np.random.default_rng(2)
+    for _ in range(40):
+        dimension, count = int(rng.integers(2, 4)), int(rng.integers(1, 7))
+        k, graph = (3, 6)[dimension - 2], PoseGraph(dimension)
+        true = lie.exp(rng.normal(size=(count, k)))
+        for index, pose in enumerate(true):
+            graph.add_pose(pose, index)
+        pairs = [(i, i + 1) for i in range(count - 1)] + [(0, count - 1)] * (count > 2)
+        for i, j in pairs:
+            information = np.eye(k) * (rng.random(k) < 0.7)
+            Z = lie.inverse(true[i]) @ true[j] @ lie.exp(0.1 * rng.normal(size=k))
+            graph.add_edge(i, j, Z, information, is_loop=j - i > 1)
+        try:
+            graph.optimize(GraphConfig(robust=robust), initialize=initialize)
+        except InputError as error:
+            assert "not joined to a fixed one" in str(error) or " free: " in str(error)
+            continue
+        assert not (graph.free_poses() and graph.certify().certified)

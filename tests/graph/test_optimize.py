@@ -1,0 +1,399 @@
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.errors import InputError
+from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.solvers.descent import Optimizer
+from scanchain.graph.solvers.minimizer import Evaluation, full_curvature
+from tests.support.naive_graph import dense, normal_equations
+from tests.support.scenes import shared_data
+
+PLAIN = GraphConfig(robust="none")
+BEST_HALF_CHI2 = {
+    "manhattan": 1774.5205,
+    "intel": 22.5021,
+    "MIT": 20.6035,
+    "sphere2500": 675.701,
+    "torus3D": 12117.6,
+}
+
+
+def read(name, **options):
+    return read_g2o(shared_data(f"graphs/{name}.g2o"), **options).graph
+
+
+def ring(dimension, count=12, *, noise=0.0, seed=0):
+    """A closed ring of poses whose guess follows the noisy odometry; the last edge is the loop."""
+    rng = np.random.default_rng(seed)
+    k = 3 if dimension == 2 else 6
+    twist = np.zeros(k)
+    twist[0], twist[-1] = 1.0, 2.0 * np.pi / count
+    true = [lie.identity(dimension)]
+    for _ in range(count - 1):
+        true.append(true[-1] @ lie.exp(twist))
+    graph, T = PoseGraph(dimension), lie.identity(dimension)
+    graph.add_pose(T, 0)
+    for index in range(1, count):
+        Z = lie.inverse(true[index - 1]) @ true[index] @ lie.exp(noise * rng.normal(size=k))
+        T = T @ Z
+        graph.add_pose(T, index)
+        graph.add_edge(index - 1, index, Z, 100.0 * np.eye(k))
+    graph.add_edge(count - 1, 0, lie.inverse(true[-1]), 100.0 * np.eye(k), is_loop=True)
+    return graph, np.array(true)
+
+
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton"])
+@pytest.mark.parametrize("name", list(BEST_HALF_CHI2))
+def test_the_published_graphs_reach_the_best_known_chi2_from_their_files(name, optimizer):
+    answer = read(name).optimize(GraphConfig(optimizer=optimizer))
+    assert answer.converged, answer.reason
+    assert 0.5 * answer.chi2_after <= BEST_HALF_CHI2[name] * (1.0 + 2e-5)
+    assert 0.5 * answer.chi2_after >= BEST_HALF_CHI2[name] * (1.0 - 2e-5)
+
+
+def test_small_grid_reaches_one_minimum_by_both_optimizers():
+    optimizers = ("levenberg-marquardt", "gauss-newton")
+    answers = [read("smallGrid3D").optimize(GraphConfig(optimizer=optimizer)) for optimizer in optimizers]
+    assert all(answer.converged for answer in answers)
+    assert answers[0].chi2_after == pytest.approx(answers[1].chi2_after, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["intel", "manhattan", "smallGrid3D", "sphere2500"])
+@pytest.mark.parametrize("optimizer", ["dogleg", "newton"])
+def test_dogleg_and_newton_reach_the_same_minimum(name, optimizer):
+    answer = read(name).optimize(GraphConfig(optimizer=optimizer, robust="none"))
+    reference = read(name).optimize(PLAIN)
+    assert answer.converged and answer.chi2_after == pytest.approx(reference.chi2_after, rel=2e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
+    """Gradient descent too, only that it takes its time."""
+    chi2 = {}
+    for optimizer in get_args(Optimizer):
+        graph, _ = ring(dimension, noise=0.05)
+        config = GraphConfig(optimizer=optimizer, max_iterations=20_000, tolerance=1e-10, robust="none")
+        answer = graph.optimize(config)
+        assert answer.converged, (optimizer, answer.reason)
+        chi2[optimizer] = answer.chi2_after
+    assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
+def test_no_step_of_a_guarded_optimizer_raises_chi2(optimizer):
+    graph = read("smallGrid3D")
+    before = np.inf
+    for _ in range(6):
+        answer = graph.optimize(
+            GraphConfig(optimizer=optimizer, max_iterations=1, robust="none"), initialize="given"
+        )
+        assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
+        before = answer.chi2_after
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
+    graph, _ = ring(dimension, count=4, noise=0.2)
+    problem, poses = graph._prepared(), graph.poses
+    weights = np.array([1.0, 0.5, 1.0, 0.7])
+    errors = problem.errors(poses)
+    now = Evaluation(poses, errors, problem.chi2(errors), 0.0)
+    values = full_curvature(problem, now, problem.linearize(poses, errors, weights))
+    n, step = problem.pattern.scalars, 1e-3
+
+    def cost(a, b):
+        return 0.5 * weights @ problem.chi2(problem.errors(problem.moved(poses, step * (a + b))))
+
+    axes = np.eye(n)
+    expected = [
+        [(cost(a, b) - cost(a, -b) - cost(-a, b) + cost(-a, -b)) / (4.0 * step**2) for a in axes] for b in axes
+    ]
+    assert np.allclose(dense(problem.pattern, values), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
+    assert read("MIT").optimize(PLAIN).initialization == "chordal"
+    assert read("intel").optimize(PLAIN).initialization == "given"
+
+
+@pytest.mark.parametrize("initialize", ["odometry", "spanning-tree", "chordal", "given"])
+def test_every_way_to_start_ends_in_the_same_minimum(initialize):
+    answer = read("intel").optimize(PLAIN, initialize=initialize)
+    assert answer.initialization == initialize
+    assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2["intel"], rel=2e-5)
+
+
+def test_levenberg_marquardt_lowers_chi2_where_gauss_newton_fails():
+    """From the file's own guess of MIT, plain Gauss-Newton is lost; the damped one at least goes down."""
+    graph = read("MIT")
+    answer = graph.optimize(PLAIN, initialize="given")
+    assert answer.chi2_after < answer.chi2_before
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimension):
+    """Pose 1 lies 1 m ahead of pose 0 and looks left; pose 2 lies 1 m ahead of pose 1: at (1, 1), looking left."""
+    quarter = lie.exp(np.array([0.0, 0.0, np.pi / 2]))
+    ahead = lie.exp(np.array([1.0, 0.0, 0.0]))
+    to_2 = lie.pose_2d(1.0, 1.0, np.pi / 2)
+    measured = [(0, 1, ahead @ quarter), (1, 2, ahead), (0, 2, to_2)]
+    graph = PoseGraph(dimension)
+    raise_dimension = lie.lift if dimension == 3 else np.asarray
+    k = graph.freedom
+    for index in range(3):
+        graph.add_pose(lie.identity(dimension), index)
+    for i, j, T in measured:
+        graph.add_edge(i, j, raise_dimension(T), np.eye(k))
+    answer = graph.optimize(PLAIN)
+    assert answer.chi2_after < 1e-11
+    assert np.allclose(graph.poses[1], raise_dimension(ahead @ quarter), atol=1e-6)
+    assert np.allclose(graph.poses[2][:dimension, dimension], [1.0, 1.0, 0.0][:dimension], atol=1e-6)
+    assert np.allclose(lie.yaw(graph.poses[2]), np.pi / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_perfect_ring_returns_the_true_poses(dimension):
+    graph, true = ring(dimension)
+    answer = graph.optimize(PLAIN)
+    assert answer.converged and answer.chi2_after < 1e-12
+    assert np.allclose(graph.poses, true, atol=1e-7)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_answer_moves_with_the_world_frame(dimension):
+    """Far from the origin as near it: the same graph, its first pose elsewhere, ends in the same shape."""
+    near, _ = ring(dimension, noise=0.02)
+    far = PoseGraph(dimension)
+    k = near.freedom
+    away = np.array([4.1e5, -5.3e6, 0.7] if dimension == 2 else [4.1e5, -5.3e6, 120.0, 0.2, -0.3, 0.7])
+    T = lie.exp(away)
+    for pose, stamp in zip(near.poses, near.stamps_ns, strict=True):
+        far.add_pose(T @ pose, int(stamp))
+    far.add_edges(near.edges, near.measurements, near.information, near.is_loop)
+    assert near.optimize(PLAIN).converged and far.optimize(PLAIN).converged
+    assert k == far.freedom
+    # 1e-9 relative of the distance is all that double precision keeps
+    assert np.allclose(lie.inverse(T) @ far.poses, near.poses, atol=1e-7)
+
+
+def test_meters_or_centimeters_same_shape():
+    meters, _ = ring(2, noise=0.05)
+    scale, back = np.diag([100.0, 100.0, 1.0]), np.diag([0.01, 0.01, 1.0])
+    centimeters = PoseGraph(2)
+    for pose in meters.poses:
+        centimeters.add_pose(scale @ pose @ back, 0)
+    centimeters.add_edges(
+        meters.edges, scale @ meters.measurements @ back, back @ meters.information @ back, meters.is_loop
+    )
+    for robust in ("none", "huber", "cauchy", "geman-mcclure", "truncated"):
+        a, b = (graph.optimize(GraphConfig(robust=robust)) for graph in (meters, centimeters))
+        assert a.chi2_after == pytest.approx(b.chi2_after, rel=1e-4)
+        assert np.allclose(back @ centimeters.poses @ scale, meters.poses, atol=1e-4)
+
+
+def test_a_fixed_pose_stays_to_the_bit():
+    graph, _ = ring(3, noise=0.05)
+    graph.fix(4)
+    before = graph.poses.copy()
+    graph.optimize(PLAIN)
+    assert np.array_equal(graph.poses[4], before[4])
+    assert not np.array_equal(graph.poses[0], before[0])
+
+
+def test_the_same_optimization_twice_is_equal_to_the_bit():
+    answers = [read("intel").optimize(GraphConfig()) for _ in range(2)]
+    assert np.array_equal(answers[0].state.poses, answers[1].state.poses)
+    assert answers[0].chi2_after == answers[1].chi2_after
+
+
+def test_every_reason_to_stop_is_reported():
+    assert read("MIT").optimize(GraphConfig(max_iterations=1, robust="none")).reason == "1 iteration reached"
+    assert "χ² change" in read("intel").optimize(PLAIN).reason
+    graph, _ = ring(2, noise=0.05)
+    graph.optimize(GraphConfig(robust="none", tolerance=1e-10))
+    assert "gradient" in graph.optimize(PLAIN).reason
+    graph, _ = ring(2)
+    assert graph.optimize(PLAIN).reason.split()[0] in {"gradient", "step", "χ²"}
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_graph_grown_between_optimizations_equals_one_built_at_once(dimension):
+    whole, _ = ring(dimension, count=60, noise=0.03)
+    grown = PoseGraph(dimension)
+    for index, pose in enumerate(whole.poses):
+        assert grown.add_pose(pose, 10 * index) == index
+        for edge in np.flatnonzero(whole.edges.max(axis=1) == index):
+            i, j = whole.edges[edge]
+            grown.add_edge(i, j, whole.measurements[edge], whole.information[edge], bool(whole.is_loop[edge]))
+        if index % 20 == 19:
+            grown.optimize(PLAIN)
+    whole.optimize(PLAIN)
+    assert np.allclose(grown.poses, whole.poses, atol=1e-6)
+    assert grown.stamps_ns.tolist() == [10 * index for index in range(60)]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_relative_covariance_equals_the_dense_inverse(dimension):
+    graph, _ = ring(dimension, count=8, noise=0.02)
+    graph.optimize(PLAIN)
+    k, i, j = graph.freedom, 2, 6
+    H, _ = normal_equations(
+        graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
+    )
+    P = np.linalg.inv(H)
+
+    def picked(a, b):
+        return P[(a - 1) * k : a * k, (b - 1) * k : b * k]
+
+    joint = picked(i, i) + picked(j, j) - picked(i, j) - picked(j, i)
+    adjoint = lie.adjoint(lie.inverse(graph.poses[j]))
+    assert np.allclose(graph.relative_covariance(i, j), adjoint @ joint @ adjoint.T, rtol=1e-5, atol=1e-9)
+    assert np.allclose(graph.relative_covariance(0, 1), graph.covariances()[1], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_covariances_are_those_of_right_twists_as_the_information_of_edges_is(dimension):
+    """A chain of edges, each drawn 20,000 times with the covariance of its right twist."""
+    rng = np.random.default_rng(0)
+    k = 3 * (dimension - 1)
+    spreads = [np.diag(rng.uniform(0.005, 0.03, k)) for _ in range(2)]
+    motions = [lie.exp(rng.uniform(-1.5, 1.5, k)) for _ in range(2)]
+    graph = PoseGraph(dimension)
+    for index in range(3):
+        graph.add_pose(lie.identity(dimension), index)
+    for index, (motion, spread) in enumerate(zip(motions, spreads, strict=True)):
+        graph.add_edge(index, index + 1, motion, np.linalg.inv(spread @ spread))
+    graph.optimize(PLAIN)
+    drawn = [
+        motion @ lie.exp(rng.normal(size=(20_000, k)) @ spread)
+        for motion, spread in zip(motions, spreads, strict=True)
+    ]
+    twists = lie.log(lie.inverse(motions[0] @ motions[1]) @ drawn[0] @ drawn[1])
+    scale = np.sqrt(np.outer(*2 * [np.diag(np.cov(twists.T))]))
+    for found in (graph.covariances()[2], graph.relative_covariance(0, 2)):
+        assert np.abs((found - np.cov(twists.T)) / scale).max() < 0.05
+    assert np.allclose(graph.relative_covariance(1, 2), spreads[1] @ spreads[1], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_covariances_equal_the_dense_inverse(dimension):
+    graph, _ = ring(dimension, count=9, noise=0.02)
+    graph.optimize(PLAIN)
+    k = graph.freedom
+    H, _ = normal_equations(
+        graph.poses, graph.edges, graph.measurements, graph.information, np.ones(len(graph.edges)), graph.fixed
+    )
+    P = np.linalg.inv(H).reshape(8, k, 8, k)
+    found = graph.covariances()
+    assert not found[0].any()
+    for pose in range(1, 9):
+        adjoint = lie.adjoint(lie.inverse(graph.poses[pose]))
+        expected = adjoint @ P[pose - 1, :, pose - 1] @ adjoint.T
+        assert np.allclose(found[pose], expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
+def test_covariances_equal_those_of_gtsam(name):
+    gtsam = pytest.importorskip("gtsam")
+    graph = read(name)
+    graph.optimize(PLAIN)
+    flat = graph.dimension == 2
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for index, T in enumerate(graph.poses):
+        values.insert(index, gtsam.Pose2(*T[:2, 2], float(lie.yaw(T))) if flat else gtsam.Pose3(T))
+    order = np.arange(3) if flat else np.array([3, 4, 5, 0, 1, 2])  # GTSAM's rotation comes first in space
+    for (i, j), Z, omega in zip(graph.edges.tolist(), graph.measurements, graph.information, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])
+        if flat:
+            factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*Z[:2, 2], float(lie.yaw(Z))), noise))
+        else:
+            factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(Z), noise))
+    held = gtsam.noiseModel.Diagonal.Sigmas(np.full(graph.freedom, 1e-6))
+    prior = gtsam.PriorFactorPose2 if flat else gtsam.PriorFactorPose3
+    factors.add(prior(0, values.atPose2(0) if flat else values.atPose3(0), held))
+    marginals = gtsam.Marginals(factors, values)
+    found = graph.covariances()
+    for pose in (1, len(graph) // 2, len(graph) - 1):
+        theirs = marginals.marginalCovariance(pose)
+        spread = np.sqrt(np.diag(theirs))
+        ours = found[pose][np.ix_(order, order)]
+        # GTSAM linearizes its residual in another chart where the residual is large, hence a few thousandths
+        assert np.abs((ours - theirs) / np.outer(spread, spread)).max() < (1e-3 if flat else 0.05)
+
+
+def test_odometry_alone_adds_up_the_covariances_of_its_steps():
+    graph = PoseGraph(2)
+    for index in range(4):
+        graph.add_pose(lie.pose_2d(index, 0.0, 0.0), index)
+    for index in range(3):
+        graph.add_edge(index, index + 1, lie.pose_2d(1.0, 0.0, 0.0), np.diag([100.0, 100.0, 1e9]))
+    assert np.allclose(np.diag(graph.relative_covariance(0, 3))[:2], 0.03, rtol=1e-4)
+    assert np.allclose(graph.relative_covariance(1, 1), 0.0)
+
+
+def test_a_pose_that_nothing_joins_is_named():
+    graph, _ = ring(2)
+    graph.add_pose(lie.identity(2), 99)
+    with pytest.raises(InputError, match=r"1 of 13 poses are not joined to a fixed one: 12;"):
+        graph.optimize(PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("i", "j", "information", "words"),
+    [
+        (0, 7, np.eye(3), "edge 0-7 joins a pose that is not there"),
+        (-1, 1, np.eye(3), "edge -1-1 joins a pose that is not there"),
+        (1, 1, np.eye(3), "joins a pose to itself"),
+        (0, 1, np.diag([1.0, 1.0, -1.0]), "not symmetric positive semidefinite"),
+        (
+            0,
+            1,
+            np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+            "not symmetric positive semidefinite",
+        ),
+        (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give meters"),
+        (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
+    ],
+)
+def test_an_impossible_edge_is_refused_and_changes_nothing(i, j, information, words):
+    graph, _ = ring(2, count=3)
+    with pytest.raises(InputError, match=words):
+        graph.add_edge(i, j, lie.identity(2), information)
+    assert len(graph.edges) == 3
+
+
+def test_a_measurement_or_a_pose_that_is_not_finite_is_refused():
+    graph, _ = ring(2, count=3)
+    with pytest.raises(InputError, match="T_ij holds NaN or infinite values"):
+        graph.add_edge(0, 2, np.full((3, 3), np.nan), np.eye(3))
+    with pytest.raises(InputError, match="T_world holds NaN or infinite values"):
+        graph.add_pose(np.full((3, 3), np.inf), 0)
+
+
+def test_gauss_newton_names_the_pose_that_its_edges_leave_free():
+    graph = PoseGraph(2)
+    for index in range(3):
+        graph.add_pose(lie.identity(2), index)
+    graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), np.eye(3))
+    graph.add_edge(1, 2, lie.pose_2d(1.0, 0.0, 0.0), np.diag([1.0, 1.0, 0.0]))
+    with pytest.raises(InputError, match=r"leave 1 pose free: 2 \(yaw\)"):
+        graph.optimize(GraphConfig(optimizer="gauss-newton", robust="none"), initialize="given")
+
+
+def test_an_empty_graph_says_so():
+    with pytest.raises(InputError, match="has no poses"):
+        PoseGraph(2).optimize(PLAIN)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_poses_without_edges_but_the_first_are_already_optimal(dimension):
+    graph = PoseGraph(dimension)
+    graph.add_pose(lie.identity(dimension), 5)
+    answer = graph.optimize(GraphConfig())
+    assert answer.converged and answer.chi2_after == 0.0
+    assert np.array_equal(graph.poses[0], lie.identity(dimension))

@@ -1,0 +1,174 @@
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import GraphConfig
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.robust.inliers import contradictions
+from tests.benchmarks.wrong_edges import try_wrong_loops
+from tests.support.scenes import shared_data
+
+
+def with_false_loops(name, share, seed=0):
+    """A published graph, its loops under suspicion, with random ones added, and the poses it should end with."""
+    path = shared_data(f"graphs/{name}.g2o")
+    true = read_g2o(path).graph
+    true.optimize(GraphConfig())
+    graph = read_g2o(path, loops="robust").graph
+    rng = np.random.default_rng(seed)
+    count = int(share * graph.is_loop.sum())
+    pairs = rng.integers(0, len(graph), (count, 2))
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1]
+    span = np.ptp(true.poses[:, :2, 2], axis=0)
+    twists = rng.uniform(-0.5, 0.5, (len(pairs), 3)) * [*span, 2.0 * np.pi]
+    omega = np.median(graph.information[graph.is_loop], axis=0)
+    real = len(graph.edges)
+    graph.add_edges(pairs, lie.exp(twists), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool))
+    return graph, true, np.arange(len(graph.edges)) >= real
+
+
+def in_order_of_addition(graph, values):
+    result = np.empty(len(values), values.dtype)
+    result[np.argsort(graph.is_loop, kind="stable")] = values
+    return result
+
+
+def position_error_m(graph, true):
+    return float(np.sqrt(((graph.poses[:, :2, 2] - true.poses[:, :2, 2]) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize(
+    ("robust", "true_lost", "error_m"), [("truncated", 0.01, 0.2), ("geman-mcclure", 0.04, 2.0)]
+)
+@pytest.mark.parametrize("name", ["intel", "manhattan"])
+def test_false_loops_are_rejected_and_true_ones_kept(name, robust, true_lost, error_m):
+    graph, true, false = with_false_loops(name, 0.03)
+    answer = graph.optimize(GraphConfig(robust=robust))
+    rejected = in_order_of_addition(graph, answer.rejected)
+    assert rejected[false].mean() >= 0.99
+    assert rejected[graph.is_loop & ~false].mean() <= true_lost
+    assert position_error_m(graph, true) < error_m
+    weight = in_order_of_addition(graph, answer.state.weight)
+    assert weight[false].max() < 0.1 and np.all(weight[~graph.is_loop] == 1.0)
+    assert not rejected[~graph.is_loop].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "share"), [("intel", 0.1), ("intel", 0.3), ("intel", 0.5), ("manhattan", 0.1), ("manhattan", 0.5)]
+)
+def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share):
+    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, "nearby", seed=0)
+    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
+    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
+    assert outcome.certified
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_with_it(dimension):
+    rng = np.random.default_rng(3)
+    k, count = (3, 6)[dimension - 2], 10
+    true = lie.exp(0.5 * rng.normal(size=(count, k)))
+    pairs = np.array([*((i, i + 1) for i in range(count - 1)), (0, 4), (2, 7), (1, 9), (3, 8)])
+    noise = 0.01 * rng.normal(size=(len(pairs), k))
+    measured = lie.inverse(true[pairs[:, 0]]) @ true[pairs[:, 1]] @ lie.exp(noise)
+
+    def optimized(chosen):
+        graph = PoseGraph(dimension)
+        for index, T in enumerate(true):
+            graph.add_pose(T, index)
+        omega = np.tile(1e4 * np.eye(k), (len(pairs), 1, 1))
+        graph.add_edges(pairs[chosen], measured[chosen], omega[chosen], np.zeros(chosen.sum(), bool))
+        answer = graph.optimize(GraphConfig(robust="none", tolerance=1e-14))
+        return graph, answer.chi2_after
+
+    everything = np.ones(len(pairs), bool)
+    whole, with_all = optimized(everything)
+    problem = BetweenProblem(pairs, measured, whole.information, whole.fixed)
+    for edge in range(count - 1, len(pairs)):
+        others = everything.copy()
+        others[edge] = False
+        without, chi2 = optimized(others)
+        falls = contradictions(problem, whole.poses, everything, np.inf)[edge]
+        rises = contradictions(problem, without.poses, others, np.inf)[edge]
+        assert falls == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
+        assert rises == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
+        bound = contradictions(problem, without.poses, others, 0.0)[edge]
+        assert bound <= rises * (1.0 + 1e-9)
+
+
+def test_loops_are_judged_by_the_noise_they_have_where_they_claim_to_have_more():
+    """Information matrices a hundred times too small would let in a loop that is off by a meter."""
+    rng = np.random.default_rng(0)
+    graph, sigma = PoseGraph(2), np.array([0.02, 0.02, 0.002])
+    true = [lie.pose_2d(np.cos(a) * 5, np.sin(a) * 5, a) for a in np.linspace(0.0, 12.0 * np.pi, 180)]
+    for index, T in enumerate(true):
+        graph.add_pose(T, index)
+    pairs = [(i, i + 1) for i in range(179)] + [(i, i + 30) for i in range(0, 150, 3)]
+    for i, j in pairs:
+        Z = lie.inverse(true[i]) @ true[j] @ lie.exp(sigma * rng.normal(size=3))
+        graph.add_edge(i, j, Z, 0.01 * np.diag(sigma**-2), is_loop=j - i > 1)
+    Z = lie.inverse(true[10]) @ true[100] @ lie.exp(np.array([1.0, 0.0, 0.0]))
+    graph.add_edge(10, 100, Z, 0.01 * np.diag(sigma**-2), is_loop=True)
+    answer = graph.optimize(GraphConfig(robust="truncated"))
+    assert answer.state.edges[answer.rejected].tolist() == [[10, 100]]
+
+
+def test_without_robust_weights_the_same_false_loops_ruin_the_map():
+    graph, true, _ = with_false_loops("intel", 0.03)
+    graph.optimize(GraphConfig(robust="none"), initialize="given")
+    assert position_error_m(graph, true) > 2.0
+
+
+def test_truncated_weights_are_verdicts():
+    graph, _, _ = with_false_loops("intel", 0.03)
+    weight = graph.optimize(GraphConfig(robust="truncated")).state.weight
+    assert np.all((weight == 0.0) | (weight == 1.0))
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy", "geman-mcclure", "tukey", "truncated"])
+def test_a_robust_loss_hardly_moves_a_graph_whose_loops_are_true(robust):
+    graph, true, _ = with_false_loops("intel", 0.0)
+    answer = graph.optimize(GraphConfig(robust=robust))
+    assert not answer.rejected.any()
+    assert position_error_m(graph, true) < 0.02
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy"])
+def test_a_minimum_of_the_robust_loss_is_flat(robust):
+    """The weights belong to the loss: at the answer Σ w JᵀΩe vanishes."""
+    graph, _, _ = with_false_loops("intel", 0.01)
+    graph.optimize(GraphConfig(robust=robust, tolerance=1e-12, max_iterations=300))
+    problem = graph._prepared()
+    equations = problem.linearize(graph.poses, problem.errors(graph.poses), graph.weight)
+    diagonal = equations.values[problem.pattern.diagonal]
+    assert np.abs(equations.gradient / np.sqrt(diagonal)).max() < 1e-3
+
+
+def test_false_edges_stay_in_force_where_a_pose_would_be_loose_without_them():
+    """Two loops hold the last pose, and each claims another place."""
+    graph = PoseGraph(2)
+    for index, x in enumerate((0.0, 1.0, 3.0)):
+        graph.add_pose(lie.pose_2d(x, 0.0, 0.0), index)
+    graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), 1e4 * np.eye(3))
+    graph.add_edge(0, 2, lie.pose_2d(2.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    graph.add_edge(1, 2, lie.pose_2d(3.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    answer = graph.optimize(GraphConfig(robust="huber"))
+    assert not answer.rejected.any() and answer.state.degrees_of_freedom == 3
+    assert answer.state.weight.min() > 0.0 and graph.certify().chi2 == pytest.approx(answer.chi2_after)
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy", "geman-mcclure", "tukey", "truncated"])
+def test_rejected_edges_have_no_weight_and_the_answer_is_the_minimum_without_them(robust):
+    graph, _, _ = with_false_loops("intel", 0.03)
+    answer = graph.optimize(GraphConfig(robust=robust))
+    assert answer.rejected.any()
+    assert np.array_equal(answer.rejected, answer.state.weight == 0.0)
+    in_force = (answer.state.weight * answer.state.edge_chi2)[~answer.rejected].sum()
+    assert answer.state.chi2 == pytest.approx(in_force) and answer.state.chi2 == pytest.approx(answer.chi2_after)
+    problem = graph._prepared()
+    equations = problem.linearize(graph.poses, problem.errors(graph.poses), graph.weight)
+    step = problem.cholesky
+    step.factorize(equations.values)
+    assert np.abs(step.solve(equations.gradient)).max() < 0.02  # m and rad, left to the tolerance

@@ -1,0 +1,348 @@
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
+
+from scanchain import lie
+from scanchain.config import LocalMapConfig
+from scanchain.kernels.geometry import eigen
+from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.graph.shortest_paths import shortest_paths
+from scanchain.kernels.registration import optimizers
+from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration.residuals import normal_equations
+from scanchain.kernels.registration.weights import weigh
+from scanchain.kernels.voxels import downsample, hashing
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE, insert
+from scanchain.registration import VoxelMap
+from tests.support import naive
+
+SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}
+
+
+def some_points(dimension, n=400, seed=0):
+    """A wall, a pole and clutter, so that every shape occurs."""
+    rng = np.random.default_rng(seed)
+    wall = np.column_stack([rng.uniform(-3, 3, n), 2.0 + 0.01 * rng.normal(size=n), rng.uniform(-1, 1, n)])
+    pole = np.column_stack([0.3 + 0.01 * rng.normal(size=(n, 2)), rng.uniform(-1, 2, n)])
+    clutter = rng.uniform(-3, 3, (n // 4, 3))
+    return np.ascontiguousarray(np.concatenate([wall, pole, clutter])[:, :dimension])
+
+
+def map_of(points, size=0.5, alone=8):
+    voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size))
+    insert(voxel_map.voxels, points, lie.identity(points.shape[1]), 1, float(alone))
+    return voxel_map
+
+
+def keys_of(voxel_map):
+    return [hashing.unpack(key) for key in voxel_map.voxels.keys[: len(voxel_map)]]
+
+
+def adjacent(a, b):
+    return max(abs(i - j) for i, j in zip(a, b, strict=True)) <= 1
+
+
+def paired(voxel_map, correspondence):
+    """Pairs as naive.py takes them."""
+    d = voxel_map.dimension
+    cells = voxel_map.voxels.cells
+    return [
+        (i, cells[j, :d], SHAPES[cells[j, SHAPE]], cells[j, DIRECTION : DIRECTION + d])
+        for i, j in enumerate(correspondence)
+        if j >= 0
+    ]
+
+
+@pytest.mark.parametrize("coordinates", [(0, 0, 0), (-1, 5, -1048576), (1048575, -7, 3)])
+def test_a_voxel_key_unpacks_to_the_coordinates_it_was_made_of(coordinates):
+    assert hashing.unpack(hashing.pack(*coordinates)) == coordinates
+
+
+def test_every_key_is_found_where_it_was_put_even_in_a_crowded_table():
+    rng = np.random.default_rng(1)
+    wanted = np.unique(rng.integers(0, 2**40, 900))
+    keys = np.full(1024, hashing.EMPTY)
+    for key in wanted:
+        keys[~hashing.find(keys, key)] = key
+    assert all(keys[hashing.find(keys, key)] == key for key in wanted)
+    assert hashing.find(keys, 2**41 + 1) < 0
+
+
+@pytest.mark.parametrize("spread", [(1.0, 1.0, 1.0), (1.0, 1e-3, 1e-6), (5.0, 5.0, 1e-4), (1e-9, 2e-9, 3e-9)])
+def test_closed_form_eigenvectors_equal_lapack(spread):
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        Q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        A = Q @ np.diag(np.array(spread) * rng.uniform(0.5, 1.0, 3)) @ Q.T
+        entries = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
+        values = np.array(eigen.eigenvalues_3d(*entries))
+        expected, vectors = np.linalg.eigh(A)
+        np.testing.assert_allclose(values, expected, atol=1e-7 * expected[-1])
+        v = np.array(eigen.eigenvector_3d(*entries, values[0]))
+        gap = (expected[1] - expected[0]) / expected[-1]
+        assert abs(v @ vectors[:, 0]) > 1.0 - 1e-6 / gap**2
+
+
+def test_planar_eigenvector_equals_lapack():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        B = rng.normal(size=(2, 2))
+        A = B @ B.T
+        small, large, nx, ny = eigen.normal_2d(A[0, 0], A[0, 1], A[1, 1])
+        expected, vectors = np.linalg.eigh(A)
+        np.testing.assert_allclose([small, large], expected, atol=1e-12 * expected[-1])
+        assert abs(np.array([nx, ny]) @ vectors[:, 0]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("alone", [1, 8, 10**6])
+def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
+    points = some_points(dimension)
+    voxel_map = map_of(points, alone=alone)
+    groups = naive.group(points, 0.5)
+    cells = voxel_map.voxels.cells
+    assert sorted(keys_of(voxel_map)) == sorted(groups)
+    seen = set()
+    for voxel, key in enumerate(keys_of(voxel_map)):
+        around = [members for other, members in groups.items() if other != key and adjacent(other, key)]
+        kind, direction = naive.shape(naive.members_of(groups[key], around, alone, 0.5))
+        np.testing.assert_allclose(cells[voxel, :dimension], groups[key].mean(0), atol=1e-12)
+        assert SHAPES[cells[voxel, SHAPE]] == kind
+        seen.add(kind)
+        if direction is not None:
+            assert abs(cells[voxel, DIRECTION : DIRECTION + dimension] @ direction) > 1.0 - 1e-9
+    assert "plane" in seen
+
+
+def test_a_voxel_map_far_from_its_origin_loses_no_precision():
+    points = some_points(3)
+    offset = np.array([200_000.0, -150_000.0, 300.0])
+    here, there = map_of(points), map_of(points + offset)
+    order = [keys_of(there).index(tuple(np.add(key, offset / 0.5).astype(int))) for key in keys_of(here)]
+    np.testing.assert_allclose(there.points()[order] - offset, here.points(), atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("reach", [1, 2])
+def test_association_finds_the_nearest_mean(dimension, reach):
+    points = some_points(dimension)
+    voxel_map = map_of(points)
+    means = dict(zip(keys_of(voxel_map), voxel_map.points(), strict=True))
+    T = lie.exp(np.array([0.1, -0.2, 0.1] if dimension == 2 else [0.1, -0.2, 0.1, 0.02, 0.03, 0.1]))
+    correspondence = np.empty(len(points), np.int32)
+    found = associate(voxel_map.voxels, points, T, reach, 0.6, correspondence)
+    keys = keys_of(voxel_map)
+    expected = [naive.nearest_mean(p, means, 0.5, reach, 0.6) for p in lie.transform(T, points)]
+    assert [keys[j] if j >= 0 else None for j in correspondence] == expected
+    assert found == sum(key is not None for key in expected)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("alone", [8, 10**6])
+def test_the_weight_is_the_sensors_variance_over_the_residuals(dimension, alone):
+    points = some_points(dimension)
+    voxel_map = map_of(points, alone=alone)
+    groups = naive.group(points, 0.5)
+    T = lie.exp(np.array([0.1, -0.2, 0.1] if dimension == 2 else [0.1, -0.2, 0.1, 0.02, 0.03, 0.1]))
+    correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, T, 1, 0.6, correspondence)
+    variance = 0.02**2
+    weigh(voxel_map.voxels, points, T, correspondence, variance, weight)
+    keys, moved = keys_of(voxel_map), lie.transform(T, points)
+    assert np.array_equal(weight == 0.0, correspondence < 0)
+    for i, mean, kind, direction in paired(voxel_map, correspondence):
+        key = keys[correspondence[i]]
+        near = [members for other, members in groups.items() if other != key and adjacent(other, key)]
+        members = naive.members_of(groups[key], near, alone, 0.5)
+        expected = naive.weight_of(moved[i], T, mean, kind, direction, members, 0.5, variance)
+        assert weight[i] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_plane_seen_edge_on_has_little_weight():
+    rng = np.random.default_rng(0)
+    slab = np.column_stack(
+        [rng.uniform(20.0, 23.0, 600), rng.uniform(-1.5, 1.5, 600), 0.001 * rng.normal(size=600)]
+    )
+    wall = slab[:, [2, 1, 0]] + np.array([20.0, 0.0, -21.5])
+    weights = []
+    for points in (slab, wall):
+        voxel_map = map_of(points, size=1.0)
+        correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+        associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, correspondence)
+        weigh(voxel_map.voxels, points, np.eye(4), correspondence, 0.02**2, weight)
+        weights.append(np.median(weight))
+    assert weights[0] < 0.001 and weights[1] > 0.8
+
+
+def weight_of(points, *, size=1.0, noise_m=0.02, passes=1):
+    """Median weight of points in a map of themselves, inserted so many times, seen from the origin."""
+    voxel_map = VoxelMap(3, LocalMapConfig(voxel_size_m=size))
+    for _ in range(passes):
+        voxel_map.insert(points, np.eye(4))
+    correspondence, weight = np.empty(len(points), np.int32), np.empty(len(points))
+    associate(voxel_map.voxels, points, np.eye(4), 1, 1.0, correspondence)
+    weigh(voxel_map.voxels, points, np.eye(4), correspondence, noise_m**2, weight)
+    return float(np.median(weight[correspondence >= 0]))
+
+
+def ring_on(surface_m, elevation, n=4000, noise_m=0.02, seed=0):
+    """Where one ring strikes a surface that is surface_m(azimuth) away, good to noise_m along the ray."""
+    rng = np.random.default_rng(seed)
+    azimuth = rng.uniform(-0.3, 0.3, n)
+    cone = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(n, np.tan(elevation))])
+    ranges = surface_m(azimuth) + noise_m * rng.normal(size=n)
+    return cone / np.linalg.norm(cone, axis=1)[:, None] * ranges[:, None]
+
+
+@pytest.mark.parametrize("passes", [1, 10])
+def test_a_ring_seen_over_and_over_is_no_surface(passes):
+    """Neither the arc on a smooth wall nor the sheet that a ragged hedge makes of it."""
+    arc = ring_on(lambda azimuth: 15.0 / np.cos(azimuth), 0.1)
+    hedge = ring_on(lambda azimuth: 15.0 + np.sin(40.0 * azimuth), 0.1)
+    assert max(weight_of(arc, passes=passes), weight_of(hedge, passes=passes)) < 0.05
+
+
+def test_a_pole_counts_and_a_ring_on_a_rail_does_not():
+    rng = np.random.default_rng(0)
+    thin = 0.01 * rng.normal(size=(300, 2))
+    length = rng.uniform(-0.5, 0.5, 300)
+    pole = np.column_stack([12.5 + thin[:, 0], 0.5 + thin[:, 1], length])
+    rail = np.column_stack([12.5 + thin[:, 0], 0.5 + length, 0.5 + thin[:, 1]])
+    assert weight_of(pole) > 0.5 > 0.01 > weight_of(rail)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
+    points = some_points(dimension)
+    voxel_map = map_of(points)
+    k = 3 if dimension == 2 else 6
+    T = lie.exp(np.linspace(0.05, -0.08, k))
+    origin = np.array([0.7, -0.4, 0.3]) * ([1, 1, 0] if dimension == 2 else 1)
+    correspondence = np.empty(len(points), np.int32)
+    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
+    pairs = paired(voxel_map, correspondence)
+    assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
+    H, b = np.empty((k, k)), np.empty(k)
+    scale, weight = 0.2, np.random.default_rng(3).uniform(0.1, 1.0, len(points))
+    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, correspondence, weight, scale, False, H, b)
+    assert total == pytest.approx(naive.cost(points, pairs, T, scale, weight), rel=1e-12)
+    np.testing.assert_allclose(
+        H, naive.gauss_newton_hessian(points, pairs, T, origin[:dimension], scale, weight), rtol=1e-6, atol=1e-5
+    )
+    moved = np.empty_like(T)
+    for axis in range(k):
+        ends = []
+        for sign in (1e-6, -1e-6):
+            perturb(sign * np.eye(k)[axis], T.copy(), origin, moved)
+            ends.append(naive.cost(points, pairs, moved, scale, weight))
+        assert b[axis] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimension):
+    points = some_points(dimension)
+    voxel_map = map_of(points)
+    k = 3 if dimension == 2 else 6
+    T = lie.exp(np.linspace(0.05, -0.08, k))
+    origin, correspondence = np.zeros(3), np.empty(len(points), np.int32)
+    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
+    huge, full = 1e4, np.ones(len(points))  # every weight is one, the cost plain least squares
+    H, b = np.empty((k, k)), np.empty(k)
+    normal_equations(voxel_map.voxels, points, T, origin, correspondence, full, huge, True, H, b)
+    h, moved, gradients = 1e-5, np.empty_like(T), []
+    for axis in range(k):
+        ends = []
+        for sign in (h, -h):
+            perturb(sign * np.eye(k)[axis], T.copy(), origin, moved)
+            normal_equations(
+                voxel_map.voxels, points, moved, origin, correspondence, full, huge, False, np.empty((k, k)), b
+            )
+            ends.append(b.copy())
+        gradients.append((ends[0] - ends[1]) / (2 * h))
+    numeric = np.array(gradients)
+    np.testing.assert_allclose(H, 0.5 * (numeric + numeric.T), rtol=1e-4, atol=1e-3 * np.abs(H).max())
+
+
+@pytest.mark.parametrize(
+    "twist", [[0.1, -0.2, 1e-12], [0.5, 0.1, 3.1], [1, 2, 3, 1e-7, 0, 0], [1, 2, 3, 0.5, -2, 2]]
+)
+def test_perturbation_is_the_exponential_about_the_origin(twist):
+    twist = np.array(twist, float)
+    T = lie.exp(twist[::-1].copy())
+    origin = np.array([3.0, -1.0, 0.0 if len(twist) == 3 else 2.0])
+    shift = lie.identity(T.shape[0] - 1)
+    shift[:-1, -1] = origin[: T.shape[0] - 1]
+    out, before = np.empty_like(T), T.copy()
+    perturb(twist, T, origin, out)
+    np.testing.assert_allclose(out, shift @ lie.exp(twist) @ lie.inverse(shift) @ T, atol=1e-12)
+    np.testing.assert_allclose(T, before, atol=1e-15)
+
+
+def test_orthonormalizing_leaves_a_rotation_and_changes_it_little():
+    T = lie.exp(np.array([1, 2, 3, 0.4, 0.5, -0.6]))
+    T[:3, :3] += 1e-6 * np.random.default_rng(0).normal(size=(3, 3))
+    before = T.copy()
+    orthonormalize(T)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(T, before, atol=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_damped_solve_equals_numpy(damping):
+    rng = np.random.default_rng(5)
+    B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
+    H, x = B.T @ B, np.empty(6)
+    assert optimizers.solve(H, b, damping, np.empty((6, 6)), x)
+    np.testing.assert_allclose(x, -np.linalg.solve(H + damping * np.diag(np.diag(H)), b), rtol=1e-9)
+
+
+def test_solve_says_so_where_the_system_is_singular():
+    assert not optimizers.solve(np.diag([1.0, 0.0, 1.0]), np.ones(3), 0.5, np.empty((3, 3)), np.empty(3))
+
+
+@pytest.mark.parametrize("optimizer", [optimizers.NEWTON, optimizers.GAUSS_NEWTON, optimizers.GRADIENT_DESCENT])
+def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
+    rng = np.random.default_rng(6)
+    B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
+    H, x = B.T @ B, np.empty(6)
+    assert optimizers.step(optimizer, H, b, 0.0, np.empty((6, 6)), x)
+    decrease = -(b @ x + 0.5 * x @ H @ x)
+    assert decrease > 0.0
+    assert optimizers.predicted_decrease(H, b, x) == pytest.approx(decrease)
+    assert b @ x < 0.0
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_downsampling_keeps_the_first_point_of_each_voxel_in_range(dimension, dtype):
+    points = some_points(dimension).astype(dtype)
+    chosen = np.empty(len(points), np.int32)
+    count = downsample.first_per_voxel(points, 0.4, 0.5, 3.0, chosen)
+    assert chosen[:count].tolist() == naive.first_per_voxel(points.astype(float), 0.4, 0.5, 3.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_deskewing_moves_each_point_along_the_motion(dimension):
+    points = some_points(dimension)
+    shares = np.linspace(-0.5, 1.0, len(points))
+    twist = np.array([1.0, 0.2, 0.3] if dimension == 2 else [1.0, 0.2, 0.1, 0.02, -0.05, 0.3])
+    expected = naive.deskew(points, shares, twist)
+    downsample.deskew(points, shares, twist)
+    np.testing.assert_allclose(points, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_shortest_paths_equal_those_of_scipy(seed):
+    rng = np.random.default_rng(seed)
+    edges = np.concatenate([np.stack([np.arange(39), np.arange(1, 40)], axis=1), rng.integers(0, 45, (20, 2))])
+    lengths = rng.uniform(0.1, 2.0, len(edges))
+    dense = np.full((45, 45), np.inf)
+    for (i, j), length in zip(edges, lengths, strict=True):
+        dense[i, j] = dense[j, i] = min(dense[i, j], length)
+    expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
+    assert shortest_paths(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
+
+
+def test_an_edge_of_infinite_length_leads_nowhere():
+    edges = np.array([[0, 1], [1, 2]])
+    assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]

@@ -1,0 +1,203 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanchain.graph.robust.losses import RobustLoss
+from scanchain.kernels.landmarks import dead_reckoning, factors
+from scanchain.landmarks import guess as guesses
+from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
+from scanchain.landmarks.files.npz import read_landmark_data
+from scanchain.landmarks.minimize import QUADRATIC, minimize
+from scanchain.landmarks.problem import Values
+from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
+from tests.support import naive_landmarks
+from tests.support.naive_landmarks import numeric_jacobian
+from tests.support.scenes import shared_data
+
+
+@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize("bearing", [0.3, np.pi - 1e-9, -np.pi + 1e-9, -3.0])
+def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bearing):
+    rng = np.random.default_rng(1)
+    pose, landmark = np.array([1.0, -2.0, 2.8])[:size], rng.normal(size=2) * 3.0
+    r, J = np.empty(2), np.empty((2, size + 2))
+    factors.bearing_range_block(pose, landmark, bearing, 2.0, r, J)
+    assert np.allclose(r, naive_landmarks.bearing_range(pose, landmark, bearing, 2.0), atol=1e-12)
+
+    def residual(x):
+        return naive_landmarks.bearing_range(x[:size], x[size:], r[0] + bearing, 2.0)  # far from the wrap
+
+    assert np.allclose(J, numeric_jacobian(residual, np.concatenate([pose, landmark])), atol=1e-8)
+
+
+def test_a_bearing_that_crosses_pi_is_off_by_little_not_by_a_turn():
+    r, J = np.empty(2), np.empty((2, 4))
+    for y in (0.01, -0.01):
+        factors.bearing_range_block(np.zeros(2), np.array([-2.0, y]), np.sign(y) * -3.13, 2.0, r, J)
+        assert abs(r[0]) < 0.02
+
+
+def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
+    r, J = np.empty(2), np.empty((2, 5))
+    factors.bearing_range_block(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0, r, J)
+    assert np.array_equal(r, [0.0, -3.0]) and not J[0].any()
+    assert np.allclose(J[1], [-np.cos(0.7), -np.sin(0.7), 0.0, np.cos(0.7), np.sin(0.7)])
+
+
+@pytest.mark.parametrize("turn", [0.4, 3.1, -3.1])
+def test_odometry_equals_the_naive_one_and_finite_differences(turn):
+    first, second, moved = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.0, 3.0 + turn]), np.array([0.4, 0.1, turn])
+    r, J = np.empty(3), np.empty((3, 6))
+    factors.odometry_block(first, second, moved, r, J)
+    assert np.allclose(r, naive_landmarks.odometry(first, second, moved), atol=1e-12)
+    numeric = numeric_jacobian(
+        lambda x: naive_landmarks.odometry(x[:3], x[3:], moved), np.concatenate([first, second])
+    )
+    assert np.allclose(J, numeric, atol=1e-8)
+
+
+def test_dead_reckoning_equals_many_short_steps_and_stands_still_before_the_first_velocity():
+    times = np.array([1.0, 1.7, 2.2, 4.0])
+    velocities = np.array([[0.5, 0.3], [0.2, -1.0], [0.0, 0.8], [1.0, 0.0]])
+    nodes = np.array([0.2, 1.5, 2.1, 4.5])
+    motion, spread = np.empty((3, 3)), np.empty((3, 4, 3, 3))
+    dead_reckoning.integrate(times, velocities, nodes, motion, spread)
+    for k in range(3):
+        expected = naive_landmarks.dead_reckoned(times, velocities, nodes[k], nodes[k + 1])
+        assert np.allclose(motion[k], expected, atol=1e-4)
+
+
+def test_the_spread_of_dead_reckoning_is_what_noisy_velocities_do():
+    """Noise of density q a meter, at v held for τ, is a velocity error of variance q v / τ; turning likewise."""
+    rng = np.random.default_rng(0)
+    times, nodes = np.arange(0.0, 2.0, 0.1), np.array([0.0, 2.0])
+    clean = np.tile([0.8, 0.5], (len(times), 1))
+    motion, spread = np.empty((1, 3)), np.empty((1, 4, 3, 3))
+    dead_reckoning.integrate(times, clean, nodes, motion, spread)
+    densities = np.array([4e-4, 0.0, 5e-4, 8e-4])
+    variances = np.array([0.8 * densities[0], 0.8 * densities[2] + 0.5 * densities[3]]) / 0.1
+    sampled = np.empty((4000, 3))
+    for k in range(len(sampled)):
+        noisy = clean + rng.normal(size=clean.shape) * np.sqrt(variances)
+        dead_reckoning.integrate(times, noisy, nodes, motion, np.empty((1, 0, 3, 3)))
+        sampled[k] = motion[0]
+    expected = np.einsum("c,cab->ab", densities, spread[0])
+    assert np.allclose(np.cov(sampled.T), expected, atol=0.1 * np.abs(expected).max())
+
+
+@pytest.fixture(scope="module")
+def nonlinear():
+    data = read_landmark_data(shared_data("landmarks/2d_nonlinear.npz"))
+    problem = BearingRangeProblem(world_referenced(data))
+    guess = guesses.from_odometry(problem.measurements)
+    return data, problem, guess, minimize(problem, guess, create_solver("cholesky"))
+
+
+@pytest.mark.parametrize("guess", ["disturbed", "origin", "turned the other way"])
+@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton", "dogleg"])
+def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, optimizer):
+    data, problem, good, best = nonlinear
+    assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
+    assert np.abs(best.state.poses - data.true_poses).max() < 0.05
+    start = {
+        "disturbed": guesses.disturbed(good, 1.0, 0.5),
+        "turned the other way": guesses.disturbed(good, -1.0, -0.5),
+        "origin": Values(good.poses, np.zeros_like(good.landmarks)),
+    }[guess]
+    minimum = minimize(problem, start, create_solver("schur"), optimizer=optimizer)
+    assert minimum.converged
+    assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < 1e-5
+
+
+def test_gradient_descent_goes_downhill_and_says_that_it_did_not_arrive(nonlinear):
+    _, problem, guess, best = nonlinear
+    few, many = (
+        minimize(problem, guess, create_solver("schur"), optimizer="gradient-descent", max_iterations=steps)
+        for steps in (10, 100)
+    )
+    assert best.cost < many.cost < few.cost
+    assert not many.converged and many.reason == "100 iterations reached"
+
+
+def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
+    _, problem, guess, _ = nonlinear
+    given = problem.measurements
+    blind = BearingRangeProblem(replace(given, **{
+        name: getattr(given, name)[given.observed[:, 1] != 4] for name in ("observed", "measured")
+    }))  # fmt: skip
+    for optimizer in ("gauss-newton", "dogleg"):
+        with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
+            minimize(blind, guess, create_solver("schur"), optimizer=optimizer)
+
+
+def test_all_methods_reach_the_same_minimum(nonlinear):
+    _, problem, guess, best = nonlinear
+    for method in METHODS:
+        found = minimize(problem, guess, create_solver(method)).state.unknowns
+        assert np.abs(found - best.state.unknowns).max() < 1e-8
+
+
+def test_running_out_of_iterations_is_said_not_hidden(nonlinear):
+    _, problem, guess, _ = nonlinear
+    minimum = minimize(problem, guess, create_solver("schur"), max_iterations=2)
+    assert not minimum.converged and minimum.reason == "2 iterations reached"
+
+
+def measurements(seed=0, unit=1.0, outliers=0):
+    """A made-up drive of 40 poses past 6 landmarks, lengths in meters over ``unit``."""
+    rng = np.random.default_rng(seed)
+    motion = np.tile([0.3, 0.0, 0.16], (39, 1)) + rng.normal(size=(39, 3)) * [0.01, 0.005, 0.01]
+    poses = guesses.chain(np.zeros(3), np.tile([0.3, 0.0, 0.16], (39, 1)))
+    landmarks = rng.uniform(-3.0, 3.0, (6, 2)) + np.array([0.0, 2.0])
+    observed = np.stack(np.meshgrid(np.arange(40), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    away = landmarks[observed[:, 1]] - poses[observed[:, 0], :2]
+    bearing = np.arctan2(away[:, 1], away[:, 0]) - poses[observed[:, 0], 2] + rng.normal(size=len(away)) * 0.02
+    reach = np.linalg.norm(away, axis=1) + rng.normal(size=len(away)) * 0.05
+    reach[:outliers] += 3.0
+    scale = np.array([1.0 / unit, 1.0 / unit, 1.0])
+    return (
+        poses,
+        landmarks,
+        Measurements(
+            first_pose=np.zeros(3),
+            first_covariance=1e-6 * np.diag(scale**2),
+            motion=motion * scale,
+            motion_covariance=np.tile(np.diag((np.array([0.01, 0.005, 0.01]) * scale) ** 2), (39, 1, 1)),
+            calibration=no_calibration(motion),
+            observed=observed,
+            measured=np.stack([naive_landmarks.wrapped(bearing), reach / unit], axis=1),
+            measured_covariance=np.diag([0.02**2, (0.05 / unit) ** 2]),
+            landmarks=np.arange(6),
+        ),
+    )
+
+
+def solve(given, loss):
+    return minimize(BearingRangeProblem(given), guesses.from_odometry(given), create_solver("schur"), loss=loss)
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman-mcclure"])
+def test_meters_or_centimeters_same_weights_and_same_drive(kernel):
+    loss = RobustLoss(kernel, 2.0, 1.0)
+    in_m, in_cm = (solve(measurements(unit=unit, outliers=8)[2], loss) for unit in (1.0, 0.01))
+    assert np.allclose(in_m.weights, in_cm.weights, atol=1e-5)
+    assert np.allclose(in_m.state.poses[:, :2], 0.01 * in_cm.state.poses[:, :2], atol=1e-5)
+
+
+def test_outliers_lose_their_weight_and_the_drive_stays_right():
+    poses, _, given = measurements(outliers=8)
+    robust, quadratic = solve(given, RobustLoss("cauchy", 2.0, 1.0)), solve(given, QUADRATIC)
+    assert robust.weights[:8].max() < 0.01 < 0.5 < np.median(robust.weights[8:])
+    off = [np.abs(minimum.state.poses[:, :2] - poses[:, :2]).max() for minimum in (robust, quadratic)]
+    assert off[0] < 0.1 < off[1]
+
+
+def test_the_growing_guess_follows_a_drive_whose_dead_reckoning_is_lost():
+    poses, landmarks, given = measurements(seed=3)
+    given.motion[:, 2] += 0.1  # the gyro is off by 6 degrees a step
+    guess = guesses.growing(given, create_solver("schur"))
+    reckoned = guesses.from_odometry(given)
+    off, off_reckoned = (np.abs(state.poses[:, :2] - poses[:, :2]).max() for state in (guess, reckoned))
+    assert off < 0.5 and off < 0.2 * off_reckoned
+    assert np.abs(guess.landmarks - landmarks).max() < 0.5

@@ -1,0 +1,216 @@
+import numpy as np
+import pytest
+
+from scanchain.errors import InputError
+from scanchain.landmarks.files.mrclam import read_mrclam
+from scanchain.landmarks.files.npz import read_landmark_data
+from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
+from scanchain.landmarks.ranges.slam import solve_range_log
+from scanchain.landmarks.study import Options
+from scanchain.landmarks.study_log import study_log
+from tests.support.scenes import shared_data
+
+
+@pytest.fixture
+def arrays():
+    """A problem of three poses and two landmarks that fits its truth."""
+    poses, landmarks = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]), np.array([[1.0, 3.0], [4.0, 2.0]])
+    pairs = [(0, 0), (0, 1), (1, 0), (2, 1)]
+    return {
+        "gt_traj": poses,
+        "gt_landmarks": landmarks,
+        "odom": np.diff(poses, axis=0),
+        "observations": np.array([[i, j, *(landmarks[j] - poses[i])] for i, j in pairs]),
+        "sigma_odom": 0.01 * np.eye(2),
+        "sigma_landmark": 0.04 * np.eye(2),
+    }
+
+
+def written(tmp_path, arrays):
+    path = tmp_path / "problem.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def test_the_kind_of_observation_is_found_by_what_fits_the_truth(tmp_path, arrays):
+    assert read_landmark_data(written(tmp_path, arrays)).kind == "linear"
+    x, y = arrays["observations"][:, 2:].T
+    arrays["observations"][:, 2:] = np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
+    assert read_landmark_data(written(tmp_path, arrays)).kind == "bearing-range"
+
+
+def without(name):
+    return lambda arrays: arrays.pop(name)
+
+
+def setting(name, value):
+    return lambda arrays: arrays.__setitem__(name, value)
+
+
+def changing(name, place, value):
+    return lambda arrays: arrays[name].__setitem__(place, value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (without("odom"), "has no array odom"),
+        (setting("odom", np.zeros((5, 2))), "odom has 5 steps between 3 poses"),
+        (setting("gt_traj", np.zeros((3, 3))), r"gt_traj has shape \(3, 3\)"),
+        (setting("sigma_odom", np.zeros((3, 2))), r"sigma_odom has shape \(3, 2\)"),
+        (setting("sigma_odom", -np.eye(2)), "sigma_odom is no covariance"),
+        (setting("sigma_landmark", np.array([[1.0, 0.5], [0.0, 1.0]])), "sigma_landmark is no covariance"),
+        (setting("observations", np.zeros((0, 4))), "observations is empty"),
+        (setting("gt_landmarks", np.array([["a", "b"]])), "gt_landmarks holds <U1"),
+        (setting("odom", np.array([[{}, {}]] * 2)), "holds pickled objects"),
+        (changing("odom", (1, 0), np.nan), r"odom\[1, 0\] is nan"),
+        (changing("observations", (2, 1), 7.0), r"observations\[2\] is of landmark 7; .* 0 to 1"),
+        (changing("observations", (2, 0), 0.5), r"observations\[2\] is of pose 0.5"),
+        (changing("observations", (3, 0), -1.0), r"observations\[3\] is of pose -1"),
+    ],
+)
+def test_every_damage_of_a_problem_is_one_line(tmp_path, arrays, damage, said):
+    damage(arrays)
+    with pytest.raises(InputError, match=said) as raised:
+        read_landmark_data(written(tmp_path, arrays))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 broken", None])
+def test_what_is_no_npz_is_refused(tmp_path, content):
+    path = tmp_path / "problem.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"problem\.npz: "):
+        read_landmark_data(path)
+
+
+def test_a_file_cut_off_is_refused(tmp_path, arrays):
+    path = written(tmp_path, arrays)
+    whole = path.read_bytes()
+    for share in (0.2, 0.5, 0.9):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError):
+            read_landmark_data(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An MRCLAM folder with landmarks 6 and 7, robot 2 seen once, and a barcode that nobody has."""
+    place = tmp_path / "mrclam"
+    place.mkdir()
+    (place / "Barcodes.dat").write_text("# subject barcode\n1 5\n2 14\n6 63\n7 81\n")
+    (place / "Landmark_Groundtruth.dat").write_text("6 1.0 2.0 0.001 0.001\n7 2.0 0.5 0.001 0.001\n")
+    (place / "Robot1_Odometry.dat").write_text("".join(f"{10 + 0.1 * k:.1f} 0.5 0.0\n" for k in range(50)))
+    (place / "Robot1_Groundtruth.dat").write_text(
+        "".join(f"{10 + 0.1 * k:.1f} {0.05 * k:.2f} 0.0 0.0\n" for k in range(51))
+    )
+    rows = ["9.0 63 2.0 1.0", "11.0 14 1.0 0.0", "11.5 99 1.0 0.0"]
+    for time in (12.0, 11.0, 13.0, 14.0):  # not in order
+        for code, (x, y) in ((63, (1.0, 2.0)), (81, (2.0, 0.5))):
+            away = np.array([x - 0.5 * (time - 10.0), y])
+            rows.append(f"{time} {code} {np.hypot(*away):.3f} {np.arctan2(away[1], away[0]):.3f}")
+    (place / "Robot1_Measurement.dat").write_text("\n".join(rows))
+    return place
+
+
+def test_other_robots_unknown_barcodes_and_untimely_observations_are_counted(folder):
+    log = read_mrclam(folder, 1)
+    assert (log.of_robots, log.unknown, log.outside) == (1, 1, 1)
+    assert len(log.seen_s) == 8 and np.all(np.diff(log.seen_s) >= 0.0)
+    assert set(log.subjects.tolist()) == {6, 7}
+
+
+def test_an_exact_drive_is_found_exactly(folder):
+    study = study_log(folder, Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt"))
+    assert study.after.accuracy.poses_m < 0.01 and study.after.accuracy.landmarks_m < 0.01
+
+
+def test_without_motion_capture_the_estimate_stands_and_its_accuracy_is_unknown(folder):
+    (folder / "Robot1_Groundtruth.dat").unlink()
+    study = study_log(folder, Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt"))
+    assert np.isnan(study.after.accuracy.poses_m) and study.converged
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "said"),
+    [
+        ("Robot1_Odometry.dat", "1.0 2.0\n", "has 2 numbers a line; it must have 3"),
+        ("Robot1_Odometry.dat", "1.0 2.0 x\n", "is no table of 3 numbers"),
+        ("Robot1_Odometry.dat", "", "is empty"),
+        ("Robot1_Odometry.dat", "# time forward turn\n \n", "is empty"),
+        ("Robot1_Measurement.dat", "1.0 63 nan 0.0\n", "row 1 is not finite"),
+        ("Robot1_Measurement.dat", "11.0 14 1.0 0.0\n", "robot 1 saw no landmark"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_every_damage_of_a_folder_is_one_line(folder, file, text, said):
+    (folder / file).write_text(text)
+    with pytest.raises(InputError, match=said) as raised:
+        read_mrclam(folder, 1)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_robot_that_is_not_there_and_a_folder_that_is_none_are_refused(folder, tmp_path):
+    with pytest.raises(InputError, match="one of those logged there: 1"):
+        read_mrclam(folder, 3)
+    with pytest.raises(InputError, match="is no MRCLAM folder"):
+        read_mrclam(tmp_path, 1)
+
+
+@pytest.mark.parametrize("content", [b"hello", b"\x93NUMPY"])
+def test_a_file_that_is_no_npz_is_said_to_be_none(tmp_path, content):
+    path = tmp_path / "problem.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is no npz file"):
+        read_landmark_data(path)
+
+
+def test_a_log_too_short_to_tell_its_noise_is_refused(folder):
+    (folder / "Robot1_Measurement.dat").write_text("11.0 63 2.06 1.3\n")
+    with pytest.raises(InputError, match="too seldom"):
+        solve_range_log(read_mrclam(folder, 1), None)
+
+
+def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
+    study = study_log(
+        shared_data("landmarks/utias_mrclam6"), Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt")
+    )
+    assert study.before.accuracy.poses_m == pytest.approx(2.06, abs=0.01)
+    assert study.after.accuracy.poses_m <= 0.113
+    facts = {fact.label: fact.value for fact in study.facts}
+    assert facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
+    assert facts["odometry noise"].endswith("fits") and facts["sensor noise"].endswith("fits")
+
+
+def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):
+    log = read_mrclam(shared_data("landmarks/utias_mrclam6"), 1)
+    first = solve_range_log(log, None)
+    monkeypatch.setattr("scanchain.landmarks.ranges.fit._SENSOR", np.square([0.02, 0.2]))
+    second = solve_range_log(log, None)
+    assert second.bearing_sigma_rad == pytest.approx(first.bearing_sigma_rad, rel=0.1)
+    assert second.range_sigma_m == pytest.approx(first.range_sigma_m, rel=0.1)
+    assert second.odometry_noise.turn_rad == pytest.approx(first.odometry_noise.turn_rad, rel=0.1)
+
+
+def test_stated_odometry_noise_that_is_far_too_small_is_told():
+    study = study_log(
+        shared_data("landmarks/utias_mrclam6"),
+        Options(("schur",), 1, 1, OdometryNoise(0.003, 0.001, 0.005, 0.01), "odometry", "levenberg-marquardt"),
+    )
+    assert "off by a factor" in {fact.label: fact.value for fact in study.facts}["odometry noise"]
+
+
+def test_bearings_in_degrees_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    poses, landmarks = rng.uniform(-9.0, 9.0, (20, 2)), rng.uniform(-9.0, 9.0, (6, 2))
+    pairs = np.stack(np.meshgrid(np.arange(20), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    x, y = (landmarks[pairs[:, 1]] - poses[pairs[:, 0]]).T
+    given = {"gt_traj": poses, "gt_landmarks": landmarks, "odom": np.diff(poses, axis=0)}
+    given |= {"sigma_odom": np.eye(2), "sigma_landmark": np.eye(2)}
+    bearings = np.arctan2(y, x)
+    for name, angles in (("radians", bearings), ("degrees", np.degrees(bearings))):
+        np.savez(tmp_path / name, observations=np.column_stack([pairs, angles, np.hypot(x, y)]), **given)
+    assert read_landmark_data(tmp_path / "radians.npz").kind == "bearing-range"
+    with pytest.raises(InputError, match=r"bearings of observations reach 1\d\d.*: degrees\? give radians"):
+        read_landmark_data(tmp_path / "degrees.npz")

@@ -1,0 +1,165 @@
+"""CARMEN logs: the published Intel log, and small ones that hold what it does not."""
+
+import bz2
+import gzip
+from itertools import islice, zip_longest
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser
+from tests.support.scenes import shared_data
+
+
+def save(path, *lines):
+    path.write_text("# CARMEN\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def read(path, **config):
+    log = open_log(path, LogConfig(**config))
+    return log, list(log.scans())
+
+
+def points(ranges, first=-np.pi / 2, step=np.pi / 180):
+    angles = float(np.float32(first)) + float(np.float32(step)) * np.arange(len(ranges))
+    directions = np.column_stack([np.cos(angles), np.sin(angles)]).astype("f4")
+    return directions * np.asarray(ranges, "f4")[:, None]
+
+
+def assert_same(ours, theirs):
+    assert ours.stamp_ns == theirs.stamp_ns and ours.log_time_ns == theirs.log_time_ns
+    assert ours.points.tobytes() == theirs.points.tobytes() and ours.dropped == theirs.dropped
+    assert ours.T_odom_base.tobytes() == theirs.T_odom_base.tobytes()
+
+
+def test_the_published_intel_log_is_the_same_as_its_mcap_to_the_last_bit():
+    text = open_log(shared_data("2d/intel.clf.bz2"))
+    mcap = open_log(shared_data("2d/intel.mcap"))
+    assert text.scan_count == mcap.scan_count == 13_631
+    np.testing.assert_array_equal(text.T_base_lidar, mcap.T_base_lidar)
+    count = 0
+    for ours, theirs in islice(zip_longest(text.scans(), mcap.scans()), 3000):
+        assert_same(ours, theirs)
+        count += 1
+    assert count == 3000
+
+
+@pytest.mark.parametrize("pack", [bytes, bz2.compress, gzip.compress], ids=["plain", "bz2", "gz"])
+def test_a_log_may_be_packed_whatever_its_name(tmp_path, pack):
+    path = tmp_path / "a.txt"
+    path.write_bytes(pack(save(tmp_path / "b.log", *[flaser(k) for k in range(5)]).read_bytes()))
+    log, scans = read(path)
+    assert (log.dimension, log.topic, log.odometry_topic, log.scan_count) == (2, "/scan", "/odom", 5)
+    for k, scan in enumerate(scans):
+        assert scan.stamp_ns == scan.log_time_ns == int((BEGIN_S + 0.25 * k) * 1e9)
+        np.testing.assert_array_equal(scan.points, points(np.linspace(1.0, 5.0, 180).round(2)))
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.02 * k, 0.01 * k), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("beams", "first", "step"),
+    [(180, -90, 1), (181, -90, 1), (360, -90, 0.5), (361, -90, 0.5), (401, -50, 0.25), (91, -90, 2)],
+)
+def test_the_number_of_beams_tells_their_angles(tmp_path, beams, first, step):
+    _, (scan,) = read(save(tmp_path / "a.log", flaser(0, np.full(beams, 2.0))))
+    np.testing.assert_allclose(
+        scan.points, points(np.full(beams, 2.0), np.radians(first), np.radians(step)), atol=1e-5
+    )
+
+
+def test_the_codes_of_a_sick_for_no_return_are_dropped(tmp_path):
+    ranges = np.full(180, 81.82)
+    ranges[:4] = 81.83, 81.9, 81.91, 0.0
+    _, (scan,) = read(save(tmp_path / "a.log", flaser(0, ranges)))
+    assert scan.dropped == 4
+    reach = "PARAM robot_front_laser_max 50.0 nohost 0"
+    _, (scan,) = read(save(tmp_path / "b.log", reach, flaser(0, np.linspace(49.0, 51.0, 180))))
+    assert scan.dropped == 90
+
+
+def test_the_wheels_are_the_raw_odometry_not_the_corrected_pose(tmp_path):
+    line = flaser(0, pose=(50.0, 60.0, 1.0), odometry=(1.0, 2.0, 0.5))
+    _, (scan,) = read(save(tmp_path / "a.log", line))
+    np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(1.0, 2.0, 0.5), atol=1e-12)
+
+
+def test_a_laser_ahead_of_the_robot_is_mounted_there(tmp_path):
+    log, _ = read(save(tmp_path / "a.log", "PARAM robot_frontlaser_offset 0.35 nohost 0", flaser(0)))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.35, 0.0, 0.0), atol=1e-12)
+
+
+def test_a_robotlaser_line_tells_angles_reach_wheels_and_mounting_itself(tmp_path):
+    robot = lie.pose_2d(3.0, 4.0, 1.0)
+    laser = robot @ lie.pose_2d(0.2, 0.1, 0.5)
+    x, y, yaw = laser[0, 2], laser[1, 2], 1.5
+    ranges = [1.0, 2.0, 31.0, 4.0, 30.0]
+    line = robotlaser(0, ranges, (x, y, yaw), (3.0, 4.0, 1.0), remissions=(7, 8))
+    log, (scan,) = read(save(tmp_path / "a.log", line))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.1, 0.5), atol=1e-9)
+    np.testing.assert_allclose(scan.T_odom_base, robot, atol=1e-12)
+    np.testing.assert_allclose(scan.points, points(ranges, -1.0, 0.25)[[0, 1, 3]], atol=1e-6)
+    assert scan.dropped == 2
+
+
+def test_odom_lines_between_scans_join_the_wheels(tmp_path):
+    log, scans = read(save(tmp_path / "a.log", odom(0, 7.0), flaser(1), odom(2, 9.0)))
+    assert log.indexes[0].counts[log.indexes[0].channels[2].key[1]] == 3
+    np.testing.assert_allclose(scans[0].T_odom_base, lie.pose_2d(0.1, 0.02, 0.01), atol=1e-6)
+
+
+def test_the_true_poses_of_a_simulator_are_the_ground_truth(tmp_path):
+    lines = [f"TRUEPOS {k}.5 2.0 0.25 0 0 0 {BEGIN_S + 0.25 * k:.6f} nohost 0" for k in range(3)]
+    log, _ = read(save(tmp_path / "a.log", flaser(0), *lines))
+    truth = log.ground_truth()
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[:, 0, 2], [0.5, 1.5, 2.5])
+
+
+def test_scans_stay_in_the_order_of_the_file_where_stamps_step_back(tmp_path):
+    stamps_s = [BEGIN_S, BEGIN_S + 1.0, BEGIN_S + 0.5, BEGIN_S + 0.25, BEGIN_S + 2.0]
+    lines = [flaser(k, np.full(180, 1.0 + k), stamp_s=stamp) for k, stamp in enumerate(stamps_s)]
+    _, scans = read(save(tmp_path / "a.log", *lines))
+    assert [scan.stamp_ns for scan in scans] == [int(stamp * 1e9) for stamp in stamps_s]
+    assert [round(float(np.linalg.norm(scan.points[0]))) for scan in scans] == [1, 2, 3, 4, 5]
+    logged = [scan.log_time_ns - int(BEGIN_S * 1e9) for scan in scans]
+    assert logged == [0, 1_000_000_000, 1_000_100_000, 1_000_200_000, 2_000_000_000]
+
+
+def test_lines_that_are_malformed_or_of_other_kinds_are_counted(tmp_path):
+    broken = [flaser(1).replace("1.000000", "x", 1), "FLASER 180 1 2 3", flaser(2)[:200], "ODOM a b c", ""]
+    path = save(tmp_path / "a.log", flaser(0), *broken, "SYNC tag 1 2 3", "SYNC tag 1 2 3", flaser(5))
+    log, scans = read(path)
+    assert len(scans) == 2
+    told = " ".join(log.damage)
+    assert "line 3" in told and "malformed" in told
+    assert "2 SYNC" in " ".join(log.notes)
+
+
+def test_a_packed_log_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
+    rng = np.random.default_rng(0)
+    lines = [flaser(k, rng.uniform(1.0, 9.0, 180).round(2)) for k in range(2000)]
+    packed = gzip.compress(save(tmp_path / "a.log", *lines).read_bytes())
+    (tmp_path / "a.log.gz").write_bytes(packed[: len(packed) // 2])
+    log, scans = read(tmp_path / "a.log.gz")
+    assert 500 < len(scans) < 1500 and "does not unpack" in log.damage[0]
+
+
+def test_a_text_that_is_no_carmen_log_says_so(tmp_path):
+    (tmp_path / "a.log").write_text("# a comment\nHELLO world\n")
+    with pytest.raises(InputError, match="without a line of FLASER"):
+        open_log(tmp_path / "a.log")
+    (tmp_path / "b.bz2").write_bytes(b"BZh9 and no more")
+    with pytest.raises(InputError, match=r"b\.bz2"):
+        open_log(tmp_path / "b.bz2")
+
+
+def test_a_part_of_a_log_is_chosen_by_time(tmp_path):
+    path = save(tmp_path / "a.log", *[flaser(k) for k in range(40)])
+    log, scans = read(path, start_s=5.0, end_s=6.0)
+    assert log.scan_count == len(scans) == 5
+    assert scans[0].stamp_ns == int((BEGIN_S + 5.0) * 1e9)

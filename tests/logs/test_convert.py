@@ -1,0 +1,205 @@
+"""Conversion to MCAP: the same scans out of it as out of the source, and what can go wrong."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros1.decoder import DecoderFactory as Ros1Factory
+from mcap_ros2.decoder import DecoderFactory as Ros2Factory
+
+from scanchain.__main__ import main
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+from tests.logs.test_carmen import flaser, odom, save
+from tests.logs.test_folders import kitti_odometry, kitti_raw, xyzi
+from tests.support import recorders
+from tests.support.naive_logs import office, write
+from tests.support.scenes import shared_data
+
+
+def carmen(folder):
+    return save(folder / "a.log", *[line for k in range(600) for line in (odom(k, 1.0), flaser(k))])
+
+
+def clouds(folder):
+    folder = folder / "clouds"
+    folder.mkdir()
+    for cloud in recorders.clouds():
+        xyzi(cloud).tofile(folder / f"{cloud.stamp_ns}.bin")
+    return folder
+
+
+def parts(folder):
+    folder = folder / "parts"
+    folder.mkdir()
+    said = office(30)
+    write(folder / "0.mcap", said[:31])
+    write(folder / "1.mcap", said[31:])
+    return folder
+
+
+SOURCES = {
+    "carmen": carmen,
+    "kitti raw": lambda folder: kitti_raw(folder, recorders.clouds()),
+    "kitti odometry": lambda folder: kitti_odometry(folder, recorders.clouds()),
+    "clouds": clouds,
+    "ros 1 bag": lambda folder: recorders.bag1_of(folder / "a.bag", recorders.Ros(recorders.ROS1).drive()),
+    "ros 2 bag": lambda folder: recorders.bag2_of(folder / "bag", recorders.Ros(recorders.ROS2).sweeps()),
+    "parts": parts,
+}
+
+
+def assert_same_log(ours, theirs):
+    np.testing.assert_array_equal(ours.T_base_lidar, theirs.T_base_lidar)
+    assert (ours.topic, ours.odometry_topic, ours.dimension) == (
+        theirs.topic,
+        theirs.odometry_topic,
+        theirs.dimension,
+    )
+    assert ours.scan_count == theirs.scan_count > 0
+    for one, other in zip(ours.scans(), theirs.scans(), strict=True):
+        assert (one.stamp_ns, one.log_time_ns, one.dropped) == (other.stamp_ns, other.log_time_ns, other.dropped)
+        assert one.points.tobytes() == other.points.tobytes() and one.times_s.tobytes() == other.times_s.tobytes()
+        assert np.array_equal(one.T_odom_base, other.T_odom_base) or one.T_odom_base is other.T_odom_base is None
+    assert ours.damage == theirs.damage == []
+    one, other = ours.ground_truth(), theirs.ground_truth()
+    assert (one is None) == (other is None)
+    if one is not None:
+        np.testing.assert_array_equal(one.poses, other.poses)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_a_converted_log_is_the_same_as_its_source_to_the_last_bit(tmp_path, capfd, source):
+    path = SOURCES[source](tmp_path)
+    assert main(["convert", str(path), str(tmp_path / "out.mcap")]) == 0
+    said = capfd.readouterr().out
+    assert said.startswith(f"{tmp_path / 'out.mcap'}: ")
+    assert_same_log(open_log(tmp_path / "out.mcap"), open_log(path))
+
+
+def test_messages_of_a_bag_stay_as_they_are_and_others_can_decode_them(tmp_path):
+    for store, factory, name in ((recorders.ROS1, Ros1Factory, "ros1"), (recorders.ROS2, Ros2Factory, "ros2")):
+        ros = recorders.Ros(store)
+        bag = recorders.bag1_of(tmp_path / "a.bag", ros.drive()) if ros.is_ros1 else tmp_path / "bag"
+        if not ros.is_ros1:
+            recorders.bag2_of(bag, ros.drive())
+        assert main(["convert", str(bag), str(tmp_path / f"{name}.mcap")]) == 0
+        with (tmp_path / f"{name}.mcap").open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[factory()])
+            assert reader.get_header().profile == name
+            read = list(reader.iter_decoded_messages())
+        assert sorted({channel.topic for _, channel, _, _ in read}) == ["/odom", "/scan", "/tf_static"]
+        told = [ros.serialize(message, kind) for _, kind, _, message in ros.drive()]
+        assert sorted(message.data for _, _, message, _ in read) == sorted(told)
+
+
+@pytest.mark.parametrize("source", ["carmen", "kitti raw", "clouds"])
+def test_what_is_made_of_text_and_files_others_can_decode(tmp_path, source):
+    assert main(["convert", str(SOURCES[source](tmp_path)), str(tmp_path / "out.mcap")]) == 0
+    with (tmp_path / "out.mcap").open("rb") as stream:
+        read = list(make_reader(stream, decoder_factories=[Ros2Factory()]).iter_decoded_messages())
+    lidar = [decoded for schema, _, _, decoded in read if schema.name.startswith("sensor_msgs/msg/")]
+    assert len(lidar) == (600 if source == "carmen" else 3)
+    if source != "carmen":
+        assert [field.name for field in lidar[0].fields] == ["x", "y", "z", "intensity"]
+
+
+def test_the_first_part_of_the_intel_log_converts_to_what_its_mcap_holds(tmp_path):
+    import bz2
+
+    lines = bz2.decompress(shared_data("2d/intel.clf.bz2").read_bytes()).splitlines()[:2500]
+    (tmp_path / "intel.clf").write_bytes(b"\n".join(lines) + b"\n")
+    assert main(["convert", str(tmp_path / "intel.clf"), str(tmp_path / "intel.mcap")]) == 0
+    ours = list(open_log(tmp_path / "intel.mcap").scans())
+    assert len(ours) > 500
+    for one, other in zip(ours, open_log(shared_data("2d/intel.mcap")).scans(), strict=False):
+        assert (one.stamp_ns, one.log_time_ns) == (other.stamp_ns, other.log_time_ns)
+        assert one.points.tobytes() == other.points.tobytes()
+        assert one.T_odom_base.tobytes() == other.T_odom_base.tobytes()
+
+
+def test_a_rate_gives_stamps_to_files_that_are_only_numbered(tmp_path, capfd):
+    (tmp_path / "scans").mkdir()
+    for k, cloud in enumerate(recorders.clouds()):
+        xyzi(cloud).tofile(tmp_path / "scans" / f"{k}.bin")
+    words = ["convert", str(tmp_path / "scans"), str(tmp_path / "out.mcap")]
+    assert main(words) == 2 and "--log.rate_hz 10" in capfd.readouterr().err
+    assert main([*words, "--rate", "-1"]) == 2 and "--rate: log.rate_hz is -1" in capfd.readouterr().err
+    assert main([*words, "--log.rate_hz", "4", "--rate", "4"]) == 2
+    assert "--rate and --log.rate_hz both set" in capfd.readouterr().err
+    assert not (tmp_path / "out.mcap").exists()
+    assert main([*words, "--log.rate_hz", "4", "--json"]) == 0
+    said = json.loads(capfd.readouterr().out)
+    assert said["messages"] == {"/points": 3} and said["damage"] == []
+    direct = open_log(tmp_path / "scans", LogConfig(rate_hz=4.0))
+    assert_same_log(open_log(tmp_path / "out.mcap"), direct)
+
+
+def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd):
+    said = [*office(20), *(replace(each, topic="/rear") for each in office(20) if each.topic == "/scan")]
+    source = write(tmp_path / "in.mcap", sorted(said, key=lambda each: each.log_ns))
+    keys = {"topic": "/rear", "start_s": 0.5, "end_s": 1.5, "every": 3}
+    flags = [f"--log.{key}={value}" for key, value in keys.items()]
+    assert main(["convert", str(source), str(tmp_path / "out.mcap"), *flags]) == 0
+    assert "/scan" not in capfd.readouterr().out
+    assert_same_log(open_log(tmp_path / "out.mcap"), open_log(source, LogConfig(**keys)))
+
+
+def test_a_rate_for_a_log_with_stamps_is_said_to_have_no_effect(tmp_path, capfd):
+    assert main(["convert", str(carmen(tmp_path)), str(tmp_path / "a.mcap"), "--rate", "5"]) == 0
+    assert "note: log.rate_hz 5 has no effect: the log has its own stamps" in capfd.readouterr().err
+
+
+def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
+    words = ["convert", str(tmp_path), str(tmp_path / "out.mcap"), "--log.min_range_m", "1"]
+    assert main(words) == 2
+    assert (
+        "--log.min_range_m has no meaning for convert; its keys are log.format, log.rate_hz"
+        in capfd.readouterr().err
+    )
+
+
+def test_an_mcap_file_is_cut_by_the_short_flags(tmp_path, capfd):
+    source, cut = write(tmp_path / "in.mcap", office(40)), tmp_path / "out.mcap"
+    assert main(["convert", str(source), str(cut), "--start", "1", "--end", "2", "--every", "2"]) == 0
+    chosen = open_log(source, LogConfig(start_s=1.0, end_s=2.0, every=2)).scans()
+    assert [scan.stamp_ns for scan in open_log(cut).scans()] == [scan.stamp_ns for scan in chosen]
+    before, _ = cut.read_bytes(), capfd.readouterr()
+    assert main(["convert", str(source), str(cut), "--start", "99", "--force"]) == 2
+    assert "no message lies after --start 99 s; the log is " in capfd.readouterr().err
+    assert cut.read_bytes() == before
+
+
+def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capfd):
+    folder = clouds(tmp_path)
+    (folder / "1700000000500000000.bin").write_bytes(b"xyz")
+    assert main(["convert", str(folder), str(tmp_path / "out.mcap")]) == 0
+    said = capfd.readouterr()
+    assert "3 /points" in said.out and "warning: " in said.err and "500000000.bin" in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["in.mcap", "out.mcap"], "is MCAP already"),
+        (["a.log", "out.bag"], "does not end in .mcap"),
+        (["absent", "out.mcap"], "no such file"),
+        (["empty", "out.mcap"], "is a folder of no log"),
+        (["a.log", "taken.mcap"], "exists"),
+        (["bad.log", "out.mcap"], "no message that could be read"),
+    ],
+)
+def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(tmp_path, capfd, monkeypatch, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "in.mcap", office(2))
+    save(tmp_path / "a.log", flaser(0))
+    save(tmp_path / "bad.log", f"FLASER 180 1 2 3 {1e9:.6f} nohost 0")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "taken.mcap").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["convert", *words]) == 2
+    said = capfd.readouterr()
+    assert complaint in said.err and said.err.count("\n") == 1 and said.out == ""
+    assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "taken.mcap").read_text() == "mine"

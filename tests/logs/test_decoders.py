@@ -1,0 +1,386 @@
+"""LaserScan and PointCloud2 in every form that drivers give them."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+from scanchain.simulation import simulate
+from tests.support.naive_logs import (
+    SECOND,
+    STAMP_NS,
+    Cdr,
+    Said,
+    cloud_said,
+    laser_points,
+    laser_scan,
+    odometry,
+    odometry_said,
+    office,
+    point_cloud,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
+
+
+def only_scan(folder, said, **config):
+    """The one scan of a log that holds one message."""
+    (scan,) = open_log([write(folder / "one.mcap", [said])], LogConfig(**config)).scans()
+    return scan
+
+
+def laser(folder, ranges, *, config=None, **options):
+    data = laser_scan(STAMP_NS, np.asarray(ranges, np.float64), **options)
+    return only_scan(folder, scan_said(STAMP_NS, data), **(config or {}))
+
+
+def cloud(folder, rows, *, config=None, **options):
+    return only_scan(folder, cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows, **options)), **(config or {}))
+
+
+def distances(scan):
+    return np.linalg.norm(scan.points.astype(float), axis=1)
+
+
+# LaserScan
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("frame", ["", "l", "la", "las", "lase"])
+def test_a_laser_scan_is_read_in_either_byte_order_and_any_alignment(tmp_path, order, frame):
+    ranges = np.linspace(1.0, 5.0, 50)
+    scan = laser(tmp_path, ranges, order=order, frame=frame, beam_s=1e-4)
+    np.testing.assert_allclose(scan.points, laser_points(ranges), atol=2e-6)
+    np.testing.assert_allclose(scan.times_s, 1e-4 * np.arange(50), rtol=1e-5)
+    assert scan.stamp_ns == STAMP_NS and scan.points.dtype == scan.times_s.dtype == np.float32
+
+
+def test_beams_without_return_are_dropped_with_their_times_and_counted(tmp_path):
+    ranges = [np.inf, 1.0, np.nan, 0.0, 2.0, 0.05, 30.0, 35.0, -1.0, 3.0, -np.inf]
+    scan = laser(tmp_path, ranges, beam_s=0.25)
+    assert distances(scan) == pytest.approx([1.0, 2.0, 3.0])
+    assert scan.times_s == pytest.approx([0.25, 1.0, 2.25])
+    assert scan.dropped == 8
+
+
+def test_a_scanner_that_leaves_its_range_limits_at_zero_loses_nothing(tmp_path):
+    scan = laser(tmp_path, [1.0, 50.0, 0.0, np.inf], low=0.0, high=0.0)
+    assert distances(scan) == pytest.approx([1.0, 50.0]) and scan.dropped == 2
+
+
+@pytest.mark.parametrize("high", [np.inf, np.nan, -1.0])
+def test_a_nonsense_range_max_is_no_limit(tmp_path, high):
+    assert distances(laser(tmp_path, [1.0, 70.0, np.inf], high=high)) == pytest.approx([1.0, 70.0])
+
+
+def test_a_nonsense_range_min_is_no_limit(tmp_path):
+    assert distances(laser(tmp_path, [0.5, 0.0, 2.0], low=np.nan)) == pytest.approx([0.5, 2.0])
+
+
+def test_the_sick_value_for_no_return_is_dropped(tmp_path):
+    assert distances(laser(tmp_path, [1.0, 81.83, 81.91], high=81.83)) == pytest.approx([1.0])
+
+
+def test_a_lidar_that_turns_clockwise_has_a_negative_step(tmp_path):
+    ranges = np.array([1.0, 2.0, 3.0])
+    scan = laser(tmp_path, ranges, first=1.5, step=-0.5)
+    np.testing.assert_allclose(scan.points, laser_points(ranges, 1.5, -0.5), atol=1e-6)
+
+
+def test_a_channel_may_change_its_geometry_in_every_scan(tmp_path):
+    said, expected = [], []
+    for k in range(200):
+        ranges = np.full(20 + k % 3, 2.0)
+        first, step = -1.0 + 0.1 * (k % 5), 0.01 * (1 + k % 7)
+        stamp_ns = STAMP_NS + k * SECOND
+        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges, first=first, step=step)))
+        expected.append(laser_points(ranges, first, step))
+    log = open_log([write(tmp_path / "a.mcap", said, chunk_size=300)], LogConfig())
+    for scan, points in zip(log.scans(), expected, strict=True):
+        np.testing.assert_allclose(scan.points, points, atol=2e-6)
+
+
+def test_scans_do_not_share_memory_that_someone_could_write_into(tmp_path):
+    log = open_log([write(tmp_path / "a.mcap", office(2))], LogConfig())
+    first, second = log.scans()
+    assert not np.shares_memory(first.points, second.points)
+
+
+# PointCloud2
+
+XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4")]
+
+
+def random_rows(dtype, count=24, seed=0):
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, np.dtype(dtype))
+    for name in rows.dtype.names:
+        values = rng.uniform(1.0, 100.0, count)
+        rows[name] = values if rows.dtype[name].kind == "f" else np.rint(values)
+    return rows
+
+
+def xyz(rows):
+    return np.column_stack([rows[name] for name in "xyz"]).astype(np.float32)
+
+
+@pytest.mark.parametrize("code", ["f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4"])
+@pytest.mark.parametrize("big", [True, False])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_coordinates_of_any_number_type_and_byte_order_are_read(tmp_path, code, big, order):
+    kind = (">" if big else "<") + code
+    rows = random_rows([("x", kind), ("ring", "<u2"), ("y", kind), ("z", kind)])
+    if code.endswith("1"):
+        rows = random_rows([("x", kind), ("ring", ">u2" if big else "<u2"), ("y", kind), ("z", kind)])
+    elif big:
+        rows = random_rows([("x", kind), ("ring", ">u2"), ("y", kind), ("z", kind)])
+    scan = cloud(tmp_path, rows, order=order)
+    assert np.array_equal(scan.points, xyz(rows))
+    assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+
+
+@pytest.mark.parametrize("padding", [0, 1, 7, 16, 100])
+@pytest.mark.parametrize("height", [1, 4])
+def test_padding_behind_rows_is_no_point(tmp_path, padding, height):
+    rows = random_rows(XYZ)
+    assert np.array_equal(cloud(tmp_path, rows, height=height, padding=padding).points, xyz(rows))
+
+
+def test_a_last_row_without_its_padding_is_complete(tmp_path):
+    rows = random_rows(XYZ)
+    data = b"".join(part.tobytes() + b"\xff" * 5 for part in rows.reshape(4, 6))[:-5]
+    assert np.array_equal(cloud(tmp_path, rows, height=4, padding=5, data=data).points, xyz(rows))
+
+
+def test_a_row_step_of_zero_is_taken_from_the_points(tmp_path):
+    rows = random_rows(XYZ)
+    assert np.array_equal(cloud(tmp_path, rows, row_step=0).points, xyz(rows))
+
+
+def test_fields_may_lie_anywhere_and_overlap_nothing_else(tmp_path):
+    dtype = np.dtype({
+        "names": ["intensity", "z", "x", "y"],
+        "formats": ["f4", "f4", "f4", "f8"],
+        "offsets": [3, 7, 21, 11],
+        "itemsize": 48,
+    })  # fmt: skip
+    rows = random_rows(dtype)
+    assert np.array_equal(cloud(tmp_path, rows).points, xyz(rows))
+
+
+def test_names_of_any_length_leave_the_data_aligned(tmp_path):
+    for extra in ["i", "in", "int", "inte", "inten"]:
+        rows = random_rows([*XYZ, (extra, "u1")])
+        assert np.array_equal(cloud(tmp_path, rows, frame=extra).points, xyz(rows))
+
+
+def test_a_channel_may_change_its_layout(tmp_path):
+    said, expected = [], []
+    for k in range(60):
+        rows = random_rows(XYZ if k % 2 else [("ring", "u2"), *XYZ, ("time", "f4")], count=5 + k, seed=k)
+        said.append(cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)))
+        expected.append(rows)
+    log = open_log([write(tmp_path / "a.mcap", said)], LogConfig())
+    for k, (scan, rows) in enumerate(zip(log.scans(), expected, strict=True)):
+        assert np.array_equal(scan.points, xyz(rows))
+        assert len(scan.times_s) == (0 if k % 2 else len(rows))
+
+
+def test_undefined_and_zero_points_are_dropped_with_their_times_and_counted(tmp_path):
+    rows = random_rows([*XYZ, ("time", "f4")], count=8)
+    rows["time"] = np.arange(8) * 0.01
+    rows["x"][0], rows["y"][2], rows["z"][4] = np.nan, np.inf, -np.inf
+    for name in "xyz":
+        rows[name][6] = 0.0
+    scan = cloud(tmp_path, rows)
+    kept = [1, 3, 5, 7]
+    assert np.array_equal(scan.points, xyz(rows)[kept]) and scan.dropped == 4
+    np.testing.assert_allclose(scan.times_s, rows["time"][kept], atol=1e-7)
+
+
+def test_a_point_on_an_axis_is_no_zero_point(tmp_path):
+    rows = np.array([(0, 0, 1), (0, 2, 0), (1e-3, 0, 0)], dtype=XYZ)
+    assert len(cloud(tmp_path, rows).points) == 3
+
+
+def test_coordinates_beyond_float32_are_dropped_without_a_warning(tmp_path):
+    rows = np.zeros(3, [("x", "f8"), ("y", "f8"), ("z", "f8")])
+    rows["x"] = [1.0, 1e300, 1e25]
+    scan = cloud(tmp_path, rows)
+    assert scan.points[0, 0] == 1.0 and np.isfinite(scan.points).all() and scan.dropped >= 1
+
+
+def test_limits_of_the_configuration_filter_clouds(tmp_path):
+    rows = np.array([(1, 0, 0), (0, 5, 0), (0, 0, 9)], dtype=XYZ)
+    scan = cloud(tmp_path, rows, config={"min_range_m": 2.0, "max_range_m": 8.0})
+    assert np.array_equal(scan.points, [[0, 5, 0]]) and scan.dropped == 2
+
+
+# times of points
+
+
+def times_of(folder, name, values, code, stamp_ns=STAMP_NS):
+    rows = random_rows([*XYZ, (name, code)], count=len(values))
+    rows[name] = values
+    scan = only_scan(folder, cloud_said(stamp_ns, point_cloud(stamp_ns, rows)))
+    assert scan.times_s.dtype == np.float32
+    return scan.times_s
+
+
+RISING_S = np.linspace(0.0, 0.1, 11)
+
+
+@pytest.mark.parametrize("name", ["t", "time", "timestamp", "offset_time", "time_offset"])
+@pytest.mark.parametrize("code", ["<u4", ">u4", "<i4", "<f4", "<f8"])
+def test_relative_times_are_nanoseconds_if_whole_and_seconds_if_not(tmp_path, name, code):
+    if code[0] == ">":
+        dtype = [("x", ">f4"), ("y", ">f4"), ("z", ">f4"), (name, code)]
+        rows = np.ones(len(RISING_S), dtype)
+        rows[name] = RISING_S * 1e9
+        scan = cloud(tmp_path, rows)
+        return np.testing.assert_allclose(scan.times_s, RISING_S, atol=1e-7)
+    values = RISING_S if "f" in code else np.rint(RISING_S * 1e9)
+    return np.testing.assert_allclose(times_of(tmp_path, name, values, code), RISING_S, atol=1e-7)
+
+
+def test_absolute_seconds_are_made_relative_to_the_stamp(tmp_path):
+    values = STAMP_NS * 1e-9 + RISING_S
+    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
+
+
+def test_absolute_nanoseconds_in_a_double_are_made_relative_to_the_stamp(tmp_path):
+    values = STAMP_NS + RISING_S * 1e9
+    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
+
+
+@pytest.mark.parametrize("off_s", [37.0, -37.0, 1800.0])
+def test_absolute_times_of_a_clock_that_is_off_count_from_the_first_point(tmp_path, off_s):
+    values = STAMP_NS * 1e-9 + off_s + RISING_S
+    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
+
+
+def test_absolute_times_that_a_float32_cannot_tell_apart_say_nothing(tmp_path):
+    values = np.float32(STAMP_NS * 1e-9) + np.zeros(len(RISING_S), np.float32)
+    assert len(times_of(tmp_path, "timestamp", values, "<f4")) == 0
+
+
+def test_times_before_the_stamp_are_negative(tmp_path):
+    np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S - 0.1, "<f4"), RISING_S - 0.1, atol=1e-7)
+    values = STAMP_NS * 1e-9 + RISING_S - 0.1
+    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S - 0.1, atol=1e-6)
+
+
+def test_nanoseconds_in_a_float_are_recognized(tmp_path):
+    np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e9, "<f8"), RISING_S, atol=1e-7)
+    np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S * 1e9, "<f4"), RISING_S, atol=1e-7)
+
+
+def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):
+    rows = random_rows([*XYZ, ("time", "f8")], count=4)
+    rows["time"] = [np.nan, 0.01, 0.02, 0.03]
+    rows["x"][0] = np.nan
+    np.testing.assert_allclose(cloud(tmp_path, rows).times_s, [0.01, 0.02, 0.03], atol=1e-7)
+
+
+def test_times_that_are_all_the_same_say_nothing_and_harm_nothing(tmp_path):
+    assert len(times_of(tmp_path, "t", np.zeros(5), "<u4")) == 0
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_the_unit_of_times_can_be_set(tmp_path, unit, per_second):
+    rows = random_rows([*XYZ, ("t", "f8")], count=3)
+    rows["t"] = np.array([0.0, 0.002, 0.005]) * per_second
+    scan = cloud(tmp_path, rows, config={"point_times": unit})
+    np.testing.assert_allclose(scan.times_s, [0.0, 0.002, 0.005], atol=1e-7)
+
+
+def test_times_can_be_left_alone(tmp_path):
+    rows = random_rows([*XYZ, ("t", "f8")], count=3)
+    rows["t"] = [0.0, 0.05, 0.1]
+    assert len(cloud(tmp_path, rows, config={"point_times": "none"}).times_s) == 0
+
+
+@pytest.mark.parametrize(
+    ("sense", "start_rad", "expected_s"),
+    [
+        ("clockwise", np.pi, [0.1, 0.05, 0.15, 0.0]),
+        ("counterclockwise", np.pi, [0.1, 0.15, 0.05, 0.0]),
+        ("clockwise", 0.5 * np.pi, [0.05, 0.0, 0.1, 0.15]),
+    ],
+)
+def test_a_lidar_without_times_can_be_timed_by_its_azimuth(tmp_path, sense, start_rad, expected_s):
+    rows = np.array([(2, 0, 0), (0, 2, 1), (0, -2, 0), (-2, 0, 0)], dtype=XYZ)
+    config = {"point_times": sense, "revolution_s": 0.2, "revolution_start_rad": start_rad}
+    np.testing.assert_allclose(cloud(tmp_path, rows, config=config).times_s, expected_s, atol=1e-6)
+
+
+def test_the_azimuth_of_a_spinning_lidar_tells_its_times(tmp_path):
+    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
+    timed = next(iter(open_log(tmp_path / "town.mcap").scans()))
+    config = LogConfig(point_times="clockwise")
+    guessed = next(iter(open_log(tmp_path / "town.mcap", config).scans()))
+    assert np.median(np.abs(timed.times_s - guessed.times_s)) < 1e-3
+
+
+def test_what_was_assumed_of_the_times_is_told(tmp_path):
+    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
+    log = open_log(tmp_path / "town.mcap")
+    assert list(log.scans())
+    assert [note for note in log.notes if "field t (uint32) taken as ns after the stamp" in note]
+    log = open_log(tmp_path / "town.mcap", LogConfig(point_times="none"))
+    assert list(log.scans())
+    assert [note for note in log.notes if note.startswith("no point times")]
+
+
+# poses
+
+
+@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped"])
+def test_stamped_poses_lead_where_they_are_asked_for(tmp_path, kind):
+    """Of the robot's base: the static transform from base_link says where the lidar is."""
+    pose = bytes(Cdr("<").header(STAMP_NS, "map").pose(3.0, 4.0, 0.5, 6.0).put("d", *[0.0] * 36))
+    said = [
+        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1))),
+        Said("/gps", f"geometry_msgs/msg/{kind}", STAMP_NS, pose),
+        cloud_said(STAMP_NS, point_cloud(STAMP_NS, random_rows(XYZ))),
+    ]
+    path = write(tmp_path / "a.mcap", said)
+    assert open_log(path).odometry_topic == ""
+    log = open_log(path, LogConfig(odometry_topic="/gps", ground_truth_topic="/gps"))
+    (scan,) = log.scans()
+    np.testing.assert_allclose(scan.T_odom_base[:3, 3], [3.0, 4.0, 6.0])
+    np.testing.assert_allclose(log.ground_truth().poses[0], scan.T_odom_base)
+    assert log.T_base_lidar[0, 3] == 1.0 and log.T_base_lidar[1, 3] == 2.0
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_poses_are_read_in_either_byte_order(tmp_path, order):
+    rows = random_rows(XYZ)
+    said = [
+        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1), order=order)),
+        odometry_said(
+            STAMP_NS, odometry(STAMP_NS, 3.0, 4.0, 0.5, z=6.0, order=order, frame="o", child="base_link")
+        ),
+        cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
+    ]
+    log = open_log([write(tmp_path / "a.mcap", said)], LogConfig())
+    (scan,) = log.scans()
+    quat_xyzw = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
+    np.testing.assert_allclose(scan.T_odom_base[:3, :3], lie.from_quaternion(quat_xyzw), atol=1e-12)
+    np.testing.assert_allclose(scan.T_odom_base[:3, 3], [3.0, 4.0, 6.0])
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
+    assert lie.rotation_angle(log.T_base_lidar) > 0.3
+
+
+def test_a_quaternion_that_is_not_quite_unit_is_normalized(tmp_path):
+    data = bytearray(odometry(STAMP_NS, 1.0, 2.0, 0.5))
+    rows = random_rows(XYZ)
+    quat = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
+    at = bytes(data).index(np.array(quat[2:]).astype("<f8").tobytes()) - 16
+    data[at : at + 32] = (1.01 * quat).astype("<f8").tobytes()
+    said = [odometry_said(STAMP_NS, bytes(data)), cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows))]
+    (scan,) = open_log([write(tmp_path / "a.mcap", said)], LogConfig()).scans()
+    np.testing.assert_allclose(scan.T_odom_base[:3, :3] @ scan.T_odom_base[:3, :3].T, np.eye(3), atol=1e-12)

@@ -1,0 +1,491 @@
+"""The doctor: each defect of a log is found, measured and mended by the flag it names."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scanchain.__main__ import main
+from scanchain.config import Config, LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.doctor.doctor import examine
+from scanchain.simulation import simulate
+from tests.support.naive_logs import (
+    SECOND,
+    STAMP_NS,
+    Said,
+    cloud_said,
+    laser_scan,
+    odometry,
+    odometry_said,
+    point_cloud,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
+from tests.support.scenes import configured, shared_data
+
+STEP_NS = SECOND // 10
+CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]
+CHECKS += ["ranges", "surfaces", "duplicates", "rest", "mounting", "sensors"]
+
+
+def diagnose(*paths, **config):
+    found = examine(list(paths), lambda _: Config(), LogConfig(**config))
+    checks = [finding.check for finding in found.findings]
+    assert len(set(checks)) == len(checks)
+    return {finding.check: finding for finding in found.findings}
+
+
+def room(k):
+    """Ranges in a room that the robot crosses at 0.1 m a scan."""
+    angles = -1.0 + 0.02 * np.arange(100)
+    return np.minimum((8.0 - 0.1 * k) / np.maximum(np.cos(angles), 0.1), 3.0 / np.abs(np.sin(angles) + 1e-9))
+
+
+def drive(count=40, *, stamp=lambda k: 0, log=lambda k: 0, ranges=room, wheels=False, mounted=True, **options):
+    """Scans every 100 ms; ``stamp`` and ``log`` shift the times of scan k by nanoseconds."""
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))] if mounted else []
+    for k in range(count):
+        time_ns = STAMP_NS + k * STEP_NS
+        if wheels:
+            said.append(odometry_said(time_ns, odometry(time_ns, 0.1 * k, 0.0)))
+        data = laser_scan(time_ns + stamp(k), ranges(k), first=-1.0, step=0.02, high=0.0, **options)
+        said.append(scan_said(time_ns + log(k), data))
+    return said
+
+
+def saved(folder, said, **options):
+    return write(folder / "a.mcap", said, **options)
+
+
+def test_a_healthy_log_is_all_well(tmp_path):
+    found = diagnose(saved(tmp_path, drive(wheels=True)))
+    assert sorted(found) == sorted(CHECKS)
+    assert {finding.severity for finding in found.values()} == {"ok"}
+    assert "10 Hz" in found["rate"].found and "40 readings, 0 of 40" in found["wheels"].found
+    assert "0.200, 0.100" in found["mounting"].found
+
+
+def covered(*numbers):
+    """The room, but for scans in which all returns are of the robot itself."""
+    return lambda k: np.full(100, 0.2) if k in numbers else room(k)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (0, 20), (38, 39)])
+def test_scans_without_a_point_in_range_are_left_out_wherever_they_are(call, tmp_path, numbers):
+    path = saved(tmp_path, drive(ranges=covered(*numbers)))
+    found = diagnose(path)["damage"]
+    assert (
+        found.severity == "warning"
+        and "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
+    )
+    flags = ["--preprocess.min_range_m", "0.5", "--rerun", "off"]
+    code, output, errors = call("run", path, "--out", tmp_path / "a", *flags)
+    assert code == 0 and "scans          38 over" in output
+    assert (
+        f"warning: 2 of 40 scans of /scan were left out (the first: {path}: scan {numbers[0]} of /scan" in errors
+    )
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+
+
+@pytest.mark.parametrize("percent", ["10", "100"])
+def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path, percent):
+    path = saved(tmp_path, drive(ranges=covered(*range(40))))
+    found = diagnose(path)
+    assert (found["damage"].severity, found["damage"].remedy) == ("problem", "")
+    assert found["ranges"].remedy == "--preprocess.min_range_m 0.18"
+    flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", percent]
+    code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off", *flags)
+    assert code == 2 and errors.count("\n") == 1 and not (tmp_path / "a").exists()
+    assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
+    assert "lie at 0.2 to 0.2 m" in errors
+
+
+def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path):
+    slow = {"stamp": lambda k: 9 * k * STEP_NS, "log": lambda k: 9 * k * STEP_NS}
+    planar = diagnose(saved(tmp_path, drive(**slow)))["rate"]
+    assert planar.severity == "note" and planar.remedy == ""  # the plane is searched by correlation
+    said = [cloud_said(STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, sweep(k))) for k in range(5)]
+    path = saved(tmp_path, said)
+    finding = diagnose(path)["rate"]
+    assert finding.remedy == "--matching.wide_max_distance_m 8"
+    wide = configured(3, {"matching.wide_max_distance_m": 8.0})
+    findings = examine([path], lambda _: wide, LogConfig()).findings
+    assert next(each for each in findings if each.check == "rate").remedy == ""
+
+
+def test_the_scans_looked_at_are_those_that_a_run_would_take(tmp_path):
+    simulate("town", tmp_path / "town.mcap", duration_s=3.0, sensor="vlp-16")
+    found = diagnose(tmp_path / "town.mcap", every=4)["rate"]
+    assert found.found.startswith("8 scans, 2.5 Hz")
+
+
+def test_a_gap_is_found_where_it_is(tmp_path):
+    def hole(k):
+        return 2 * SECOND if k >= 20 else 0
+
+    finding = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)))["gaps"]
+    assert (
+        finding.severity == "warning"
+        and finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
+    )
+    assert finding.remedy == "--end 1.9" and "at constant velocity" in finding.effect
+    assert "--start 4, apart" in finding.effect
+    on_wheels = diagnose(saved(tmp_path, drive(stamp=hole, log=hole, wheels=True)))["gaps"]
+    assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
+    later = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)), start_s=1.0)["gaps"]
+    assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
+
+
+def test_missing_scans_are_counted_and_are_no_jitter(tmp_path):
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0.0, 0.0002, 100) * SECOND
+    missing = {20, 41, 42, 70, 90, 91, 92}
+    said = drive(100, stamp=lambda k: int(shifts[k]))
+    found = diagnose(saved(tmp_path, [each for k, each in enumerate(said, start=-1) if k not in missing]))
+    assert found["gaps"].severity == "note" and found["gaps"].found.endswith("; 7 scans missing in all")
+    assert found["jitter"].severity == "ok"
+    assert 0.2 < float(found["jitter"].found.split(" ms")[0].split()[-1]) < 0.4
+    single = diagnose(saved(tmp_path, [each for k, each in enumerate(drive(40), start=-1) if k != 20]))["gaps"]
+    assert single.severity == "note" and single.found == "none longer than 2.5 periods; 1 scan missing in all"
+
+
+def test_returns_below_range_min_are_told(tmp_path):
+    def near(k):
+        values = room(k)
+        values[:38] = 0.2
+        return values
+
+    finding = diagnose(saved(tmp_path, drive(ranges=near, low=0.45)))["returns"]
+    assert finding.severity == "note" and "38 % below range_min (0.45 m)" in finding.found
+    assert "below range_min is not used" in finding.effect
+    raised = diagnose(saved(tmp_path, sweeps()), min_range_m=3.0)["returns"]
+    assert "below range_min (3 m)" in raised.found
+
+
+def test_jitter_is_measured_against_the_period(tmp_path):
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0.0, 0.02, 400) * SECOND
+    finding = diagnose(saved(tmp_path, drive(400, stamp=lambda k: int(shifts[k]))))["jitter"]
+    assert finding.severity == "note" and finding.remedy == ""
+    told = float(finding.found.split("(")[1].split(" %")[0])
+    assert told == pytest.approx(100 * 0.02 * np.sqrt(2) / 0.1, rel=0.15)
+
+
+def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
+    assert finding["stamp order"].severity == "warning"
+    assert finding["stamp order"].found == "2 steps back in the header stamps, 1 repeated"
+
+
+def test_stamps_that_were_never_set_are_a_problem(tmp_path):
+    found = diagnose(saved(tmp_path, drive(stamp=lambda k: -STAMP_NS - k * STEP_NS)))
+    assert found["stamp order"].severity == "problem" and found["clock"].severity == "warning"
+    assert "10 Hz" in found["rate"].found  # by log time
+
+
+def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
+    found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
+    assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
+    assert "40 of 40 scans without one" in found["wheels"].found
+    assert found["wheels"].remedy == found["clock"].remedy == ""  # without a reading nothing is taken from them
+
+
+def test_scans_that_were_logged_late_are_noted(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(log=lambda k: 3 * STEP_NS if k == 30 else 0)))["clock"]
+    assert finding.severity == "note" and "from 0 to 0.3 s" in finding.found
+
+
+def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_path):
+    def ranges(k):
+        values = room(k)
+        values[::7] = 29.99
+        return values
+
+    path = saved(tmp_path, drive(ranges=ranges))
+    finding = diagnose(path)["no return"]
+    assert finding.severity == "warning" and "15 % of the beams tell exactly 29.99 m" in finding.found
+    flag, value = finding.remedy.split()
+    assert flag == "--log.max_range_m" and 29.98 < float(value) < np.float32(29.99)
+    assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"
+
+
+def test_nan_and_zero_shares_are_measured(tmp_path):
+    def ranges(k):
+        values = room(k)
+        values[:30], values[30:80] = np.nan, 0.0
+        return values
+
+    finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
+    assert finding.found == "30 % NaN or infinite, 50 % zero, 20 valid a scan (median)"
+    assert finding.severity == "warning" and "40 scans with fewer than 50 returns" in finding.effect
+
+
+def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
+    said = drive()
+    said[5].data = said[5].data[:50]
+    said[9] = scan_said(said[9].log_ns, laser_scan(said[9].log_ns, np.full(100, np.nan)))
+    path = saved(tmp_path, said)
+    finding = diagnose(path, max_bad_scans_percent=2.0)["damage"]
+    assert finding.severity == "problem" and finding.remedy == "--log.max_bad_scans_percent 5"
+    assert "1 malformed scan (" in finding.found and "1 scan without a valid point" in finding.found
+    for percent in (5.0, LogConfig().max_bad_scans_percent):
+        finding = diagnose(path, max_bad_scans_percent=percent)["damage"]
+        assert finding.severity == "warning" and "left out" in finding.effect
+
+
+def test_a_log_that_was_cut_off_is_told(tmp_path):
+    path = saved(tmp_path, drive())
+    path.write_bytes(path.read_bytes()[:-1500])
+    finding = diagnose(path)["damage"]
+    assert finding.severity == "warning" and "cut off" in finding.found
+
+
+def test_a_view_that_leaves_a_motion_open_is_told_with_it(tmp_path):
+    angles = np.abs(np.sin(-1.0 + 0.02 * np.arange(100))) + 1e-9
+    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan))
+    finding = diagnose(saved(tmp_path, along_walls))["surfaces"]
+    assert finding.severity == "warning" and "in 10 of 10 scans looked at" in finding.found
+    assert "hardly determine motion along x" in finding.found and "wheel odometry" in finding.effect
+    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan), wheels=True)
+    assert "wheel" not in diagnose(saved(tmp_path, along_walls))["surfaces"].effect
+
+
+def test_clouds_of_one_plane_with_noise_leave_motions_open(tmp_path):
+    rng = np.random.default_rng(0)
+    said = []
+    for k in range(5):
+        rows = np.zeros(2000, [(axis, "<f4") for axis in "xyz"])
+        rows["x"], rows["y"] = rng.uniform(-20.0, 20.0, (2, 2000))
+        rows["z"] = rng.normal(-1.0, 0.01, 2000)
+        time_ns = STAMP_NS + k * STEP_NS
+        said.append(cloud_said(time_ns, point_cloud(time_ns, rows)))
+    finding = diagnose(saved(tmp_path, said))["surfaces"]
+    assert finding.severity == "warning" and "in 5 of 5 scans" in finding.found
+
+
+@pytest.mark.parametrize(
+    ("name", "motion"),
+    [("corridor", "motion along x"), ("field", "rotation about z"), ("town", ""), ("highway", "")],
+)
+def test_worlds_that_leave_a_motion_open_are_told_from_those_that_do_not(tmp_path, name, motion):
+    simulate(name, tmp_path / "a.mcap", duration_s=20.0, sensor="vlp-16")
+    finding = diagnose(tmp_path / "a.mcap")["surfaces"]
+    assert (finding.severity == "ok") == (not motion) and motion in finding.found
+
+
+def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(k // 2))))["duplicates"]
+    assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
+
+
+def test_a_rest_at_the_start_is_measured_and_may_be_skipped(tmp_path):
+    rng = np.random.default_rng(0)
+
+    def ranges(k):
+        return room(max(0, k - 80)) + rng.normal(0.0, 0.002, 100)
+
+    finding = diagnose(saved(tmp_path, drive(120, ranges=ranges)))["rest"]
+    assert finding.severity == "note" and finding.remedy in ("--start 7", "--start 8")
+    assert "of 11.9 s" in finding.found
+
+
+def test_wheels_that_move_tell_a_corridor_from_a_rest(tmp_path):
+    still = {"ranges": lambda k: room(0) + 1e-4 * k}
+    assert diagnose(saved(tmp_path, drive(**still)))["rest"].severity == "warning"
+    found = diagnose(saved(tmp_path, drive(wheels=True, **still)))["rest"]
+    assert found.severity == "ok" and found.found.startswith("0.0 of 3.9 s")
+
+
+def test_wheels_without_a_mounting_are_told(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["mounting"]
+    assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
+    assert finding.remedy == "--odometry.prior constant-velocity"
+
+
+def test_a_lidar_that_pans_is_told_with_its_joint_and_range(tmp_path):
+    said = drive(mounted=False, wheels=True)
+    for k in range(40):
+        time_ns = STAMP_NS + k * STEP_NS
+        turn = ("base_link", "laser", 0.2, 0.0, 0.1 * k, 0.0)
+        said.append(transforms_said(time_ns, transforms(turn, stamp_ns=time_ns), "/tf"))
+    finding = diagnose(saved(tmp_path, said))["mounting"]
+    assert finding.severity == "note" and "wheels are carried over" in finding.effect
+    assert "base_link → laser in /tf turns from 0 to 223 deg about its z axis" in finding.found
+
+
+def test_scans_of_several_frames_on_one_topic_are_a_problem(tmp_path):
+    said = [*drive(20, frame="left"), *drive(20, frame="right", mounted=False)]
+    finding = diagnose(saved(tmp_path, said))["mounting"]
+    assert finding.severity == "problem" and "left, right" in finding.found
+
+
+# Clouds
+
+ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4"), ("ring", "<u2")])
+
+
+def sweep(k, *, span=0.095, rings=16, fields=ROW):
+    rng = np.random.default_rng(3)
+    rows = np.zeros(640, fields)
+    for name, reach in zip("xyz", (20.0, 20.0, 2.0), strict=True):
+        rows[name] = rng.uniform(1.0, reach, 640)
+    rows["x"] -= 0.3 * k
+    if "time" in fields.names:
+        rows["time"] = np.linspace(0.0, span, 640)
+    if "ring" in fields.names:
+        rows["ring"] = np.arange(640) % rings
+    return rows
+
+
+def sweeps(count=20, **options):
+    stamps_ns = [STAMP_NS + k * STEP_NS for k in range(count)]
+    return [cloud_said(stamp, point_cloud(stamp, sweep(k, **options))) for k, stamp in enumerate(stamps_ns)]
+
+
+def test_rings_and_point_times_of_a_healthy_cloud_are_told(tmp_path):
+    found = diagnose(saved(tmp_path, sweeps()))
+    assert sorted(found) == sorted([*CHECKS, "rings", "point times"])
+    assert found["rings"].found == "16 rings"
+    assert "field time (float32) taken as s" in found["point times"].found
+    assert "lasts 95 ms" in found["point times"].found and found["point times"].severity == "ok"
+
+
+def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
+    path = saved(tmp_path, sweeps(span=9.5))  # in hundredths of a second: no unit that is guessed fits
+    finding = diagnose(path)["point times"]
+    assert finding.severity == "warning" and "95 of the period" in finding.found
+    assert finding.remedy == "--log.point_times none"
+    path = saved(tmp_path, sweeps(span=0.095))
+    finding = diagnose(path, point_times="ms")["point times"]
+    assert finding.severity == "warning" and finding.remedy == "--log.point_times s"
+    assert diagnose(path, point_times="s")["point times"].severity == "ok"
+
+
+def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
+    plain = np.dtype([(name, "<f4") for name in "xyz"])
+
+    def turning(sense, times):
+        """A cloud in the order of firing, ``times`` around."""
+        azimuth = sense * np.linspace(0.0, 2.0 * np.pi * times, 640) + 1.0
+        rows = np.zeros(640, plain)
+        rows["x"], rows["y"] = 10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth)
+        return rows
+
+    def found(rows):
+        stamps_ns = [STAMP_NS + k * STEP_NS for k in range(20)]
+        path = saved(tmp_path, [cloud_said(stamp, point_cloud(stamp, rows)) for stamp in stamps_ns])
+        return path, diagnose(path)["point times"]
+
+    for sense, way in ((1.0, "counterclockwise"), (-1.0, "clockwise")):
+        path, finding = found(turning(sense, 1.0))
+        assert finding.severity == "note"
+        assert finding.remedy == f"--log.point_times {way} --log.revolution_s 0.1 --log.revolution_start_rad 1"
+        assert diagnose(path, point_times=way)["point times"].severity == "ok"
+    ring_by_ring, in_no_order, part = turning(1.0, 16.0), sweep(0, fields=plain), turning(1.0, 0.3)
+    for rows in (ring_by_ring, in_no_order, part):
+        assert found(rows)[1].remedy == ""
+
+
+def test_rings_that_come_and_go_are_noted(tmp_path):
+    said = [*sweeps(10), *sweeps(20, rings=12)[10:]]
+    finding = diagnose(saved(tmp_path, said))["rings"]
+    assert finding.severity == "note" and finding.found == "12 to 16 rings"
+
+
+def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
+    def far(k):
+        rows = sweep(k)
+        rows["y"] += 150.0
+        return rows
+
+    said = [cloud_said(STAMP_NS + k * STEP_NS, point_cloud(STAMP_NS + k * STEP_NS, far(k))) for k in range(5)]
+    finding = diagnose(saved(tmp_path, said))["ranges"]
+    assert finding.severity == "note" and finding.remedy.startswith("--preprocess.max_range_m 17")
+
+
+def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
+    path = tmp_path / "hall.mcap"
+    simulate("hall", path, seed=1, duration_s=4.0)
+    truth = open_log(path).ground_truth()
+    moved_m = np.linalg.norm(truth.poses[:, :3, 3] - truth.poses[0, :3, 3], axis=1)
+    until_s = (truth.stamps_ns[np.flatnonzero(moved_m > 0.02)[0]] - truth.stamps_ns[0]) * 1e-9
+    found = diagnose(path)["rest"].found
+    still_s, first_s = float(found.split()[0]), float(found.split(", ")[1].split()[0])
+    assert 2.0 < until_s < 3.5
+    assert still_s == first_s == pytest.approx(until_s, abs=0.15)
+
+
+def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
+    said = [*drive(wheels=True), odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")]
+    names = {"nav_msgs/msg/Path": "sensor_msgs/msg/Imu", "nav_msgs/msg/MapMetaData": "sensor_msgs/msg/NavSatFix"}
+    said += [Said(topic, kind, STAMP_NS, b"0") for topic, kind in zip(("/imu/data", "/fix"), names, strict=True)]
+    path = saved(tmp_path, said, rename=lambda kind: names.get(kind, kind))
+    finding = diagnose(path)["sensors"]
+    assert finding.severity == "ok"
+    assert finding.found.split("; ") == [
+        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
+        "IMU /imu/data: not used",
+    ]  # fmt: skip
+    assert main(["info", str(path)]) == 0
+    text = capfd.readouterr().out
+    for line in finding.found.split("; "):
+        assert f"sensor    {line}\n" in text
+    assert "wheels    /odom" in text and "/odom:" not in text
+    assert main(["info", str(path), "--json"]) == 0
+    assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
+        "GNSS", "ground truth", "IMU",
+    ]  # fmt: skip
+    assert diagnose(saved(tmp_path, drive()))["sensors"].found == "no IMU, GNSS or ground truth"
+
+
+def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
+    said = drive(wheels=True)
+    other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
+    truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
+    path = saved(tmp_path, [*said, *other, truth])
+    assert main(["info", str(path)]) == 0
+    text = capfd.readouterr().out
+    assert "several lidar topics" in text and "wheels    /odom\n" in text
+    assert "sensor    ground truth /ground_truth: evaluates the result, is not used for it\n" in text
+
+
+# The whole
+
+
+def test_the_intel_log_is_known_for_its_stamps():
+    found = diagnose(shared_data("2d/intel.mcap"))
+    assert found["stamp order"].found == "631 steps back in the header stamps, 0 repeated"
+    assert "81.83 m" in found["no return"].found and found["no return"].severity == "ok"
+    assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found
+
+
+def test_the_command_prints_the_gravest_first_and_json_says_the_same(tmp_path, capfd):
+    path = saved(tmp_path, drive(stamp=lambda k: -37 * SECOND if k == 3 else 0))
+    assert main(["doctor", str(path)]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[0] == f"{path} /scan (2D)" and lines[1].startswith("warning  stamp order")
+    assert main(["doctor", str(path), "--json"]) == 0
+    said = json.loads(capfd.readouterr().out)
+    grades = [finding["severity"] for finding in said["findings"]]
+    assert grades == sorted(grades, key=["problem", "warning", "note", "ok"].index)
+    assert said["topic"] == "/scan" and {"check", "severity", "found", "effect", "remedy"} == set(
+        said["findings"][0]
+    )
+
+
+def test_every_finding_that_is_not_ok_says_what_it_does():
+    for name in ("2d/intel.mcap", "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"):
+        for finding in diagnose(shared_data(name)).values():
+            assert finding.severity == "ok" or finding.effect, finding
+
+
+def test_a_log_that_a_run_could_not_open_is_refused_in_the_same_words(tmp_path, capfd):
+    path = saved(tmp_path, [odometry_said(STAMP_NS, odometry(STAMP_NS, 0, 0))])
+    assert main(["doctor", str(path)]) == 2
+    assert "has no lidar topic" in capfd.readouterr().err
+    with pytest.raises(InputError, match="could be read"):
+        diagnose(saved(tmp_path, [scan_said(STAMP_NS, b"\0\1\0\0")]))

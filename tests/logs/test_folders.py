@@ -1,0 +1,373 @@
+"""Folders of sweeps: KITTI raw and odometry, PCD and PLY as open3d writes them, raw float32."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.doctor.statistics import survey
+from scanchain.logs.formats.cloud_folder import stamp_of_name
+from scanchain.simulation import simulate
+from tests.support import recorders
+from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
+from tests.support.recorders import SECOND, STAMP_NS, assert_clouds
+from tests.support.scenes import shared_data
+
+
+def read(path, **config):
+    log = open_log(path, LogConfig(**config))
+    return log, list(log.scans())
+
+
+def assert_points(scans, said):
+    for scan, cloud in zip(scans, said, strict=True):
+        np.testing.assert_array_equal(scan.points, xyzi(cloud)[:, :3])
+
+
+# KITTI
+
+
+def test_a_kitti_drive_has_its_sweeps_and_their_times(tmp_path):
+    said = recorders.clouds()
+    log, scans = read(kitti_raw(tmp_path, said))
+    assert (log.dimension, log.topic, log.scan_count) == (3, "/velodyne_points", 3)
+    assert_points(scans, said)
+    assert [scan.stamp_ns - 1_317_042_145 * SECOND for scan in scans] == [594_360, 1_594_360, 2_594_360]
+
+
+def test_the_truth_of_a_kitti_drive_is_its_gps_moved_to_the_lidar(tmp_path):
+    log, _ = read(kitti_raw(tmp_path, recorders.clouds()))
+    truth = log.ground_truth()
+    assert truth is not None and len(truth) == 3
+    imu = []
+    for k in range(3):
+        a, b, c = 0.01, -0.02, 0.3 * k
+        ca, sa, cb, sb, cc, sc = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(c), np.sin(c)
+        T = np.eye(4)
+        T[:3, :3] = [
+            [cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa],
+            [sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa],
+            [-sb, cb * sa, cb * ca],
+        ]
+        meter = np.pi / 180 * 6378137.0 * np.cos(np.radians(49.0))
+        T[:3, 3] = 2e-5 * k * meter, 1e-5 * k / np.cos(np.radians(49.0)) * meter, 0.5 * k
+        imu.append(T)
+    T_lidar_imu = np.array([[0, -1, 0, -0.8], [1, 0, 0, 0.3], [0, 0, 1, -0.75], [0, 0, 0, 1.0]])
+    for k in range(3):
+        T_world_imu = np.linalg.inv(imu[0] @ np.linalg.inv(T_lidar_imu)) @ imu[k] @ np.linalg.inv(T_lidar_imu)
+        np.testing.assert_allclose(truth.poses[k], T_world_imu, atol=2e-6)
+
+
+def test_a_kitti_drive_without_its_calibration_has_no_truth_and_says_so(tmp_path):
+    log, scans = read(kitti_raw(tmp_path, recorders.clouds(), calibrated=False))
+    assert len(scans) == 3 and log.ground_truth() is None
+    assert "calib_imu_to_velo.txt" in " ".join(log.notes)
+
+
+def test_a_sweep_that_a_kitti_drive_lacks_leaves_the_times_of_the_others(tmp_path):
+    said = recorders.clouds()
+    drive = kitti_raw(tmp_path, said)
+    (drive / "velodyne_points/data/0000000001.bin").unlink()
+    _, scans = read(drive)
+    assert_points(scans, [said[0], said[2]])
+    assert scans[1].stamp_ns - scans[0].stamp_ns == 2_000_000
+
+
+def test_a_sweep_that_was_cut_off_is_left_out_and_told(tmp_path):
+    said = recorders.clouds()
+    drive = kitti_raw(tmp_path, said)
+    with (drive / "velodyne_points/data/0000000001.bin").open("ab") as file:
+        file.write(b"xyz")
+    log, scans = read(drive)
+    assert_points(scans, [said[0], said[2]])
+    assert "0000000001.bin" in log.damage[0] and "multiple of" in log.damage[0]
+
+
+def test_a_kitti_odometry_sequence_begins_at_time_zero_and_knows_its_truth(tmp_path):
+    said = recorders.clouds(5)
+    log, scans = read(kitti_odometry(tmp_path, said))
+    assert_points(scans, said)
+    assert [scan.stamp_ns for scan in scans] == [round(0.103736e9 * k) for k in range(5)]
+    assert log.duration_s == pytest.approx(0.414944)
+    T_camera_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
+    truth = log.ground_truth()
+    assert truth is not None and len(truth) == 5
+    for k in range(5):
+        expected = np.linalg.inv(T_camera_lidar) @ camera(k) @ T_camera_lidar
+        np.testing.assert_allclose(truth.poses[k], expected, atol=1e-9)
+
+
+def test_a_part_of_a_kitti_sequence_opens_only_its_own_files(tmp_path, monkeypatch):
+    from scanchain.logs.formats import kitti
+
+    opened = []
+
+    def noted(path, whole=kitti.read_xyzi):
+        opened.append(path.name)
+        return whole(path)
+
+    monkeypatch.setattr(kitti, "read_xyzi", noted)
+    said = recorders.clouds(9)
+    sequence = kitti_odometry(tmp_path, said, poses=False)
+    log, scans = read(sequence, start_s=0.2, end_s=0.5)
+    assert log.scan_count == len(scans) == 3
+    assert_points(scans, said[2:5])
+    assert set(opened) <= {f"{k:06d}.bin" for k in (0, 2, 3, 4)}  # the first tells the lidar's frame
+
+
+def test_a_kitti_folder_whose_parts_do_not_fit_says_so(tmp_path):
+    sequence = kitti_odometry(tmp_path, recorders.clouds())
+    (sequence / "times.txt").write_text("0.0\n")
+    with pytest.raises(InputError, match="does not fit the 1 timestamp;"):
+        read(sequence)
+    (sequence / "times.txt").write_text("noon\n")
+    with pytest.raises(InputError, match=r"times\.txt: is no table of numbers"):
+        read(sequence)
+
+
+def test_real_kitti_sweeps_are_the_same_out_of_a_folder(tmp_path):
+    mcap = open_log(shared_data("3d/kitti_0001_first54.mcap"))
+    scans = [scan for scan, _ in zip(mcap.scans(), range(3), strict=False)]
+    for scan in scans:
+        rows = np.column_stack([scan.points, np.zeros(len(scan.points))]).astype("<f4")
+        rows.tofile(tmp_path / f"{scan.stamp_ns}.bin")
+    _, again = read(tmp_path)
+    for ours, theirs in zip(again, scans, strict=True):
+        assert ours.stamp_ns == theirs.stamp_ns and ours.points.tobytes() == theirs.points.tobytes()
+
+
+# PCD and PLY
+
+
+def open3d():
+    from scanchain.baselines.open3d_pairs import Open3dPairs
+
+    return Open3dPairs("point-to-point").open3d
+
+
+def save_by_open3d(file, cloud, *, float64=False, **options):
+    module = open3d()
+    rows = cloud.rows
+    tensor = module.core.Tensor
+    kind = np.float64 if float64 else np.float32
+    positions = np.column_stack([rows[name] for name in "xyz"]).astype(kind)
+    said = module.t.geometry.PointCloud(tensor(positions))
+    said.point["intensity"] = tensor(rows["t"].astype(np.float32)[:, None])
+    assert module.t.io.write_point_cloud(str(file), said, **options)
+
+
+@pytest.mark.parametrize("suffix", ["pcd", "ply"])
+@pytest.mark.parametrize("options", [{"write_ascii": True}, {}, {"compressed": True}], ids=str)
+@pytest.mark.parametrize("float64", [False, True])
+def test_clouds_that_open3d_writes_are_read_to_the_last_bit(tmp_path, suffix, options, float64):
+    said = recorders.clouds()
+    for cloud in said:
+        save_by_open3d(tmp_path / f"{cloud.stamp_ns}.{suffix}", cloud, float64=float64, **options)
+    log, scans = read(tmp_path)
+    assert (log.dimension, log.topic, log.scan_count, log.damage) == (3, "/points", 3, [])
+    if options.get("write_ascii"):
+        for scan, cloud in zip(scans, said, strict=True):
+            np.testing.assert_allclose(scan.points, xyzi(cloud)[:, :3], rtol=1e-4)  # as many digits as it writes
+            assert scan.stamp_ns == cloud.stamp_ns
+    else:
+        assert_clouds(scans, said, timed=False)
+
+
+def test_the_times_in_a_pcd_are_those_of_its_points(tmp_path):
+    dtype = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<u8"), ("ring", "<u2")]
+    rows = np.zeros(11, dtype)
+    rows["x"], rows["timestamp"] = np.arange(1, 12), STAMP_NS + np.arange(11) * 10_000_000
+    content = PCD.format(count=11, form="binary").encode() + rows.tobytes()
+    (tmp_path / f"cloud_{STAMP_NS // SECOND}_000000000.pcd").write_bytes(content)
+    _, (scan,) = read(tmp_path)
+    np.testing.assert_array_equal(scan.points[:, 0], np.arange(1, 12))
+    np.testing.assert_allclose(scan.times_s, np.arange(11) * 0.01, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_a_ply_may_be_in_any_byte_order_with_other_fields_and_elements(tmp_path, form):
+    order = ">" if "big" in form else "<"
+    rows = np.zeros(4, [("x", order + "f8"), ("y", order + "f4"), ("z", order + "f4"), ("ring", "u1")])
+    rows["x"], rows["y"], rows["ring"] = [1, 2, 3, 4], [0.5, 1.5, 2.5, 3.5], [9, 8, 7, 6]
+    rows["z"] = [4, 3, 2, 1]
+    body = rows.tobytes() + b"\x03" + bytes(12)
+    if form == "ascii":
+        body = b"".join(b" ".join(str(value).encode() for value in row) + b"\n" for row in rows) + b"3 0 1 2\n"
+    (tmp_path / "1.5.ply").write_bytes(PLY.format(form=form, count=4).encode() + body)
+    _, (scan,) = read(tmp_path)
+    np.testing.assert_array_equal(scan.points, np.column_stack([rows["x"], rows["y"], rows["z"]]))
+    assert scan.stamp_ns == 1_500_000_000
+
+
+@pytest.mark.parametrize(
+    ("stem", "stamp_ns"),
+    [
+        ("1700000000123456789", 1_700_000_000_123_456_789),
+        ("1700000000123456", 1_700_000_000_123_456_000),
+        ("1700000000123", 1_700_000_000_123_000_000),
+        ("scan-1700000000.25", 1_700_000_000_250_000_000),
+        ("12.375", 12_375_000_000),
+        ("cloud_1583836591_182590976", 1_583_836_591_182_590_976),
+        ("cloud_1583836591_82590976", 1_583_836_591_082_590_976),
+        ("000017", None),
+        ("0000000017", None),
+        ("0000000000000000017", None),
+        ("map", None),
+    ],
+)
+def test_a_name_tells_its_stamp_or_none(stem, stamp_ns):
+    assert stamp_of_name(stem) == stamp_ns
+
+
+def test_files_that_are_only_numbered_need_a_rate(tmp_path):
+    said = recorders.clouds(12)
+    for k, cloud in enumerate(said):
+        xyzi(cloud).tofile(tmp_path / f"scan{k}.bin")
+    with pytest.raises(InputError, match=r"scan0\.bin hold no stamp.*--log\.rate_hz 10"):
+        read(tmp_path)
+    log, scans = read(tmp_path, rate_hz=20.0)
+    assert_points(scans, said)  # scan2 comes before scan10
+    assert [scan.stamp_ns for scan in scans] == [50_000_000 * k for k in range(12)]
+    assert log.scan_count == 12 and log.duration_s == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("1.0.pcd", b""),
+        ("1.0.pcd", b"\0" * 500),
+        ("1.0.pcd", PCD.format(count=1000, form="binary").encode()),
+        ("1.0.pcd", PCD.format(count=1000, form="binary_compressed").encode() + b"\xff" * 9),
+        ("1.0.pcd", PCD.format(count=3, form="ascii").encode() + b"1 2\n"),
+        ("1.0.pcd", PCD.replace("x y z", "a b c").format(count=0, form="ascii").encode()),
+        ("1.0.ply", b""),
+        ("1.0.ply", b"ply\n" + b"comment\n" * 5000),
+        ("1.0.ply", PLY.format(form="binary_little_endian", count=10**9).encode()),
+        ("1.0.ply", PLY.format(form="ascii", count=3).encode() + b"1 2\n"),
+        ("1.0.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n"),
+    ],
+)
+def test_a_file_that_is_broken_is_left_out_and_told(tmp_path, name, content):
+    good = PLY if name.endswith("ply") else PCD
+    rows = np.ones(1, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<u8"), ("ring", "<u2")])
+    if good is PLY:
+        rows = np.ones(1, [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("ring", "u1")])
+    form = "binary_little_endian" if good is PLY else "binary"
+    (tmp_path / f"2.0{name[3:]}").write_bytes(good.format(form=form, count=1).encode() + rows.tobytes())
+    (tmp_path / name).write_bytes(content)
+    log, scans = read(tmp_path)
+    assert [scan.stamp_ns for scan in scans] == [2 * SECOND]
+    assert name in log.damage[0] and "left out" in log.damage[0]
+
+
+def swept(k, count=300):
+    """Points (N, 6) as a lidar sees them, flat and wide, with intensity, ring and time."""
+    rng = np.random.default_rng(k)
+    columns = [rng.normal(0.0, 20.0, count), rng.normal(0.0, 20.0, count), rng.normal(-1.0, 0.7, count)]
+    return np.column_stack([*columns, rng.uniform(0, 1, count), rng.integers(0, 32, count), np.zeros(count)])
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin"])
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@pytest.mark.parametrize("count", [300, None])
+def test_folders_of_arrays_open_whatever_their_columns_and_say_what_was_found(
+    tmp_path, suffix, columns, kind, count
+):
+    clouds = [swept(k, count or 250 + 37 * k)[:, :columns].astype(kind) for k in range(6)]
+    for k, cloud in enumerate(clouds):
+        if suffix == ".npy":
+            np.save(tmp_path / f"{k}.npy", cloud)
+        else:
+            cloud.tofile(tmp_path / f"{k}.bin")
+    log, scans = read(tmp_path, rate_hz=10.0)
+    for scan, cloud in zip(scans, clouds, strict=True):
+        np.testing.assert_array_equal(scan.points, cloud[:, :3].astype(np.float32))
+    names = " ".join(["x", "y", "z", "intensity", "column_5", "column_6"][:columns])
+    assert f"6 {suffix} files of {names}, {kind}" in log.notes[0]
+    assert f"{len(clouds[0])} points in 0{suffix}" in log.notes[0]
+
+
+@pytest.mark.parametrize("hole", [0.0, np.nan, np.inf])
+def test_raw_rows_of_three_numbers_are_not_taken_for_six_where_they_are_flat(tmp_path, hole):
+    cloud = swept(0)[:, :3].astype("float32")
+    cloud[:, 2] = 1.5
+    cloud[7] = hole
+    cloud.tofile(tmp_path / "1.0.bin")
+    log, (scan,) = read(tmp_path)
+    assert scan.points.shape == (299, 2) and "1 .bin file of x y z, float32" in log.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["float16", "int32", "int64", ">f4", ">f8"])
+def test_arrays_of_any_number_type_and_with_named_fields_are_read(tmp_path, kind):
+    cloud = np.rint(swept(1)[:, :3]).astype(kind)
+    np.save(tmp_path / "1.0.npy", cloud)
+    named = np.rec.fromarrays(list(cloud.T[::-1]), names="z,y,x")
+    np.save(tmp_path / "2.0.npy", named)
+    np.save(tmp_path / "3.0.npy", np.asfortranarray(cloud))
+    for scan in read(tmp_path)[1]:
+        np.testing.assert_array_equal(scan.points, cloud[np.any(cloud, axis=1)].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.ones((3, 900)), "is an array (3, 900) of float64; give numbers (N, 3), (N, 4)"),
+        (np.ones(900), "is an array (900,) of float64"),
+        (np.ones((9, 2)), "is an array (9, 2) of float64"),
+        (np.array([[{}, 1, 2]]), "is no .npy array of numbers"),
+    ],
+)
+def test_an_array_that_is_no_cloud_is_left_out_with_its_shape(tmp_path, array, said):
+    np.save(tmp_path / "1.0.npy", array, allow_pickle=True)
+    np.save(tmp_path / "2.0.npy", swept(0))
+    log, scans = read(tmp_path)
+    assert len(scans) == 1 and said in log.damage[0]
+
+
+def test_raw_bytes_that_are_no_rows_of_numbers_are_refused_with_what_to_do(tmp_path):
+    (tmp_path / "1.0.bin").write_bytes(np.random.default_rng(0).bytes(4800))
+    with pytest.raises(InputError, match=r"neither float32 nor float64.*save clouds as \.npy, PCD or PLY"):
+        read(tmp_path)
+
+
+def test_a_folder_of_nothing_that_is_known_says_what_is(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError, match="is a folder of no log that is known; give MCAP"):
+        read(tmp_path)
+
+
+def test_the_mounting_of_a_folder_is_not_known_and_taken_as_the_origin(tmp_path):
+    xyzi(recorders.clouds(1)[0]).tofile(tmp_path / "1.0.bin")
+    log, _ = read(tmp_path)
+    np.testing.assert_array_equal(log.T_base_lidar, lie.lift(np.eye(3)))
+
+
+def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
+    np.save(tmp_path / "1.0.npy", swept(0))
+    np.save(tmp_path / "2.0.npy", swept(1))
+    assert not any("left out" in note for note in open_log(tmp_path).notes)
+    (tmp_path / "1.5.pcd").write_text(PCD.format(count=3, form="ascii") + "1 2 3\n" * 3)
+    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
+    assert note.startswith(f"{tmp_path}: only its .pcd files are read, left out are 2 .npy;")
+
+
+def test_a_folder_of_parts_of_a_log_says_which_other_files_it_left_out(tmp_path):
+    simulate("office", tmp_path / "part.mcap", duration_s=1.0)
+    np.save(tmp_path / "1.0.npy", swept(0))
+    (tmp_path / "notes.txt").touch()
+    (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
+    assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .npy;")
+
+
+def test_many_bad_files_are_told_by_the_first_and_their_number(tmp_path):
+    for k in range(40):
+        np.save(tmp_path / f"{k:03}.npy", np.random.default_rng(k).uniform(-9.0, 9.0, (50, 3)))
+    for k in range(1, 31):
+        (tmp_path / f"{k:03}.npy").write_bytes(b"no array")
+    log = open_log(tmp_path, LogConfig(rate_hz=10.0, max_bad_scans_percent=100.0))
+    assert len(list(log.scans())) == 10
+    assert len(log.damage) < 6 and any("003.npy" in line and "27 more like this" in line for line in log.damage)
+    assert len("; ".join(survey(log).damage)) < 600

@@ -1,0 +1,227 @@
+"""Messages of every kind in MCAP, recorded by other people's writers."""
+
+import numpy as np
+import pytest
+from foxglove import Channel, Schema
+from foxglove import messages as fox
+from foxglove.channels import FrameTransformsChannel, PoseInFrameChannel
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros1.decoder import DecoderFactory
+
+from scanchain import lie
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from tests.support import recorders
+from tests.support.recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar
+
+
+def read(path, **config):
+    log = open_log(path, LogConfig(**config))
+    scans = list(log.scans())
+    assert log.damage == []
+    return log, scans
+
+
+@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
+def test_a_planar_drive_of_either_ros_has_its_scans_wheels_and_mounting(tmp_path, store):
+    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).drive()))
+    assert_planar(scans)
+    assert (log.dimension, log.topic, log.odometry_topic) == (2, "/scan", "/odom")
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+    for k, scan in enumerate(scans):
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
+
+
+@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
+def test_clouds_of_either_ros_keep_every_point_and_its_time(tmp_path, store):
+    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).sweeps()))
+    assert log.dimension == 3
+    assert_clouds(scans)
+
+
+def test_what_rosbags_writes_as_ros_1_is_what_mcap_ros1_support_reads(tmp_path):
+    path = recorders.mcap_of(tmp_path / "a.mcap", Ros(ROS1), Ros(ROS1).drive())
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        scans = [decoded for _, channel, _, decoded in reader.iter_decoded_messages() if channel.topic == "/scan"]
+    assert scans[0].header.frame_id == "laser" and scans[0].ranges[1] == recorders.planar()[0].ranges[1]
+
+
+@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
+@pytest.mark.parametrize("package", ["livox_ros_driver2", "livox_ros_driver"])
+def test_a_livox_custom_message_is_a_cloud_with_times(tmp_path, store, package):
+    ros = Ros(store)
+    told = [("/livox", f"{package}/msg/CustomMsg", c.stamp_ns, ros.livox(c, package)) for c in recorders.clouds()]
+    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
+    assert log.dimension == 3 and "offset_time" in " ".join(log.notes)
+    assert_clouds(scans)
+
+
+@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
+def test_a_multi_echo_scan_is_that_of_its_first_echoes(tmp_path, store):
+    ros, kind = Ros(store), "sensor_msgs/msg/MultiEchoLaserScan"
+    told = [("/echoes", kind, scan.stamp_ns, ros.multi_echo(scan)) for scan in recorders.planar()]
+    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
+    assert log.dimension == 2
+    assert_planar(scans)
+
+
+def foxglove_logs(folder, said):
+    yield recorders.foxglove_protobuf(folder / "protobuf.mcap", said)
+    yield recorders.foxglove_json(folder / "json.mcap", said)
+    yield recorders.foxglove_json(folder / "python.mcap", said, literal_nan=True)
+
+
+def test_foxglove_laser_scans_are_the_same_in_protobuf_and_json(tmp_path):
+    for path in foxglove_logs(tmp_path, recorders.planar()):
+        log, scans = read(path, min_range_m=0.25, max_range_m=30.0)  # Foxglove tells no limits
+        assert (log.dimension, log.topic) == (2, "/lidar")
+        assert_planar(scans)
+
+
+def test_foxglove_clouds_are_the_same_in_protobuf_and_json(tmp_path):
+    for path in foxglove_logs(tmp_path, recorders.clouds()):
+        log, scans = read(path)
+        assert (log.dimension, log.topic) == (3, "/lidar")
+        assert_clouds(scans)
+
+
+def test_a_foxglove_cloud_is_moved_to_where_its_pose_says(tmp_path):
+    half = np.sqrt(0.5)
+    pose = fox.Pose(
+        position=fox.Vector3(x=1.0, y=2.0, z=3.0), orientation=fox.Quaternion(x=0, y=0, z=half, w=half)
+    )
+    _, scans = read(recorders.foxglove_protobuf(tmp_path / "a.mcap", recorders.clouds(), pose))
+    for scan, cloud in zip(scans, recorders.clouds(), strict=True):
+        rows = cloud.rows[1:]
+        expected = np.column_stack([1.0 - rows["y"], 2.0 + rows["x"], 3.0 + rows["z"]])
+        np.testing.assert_allclose(scan.points, expected, atol=1e-5)
+    _, scans = read(recorders.foxglove_protobuf(tmp_path / "b.mcap", recorders.planar(), pose))
+    _, plain = read(recorders.foxglove_protobuf(tmp_path / "c.mcap", recorders.planar()))
+    expected = np.column_stack([1.0 - plain[0].points[:, 1], 2.0 + plain[0].points[:, 0]])
+    np.testing.assert_allclose(scans[0].points, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["protobuf", "json"])
+def test_foxglove_poses_and_transforms_are_wheels_and_mounting(tmp_path, form):
+    path = tmp_path / "a.mcap"
+    half = np.sin(0.25), np.cos(0.25)
+    place, turn = {"x": 0.25, "y": 0.0, "z": 0.0}, {"x": 0.0, "y": 0.0, "z": half[0], "w": half[1]}
+    context = recorders.Context()
+    with recorders.open_mcap(path, context=context):
+        recorders.LaserScanChannel("/lidar", context=context).log(
+            recorders.foxglove_scan(recorders.planar(1)[0]), log_time=STAMP_NS
+        )
+        if form == "protobuf":
+            position, orientation = fox.Vector3(**place), fox.Quaternion(**turn)
+            pose = fox.Pose(position=position, orientation=orientation)
+            stamp = fox.Timestamp(sec=STAMP_NS // SECOND, nsec=0)
+            wheels = fox.PoseInFrame(timestamp=stamp, frame_id="odom", pose=pose)
+            PoseInFrameChannel("/wheels", context=context).log(wheels, log_time=STAMP_NS)
+            transform = fox.FrameTransform(
+                timestamp=stamp, parent_frame_id="base_link", child_frame_id="laser",
+                translation=position, rotation=orientation,
+            )  # fmt: skip
+            tree = fox.FrameTransforms(transforms=[transform])
+            FrameTransformsChannel("/tf_static", context=context).log(tree, log_time=STAMP_NS)
+        else:
+            stamp = {"sec": STAMP_NS // SECOND, "nsec": 0}
+            told = {"timestamp": stamp, "frame_id": "odom", "pose": {"position": place, "orientation": turn}}
+            json_channel("foxglove.PoseInFrame", "/wheels", context).log(told, log_time=STAMP_NS)
+            told = {"timestamp": stamp, "parent_frame_id": "base_link", "child_frame_id": "laser"}
+            told |= {"translation": place, "rotation": turn}
+            json_channel("foxglove.FrameTransform", "/tf_static", context).log(told, log_time=STAMP_NS)
+    log, (scan,) = read(path, odometry_topic="/wheels")
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+    np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+
+
+def json_channel(name, topic, context):
+    schema = Schema(name=name, encoding="jsonschema", data=b'{"type": "object"}')
+    return Channel(topic, schema=schema, message_encoding="json", context=context)
+
+
+def test_every_foxglove_number_type_has_its_own_code(tmp_path):
+    """Foxglove counts unsigned first, PointField signed first; a mix-up turns 200 into -56."""
+    row = np.dtype([("x", "<i1"), ("y", "<u1"), ("z", "<i2"), ("t", "<u2"), ("a", "<i4"), ("b", "<f8")])
+    kinds = fox.PackedElementFieldNumericType
+    codes = [kinds.Int8, kinds.Uint8, kinds.Int16, kinds.Uint16, kinds.Int32, kinds.Float64]
+    fields = [
+        fox.PackedElementField(name=name, offset=row.fields[name][1], type=code)
+        for name, code in zip(row.names, codes, strict=True)
+    ]
+    rows = np.array([(-100, 200, -30000, 60000, 1, 1.0), (100, 250, 30000, 0, 2, 2.0)], row)
+    cloud = fox.PointCloud(
+        timestamp=fox.Timestamp(sec=5, nsec=0), point_stride=row.itemsize, fields=fields, data=rows.tobytes()
+    )
+    context = recorders.Context()
+    with recorders.open_mcap(tmp_path / "a.mcap", context=context):
+        recorders.PointCloudChannel("/c", context=context).log(cloud, log_time=5 * SECOND)
+    (scan,) = read(tmp_path / "a.mcap", point_times="us")[1]
+    np.testing.assert_array_equal(scan.points, [[-100, 200, -30000], [100, 250, 30000]])
+    np.testing.assert_allclose(scan.times_s, [0.06, 0.0])
+
+
+def one_message(path, name, language, encoding, data, definition=b""):
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/x", encoding, writer.register_schema(name, language, definition))
+        writer.add_message(channel, STAMP_NS, data, STAMP_NS)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "language", "encoding"),
+    [
+        ("velodyne_msgs/msg/VelodyneScan", "ros2msg", "cdr"),
+        ("foxglove.LaserScan", "flatbuffer", "flatbuffer"),
+        ("sensor_msgs/LaserScan", "jsonschema", "json"),
+    ],
+)
+def test_a_type_that_is_unknown_is_named(tmp_path, name, language, encoding):
+    path = one_message(tmp_path / "a.mcap", name, language, encoding, b"x")
+    with pytest.raises(InputError) as error:
+        open_log(path)
+    assert "/x" in str(error.value) and name in str(error.value) and "foxglove.PointCloud" in str(error.value)
+    assert encoding == "cdr" or f"in {encoding}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("language", "encoding", "data"),
+    [
+        ("jsonschema", "json", b"{"),
+        ("jsonschema", "json", b'{"ranges": "no"}'),
+        ("jsonschema", "json", b"[" * 100_000),
+        ("protobuf", "protobuf", b"\xff\xff\xff"),
+        ("ros1msg", "ros1", b"\xff" * 40),
+    ],
+)
+def test_a_message_that_is_malformed_is_refused_in_one_line(tmp_path, language, encoding, data):
+    name = "sensor_msgs/LaserScan" if encoding == "ros1" else "foxglove.LaserScan"
+    with pytest.raises(InputError, match="scan 0 of /x is malformed"):
+        list(open_log(one_message(tmp_path / "a.mcap", name, language, encoding, data)).scans())
+
+
+def test_a_broken_protobuf_schema_is_told(tmp_path):
+    path = one_message(tmp_path / "a.mcap", "foxglove.LaserScan", "protobuf", "protobuf", b"", b"\xffno schema")
+    with pytest.raises(InputError, match=r"its schema foxglove\.LaserScan is broken"):
+        list(open_log(path).scans())
+
+
+@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
+@pytest.mark.parametrize("kind", ["livox_ros_driver2/msg/CustomMsg", "sensor_msgs/msg/MultiEchoLaserScan"])
+def test_a_message_cut_at_any_byte_is_malformed_and_nothing_else(tmp_path, store, kind):
+    ros = Ros(store)
+    said = ros.livox(recorders.clouds(1, 6)[0], "livox_ros_driver2") if "livox" in kind else None
+    whole = ros.serialize(said or ros.multi_echo(recorders.planar(1, 13)[0]), kind)
+    name = kind.replace("/msg/", "/") if ros.is_ros1 else kind
+    for length in range(len(whole)):
+        path = one_message(tmp_path / "a.mcap", name, ros.language, ros.encoding, whole[:length])
+        try:
+            list(open_log(path).scans())
+        except InputError as error:
+            assert "malformed" in str(error) or "no valid point" in str(error)

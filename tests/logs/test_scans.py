@@ -1,0 +1,715 @@
+"""From files to scans: containers, order, prior, mounting, selection; then the real logs."""
+
+import itertools
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import IndexType
+from mcap_ros2.decoder import DecoderFactory
+
+from scanchain import lie
+from scanchain.__main__ import main
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.logs.messages.point_cloud import PointCloudDecoder
+from scanchain.logs.opening import index_files
+from scanchain.simulation import simulate
+from tests.support.naive_logs import (
+    SECOND,
+    STAMP_NS,
+    cloud_said,
+    laser_points,
+    laser_scan,
+    odometry,
+    odometry_said,
+    office,
+    point_cloud,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
+from tests.support.scenes import shared_data
+
+
+def read(*paths, **config):
+    log = open_log(list(paths), LogConfig(**config))
+    return log, list(log.scans())
+
+
+def assert_office(log, scans, count=40):
+    assert (log.dimension, log.topic, log.scan_count, len(scans)) == (2, "/scan", count, count)
+    assert [scan.index for scan in scans] == list(range(count))
+    assert log.damage == () or list(log.damage) == []
+    for k, scan in enumerate(scans):
+        assert scan.stamp_ns == scan.log_time_ns == STAMP_NS + k * SECOND // 10
+        assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+        np.testing.assert_allclose(scan.points, laser_points(1.0 + k / 100 + 0.05 * np.arange(31)), atol=1e-6)
+        assert scan.times_s.shape == (0,) and scan.dropped == 0
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
+
+
+def test_messages_packed_by_hand_are_what_an_independent_decoder_reads(tmp_path):
+    rows = np.array([(1, 2, 3, 4)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f8"), ("t", "u4")])
+    said = [*office(1), cloud_said(STAMP_NS + 1, point_cloud(STAMP_NS, rows, padding=3))]
+    path = write(tmp_path / "a.mcap", said)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        mount, wheels, scan, cloud = [message[3] for message in reader.iter_decoded_messages()]
+    assert mount.transforms[0].child_frame_id == "laser" and mount.transforms[0].transform.translation.z == 0.5
+    assert wheels.child_frame_id == "base_link" and wheels.pose.pose.orientation.w == 1.0
+    assert scan.header.frame_id == "laser" and scan.ranges[1] == pytest.approx(1.05) and scan.range_max == 30.0
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "t"] and len(
+        cloud.data
+    ) == cloud.row_step == 23
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+@pytest.mark.parametrize("summary", [True, False])
+def test_every_container_gives_the_same_scans(tmp_path, chunked, compression, summary):
+    path = write(tmp_path / "a.mcap", office(), chunked=chunked, compression=compression, summary=summary)
+    log, scans = read(path)
+    assert_office(log, scans)
+    assert log.has_odometry and log.duration_s == pytest.approx(3.9)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.1, 0.3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_statistics": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK, "use_statistics": False},
+        {"use_summary_offsets": False},
+        {"crcs": False},
+        {"chunk_size": 100},
+        {"chunk_size": 10_000_000},
+        {"enable_data_crcs": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_summary_may_leave_anything_out(tmp_path, chunked, options):
+    assert_office(*read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options)))
+
+
+@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
+@pytest.mark.parametrize("short", [True, False])
+def test_type_names_of_either_form_are_known(tmp_path, encoding, short):
+    def rename(kind):
+        return kind.replace("/msg/", "/") if short else kind
+
+    assert_office(*read(write(tmp_path / "a.mcap", office(), encoding=encoding, rename=rename)))
+
+
+def test_messages_come_by_log_time_even_where_chunks_overlap(tmp_path):
+    said = office()
+    shuffled = [said[i] for i in np.random.default_rng(1).permutation(len(said))]
+    for chunked in (True, False):
+        assert_office(*read(write(tmp_path / f"{chunked}.mcap", shuffled, chunked=chunked, chunk_size=600)))
+
+
+def test_several_files_are_one_log_whatever_their_order_and_ids(tmp_path):
+    said = office()
+    first = write(tmp_path / "0.mcap", said[:31])
+    second = write(tmp_path / "1.mcap", [said[32], said[31], *said[33:]], compression="lz4", chunked=False)
+    assert_office(*read(first, second))
+    assert_office(*read(second, first))
+
+
+def test_interleaved_files_with_equal_times_keep_the_order_of_the_files(tmp_path):
+    near = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [1.0, 1.0])) for k in range(5)]
+    far = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [2.0, 2.0])) for k in range(5)]
+    _, scans = read(write(tmp_path / "near.mcap", near), write(tmp_path / "far.mcap", far))
+    ranges = [np.linalg.norm(scan.points[0]) for scan in scans]
+    assert ranges == pytest.approx([1.0, 2.0] * 5)
+    assert [scan.log_time_ns for scan in scans] == sorted(scan.log_time_ns for scan in scans)
+
+
+def test_a_channel_announced_in_an_empty_chunk_does_not_stretch_the_log(tmp_path):
+    empty = [scan_said(0, b"", "/quiet/scan_of_nothing")]
+    path = write(tmp_path / "a.mcap", office(), announced=[odometry_said(0, b"", "/other")], chunk_size=1)
+    log, scans = read(path, odometry_topic="/odom")
+    assert log.duration_s == pytest.approx(3.9)
+    assert_office(log, scans)
+    assert empty[0].data == b""
+
+
+def test_start_end_and_every_choose_scans_by_log_time(tmp_path):
+    path = write(tmp_path / "a.mcap", office())
+    log, scans = read(path, start_s=1.0, end_s=2.0)
+    assert [scan.stamp_ns - STAMP_NS for scan in scans] == [k * SECOND // 10 for k in range(10, 21)]
+    assert log.scan_count == 11
+    log, scans = read(path, start_s=0.5, every=3)
+    assert [scan.stamp_ns - STAMP_NS for scan in scans] == [k * SECOND // 10 for k in range(5, 40, 3)]
+    assert log.scan_count == len(scans) == 12
+    assert [scan.index for scan in scans] == list(range(12))
+
+
+def test_ranges_of_the_configuration_drop_and_count(tmp_path):
+    path = write(tmp_path / "a.mcap", office(1))
+    _, (scan,) = read(path, min_range_m=1.5, max_range_m=2.0)
+    distance = np.linalg.norm(scan.points, axis=1)
+    assert distance.min() >= 1.5 and distance.max() <= 2.0
+    assert scan.dropped == 31 - len(scan.points) > 0
+
+
+def test_the_log_can_be_read_again_and_closed_early(tmp_path):
+    path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
+    before = threading.active_count()
+    log = open_log([path], LogConfig())
+    iterator = log.scans()
+    assert [scan.index for scan in itertools.islice(iterator, 3)] == [0, 1, 2]
+    iterator.close()
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and "scanchain" in thread.name:
+            thread.join(5.0)
+    assert threading.active_count() == before
+    assert len(list(log.scans())) == len(list(log.scans())) == 400
+
+
+def test_a_long_gap_between_two_files_of_a_log_is_a_note(tmp_path):
+    hour_ns = 3600 * SECOND
+    paths = [
+        write(tmp_path / name, office(40, begin_ns=begin_ns))
+        for name, begin_ns in (("a.mcap", STAMP_NS + 26 * hour_ns), ("b.mcap", STAMP_NS))
+    ]
+    note = next(note for note in open_log(paths).notes if note.startswith("no message for "))
+    assert note.startswith("no message for 1.1 days from 3.9 s on between b.mcap and a.mcap: read as one log ")
+    for config in (LogConfig(end_s=3.0), LogConfig(start_s=26 * 3600.0)):
+        assert not any("no message" in note for note in open_log(paths, config).notes)
+    write(paths[0], office(40, begin_ns=STAMP_NS + 10 * SECOND))
+    assert not any("no message" in note for note in open_log(paths).notes)
+
+
+def test_opening_decodes_no_scan_twice(tmp_path, monkeypatch):
+    rows = np.array([(1, 2, 3), (2, 3, 5)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = [cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)) for k in range(5)]
+    path, decoded = write(tmp_path / "a.mcap", said), []
+    real = PointCloudDecoder.decode
+    monkeypatch.setattr(PointCloudDecoder, "decode", lambda *args: decoded.append(1) or real(*args))
+    log = open_log(path)
+    assert "preprocess.deskew" in log.idle_keys() and log.assumed_point_times().startswith("no point times")
+    assert len(decoded) == 1
+
+
+def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
+    from scanchain.logs.mcap import stream
+
+    path = write(tmp_path / "a.mcap", office(400), chunk_size=500)
+    opened = []
+    real = stream.read_block
+    monkeypatch.setattr(stream, "read_block", lambda *args: opened.append(1) or real(*args))
+    iterator = open_log([path], LogConfig()).scans()
+    next(iterator)
+    iterator.close()
+    assert 1 <= len(opened) <= 12
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux to say what is in memory")
+def test_what_has_been_read_of_a_file_does_not_stay_in_memory(tmp_path):
+    path = tmp_path / "town.mcap"
+    simulate("town", path, duration_s=2.0, sensor="os1-32")
+    log = open_log(path)
+    assert sum(1 for _ in log.scans()) == 20
+    assert resident_bytes(path) < 0.2 * path.stat().st_size
+
+
+def resident_bytes(path):
+    """Of the file's mapping into this process."""
+    lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+    for line in lines:
+        if line.endswith(str(path)):
+            return 1024 * next(int(entry.split()[1]) for entry in lines if entry.startswith("Rss:"))
+    raise AssertionError(f"{path} is not mapped")
+
+
+def blinded(*at):
+    """Scans without a return, at these seconds."""
+    return [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [np.nan] * 5)) for k in at]
+
+
+def test_one_scan_without_a_return_does_not_stop_a_log_and_is_told(tmp_path):
+    log, scans = read(write(tmp_path / "a.mcap", [*office(5), *blinded(5)]))
+    assert [scan.index for scan in scans] == list(range(5))
+    assert any("1 of 6 scans of /scan was left out (the first: " in line for line in log.damage)
+    assert any("5 scans of /scan were recovered" in line for line in log.damage)
+
+
+def test_one_empty_cloud_does_not_stop_a_log_of_clouds(tmp_path):
+    rows = np.ones(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    nowhere = np.full(60, np.nan, "<f4").view(rows.dtype)
+    said = [
+        cloud_said(
+            STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, {3: rows[:0], 4: nowhere}.get(k, rows))
+        )
+        for k in range(20)
+    ]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert len(scans) == 18 and any("2 of 20 scans of /points were left out" in line for line in log.damage)
+
+
+def test_more_bad_scans_than_the_limit_in_percent_are_refused_with_the_flag(tmp_path):
+    path = write(tmp_path / "a.mcap", [*office(10), *blinded(5, 7)])
+    with pytest.raises(InputError, match=r"scan 10 of /scan .*max_bad_scans_percent \(0\) allows; raise it"):
+        read(path, max_bad_scans_percent=0.0)
+    with pytest.raises(InputError, match=r"scan 11 of /scan has no valid point .* with it 2 of 12 scans cannot"):
+        read(path, max_bad_scans_percent=8.0)
+    assert len(read(path, max_bad_scans_percent=9.0)[1]) == 10
+
+
+def test_bad_scans_are_left_out_and_counted(tmp_path):
+    blind = blinded(5, 7)
+    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blind]), max_bad_scans_percent=100.0)
+    assert [scan.index for scan in scans] == list(range(10))
+    assert any("2 of 12 scans of /scan were left out (the first: " in line for line in log.damage)
+    with pytest.raises(InputError, match=r"a\.mcap: no scan of /scan could be read: 2 of 2"):
+        read(write(tmp_path / "a.mcap", blind), max_bad_scans_percent=100.0)
+
+
+def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
+    stamps = [0, 1, 1, 3, 2, 4]
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + s, [1.0, 2.0])) for k, s in enumerate(stamps)]
+    path = write(tmp_path / "a.mcap", said)
+    log = open_log(path)
+    for _ in range(2):
+        assert [scan.stamp_ns - STAMP_NS for scan in log.scans()] == stamps
+        assert len(log.notes) == 2
+        assert any("1 step back in the header stamps of /scan" in note for note in log.notes)
+        assert any("1 scan of /scan with the header stamp of the one before" in note for note in log.notes)
+
+
+def test_a_chunk_that_says_nothing_of_its_times_loses_no_scan(tmp_path):
+    path = write(tmp_path / "a.mcap", office(20), compression="none", crcs=False)
+    whole = bytearray(path.read_bytes())
+    times = np.array([STAMP_NS + 19 * SECOND // 10] * 2, "<u8").tobytes()
+    assert times[:8] in whole
+    for index in index_files([path])[0].blocks[-1:]:
+        head = whole.index(np.array([index.start_ns, index.end_ns], "<u8").tobytes())
+        whole[head : head + 16] = bytes(16)
+    path.write_bytes(whole)
+    assert len(list(open_log(path).scans())) == 20
+
+
+# the wheel-odometry prior
+
+
+def wheels(*entries, topic="/odom"):
+    """Readings (log time s, stamp s, x)."""
+    return [
+        odometry_said(STAMP_NS + round(at * SECOND), odometry(STAMP_NS + round(stamp * SECOND), x, 0.0), topic)
+        for at, stamp, x in entries
+    ]
+
+
+def one_scan(at, stamp):
+    return scan_said(
+        STAMP_NS + round(at * SECOND), laser_scan(STAMP_NS + round(stamp * SECOND), [1.0, 2.0], beam_s=1e-3)
+    )
+
+
+def prior_x(path, **config):
+    _, (scan,) = read(path, **config)
+    return None if scan.T_odom_base is None else scan.T_odom_base[0, 2]
+
+
+def test_the_prior_is_interpolated_between_the_readings_around_the_stamp(tmp_path):
+    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 1.0)), one_scan(0.05, 0.05), *wheels((0.2, 0.2, 3.0))])
+    assert prior_x(path) == pytest.approx(1.5)
+
+
+def test_a_reading_with_the_scans_own_stamp_is_taken_as_it_is(tmp_path):
+    said = [*wheels((0.0, 0.3, 7.0), (0.1, 0.05, 5.0)), one_scan(0.11, 0.05), *wheels((0.2, 0.01, 9.0))]
+    assert prior_x(write(tmp_path / "a.mcap", said)) == 5.0
+
+
+def test_the_prior_turns_the_short_way_round(tmp_path):
+    said = [
+        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, 3.1)),
+        one_scan(0.1, 0.1),
+        odometry_said(STAMP_NS + SECOND // 5, odometry(STAMP_NS + SECOND // 5, 0.0, 0.0, -3.1)),
+    ]
+    _, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert abs(lie.yaw(scan.T_odom_base)) == pytest.approx(np.pi)
+
+
+def test_the_nearest_reading_serves_up_to_half_a_second_and_none_beyond(tmp_path):
+    near = write(tmp_path / "near.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.4, 0.4)])
+    late = write(tmp_path / "late.mcap", [one_scan(0.0, 0.0), *wheels((0.4, 0.4, 6.0))])
+    far = write(tmp_path / "far.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.6, 0.6)])
+    assert prior_x(near) == 4.0 and prior_x(late) == 6.0 and prior_x(far) is None
+
+
+def test_a_scan_does_not_wait_for_ever_for_a_reading(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0)), *(one_scan(0.01 * k, 0.01 * k) for k in range(1, 200))]
+    _, scans = read(write(tmp_path / "a.mcap", said))
+    assert len(scans) == 199
+    assert all(scan.T_odom_base is not None for scan in scans[:50]) and scans[-1].T_odom_base is None
+
+
+def test_ground_truth_is_never_a_prior(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)]
+    log, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert not log.has_odometry and scan.T_odom_base is None
+
+
+def test_of_several_odometry_topics_none_is_used_until_one_is_chosen(tmp_path):
+    said = [*wheels((0.0, 0.0, 4.0)), *wheels((0.0, 0.0, 8.0), topic="/visual"), one_scan(0.01, 0.0)]
+    path = write(tmp_path / "a.mcap", said)
+    log, (scan,) = read(path)
+    assert scan.T_odom_base is None and not log.has_odometry
+    assert any("/odom" in note and "/visual" in note for note in log.notes)
+    assert prior_x(path, odometry_topic="/visual") == 8.0
+
+
+# the mounting
+
+
+def mounted(path, *entries):
+    said = [transforms_said(STAMP_NS, transforms(*entries)), *wheels((0.0, 0.0, 0.0)), one_scan(0.1, 0.1)]
+    log, (scan,) = read(write(path, said))
+    return log.T_base_lidar, scan.points
+
+
+def test_the_mounting_is_chained_through_the_static_tree(tmp_path):
+    T, _ = mounted(
+        tmp_path / "a.mcap",
+        ("base_link", "mast", 1.0, 0.0, np.pi / 2, 0.0),
+        ("mast", "laser", 0.5, 0.0, 0.0, 0.0),
+    )
+    np.testing.assert_allclose(T, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+
+
+def test_the_mounting_is_the_identity_where_no_chain_joins_the_frames(tmp_path):
+    T, _ = mounted(tmp_path / "a.mcap", ("map", "camera", 1.0, 0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(T, np.eye(3))
+
+
+def test_without_a_base_link_the_root_of_the_static_tree_is_the_base_and_said_to_be(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("imu_link", "mast", 1.0, 0.0, np.pi / 2, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
+    assert log.mounting.base == "imu_link"
+    assert log.notes == ["the log has no transform from base_link to laser: imu_link is taken as the base"]
+
+
+def test_the_frame_of_the_wheels_is_the_base_before_the_root_is(tmp_path):
+    said = [
+        transforms_said(
+            STAMP_NS,
+            transforms(("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)),
+        ),
+        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, child="chassis")),
+        one_scan(0.1, 0.1),
+    ]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.base == "chassis" and log.T_base_lidar[0, 2] == 0.5 and log.notes == []
+
+
+def test_a_frame_of_the_world_is_never_the_base(tmp_path):
+    T, _ = mounted(tmp_path / "a.mcap", ("map", "mast", 9.0, 0.0, 0.0, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0))
+    assert T[0, 2] == 0.5
+
+
+def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
+    yaw, x, y = 0.4, 0.2, -0.1
+    T, points = mounted(tmp_path / "a.mcap", ("base_link", "laser", x, y, yaw, np.pi))
+    raw = np.column_stack([laser_points(np.array([1.0, 2.0])), np.zeros(2)])
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0])
+    in_base = (raw @ R.T)[:, :2] + [x, y]
+    np.testing.assert_allclose(lie.transform(T, points), in_base, atol=1e-6)
+    assert points.flags.c_contiguous and points.dtype == np.float32
+    assert np.linalg.det(T[:2, :2]) == pytest.approx(1.0)
+
+
+def test_a_cloud_keeps_the_full_mounting(tmp_path):
+    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = [
+        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.0, np.pi))),
+        *wheels((0.0, 0.0, 3.0)),
+        cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
+    ]
+    log, (scan,) = read(write(tmp_path / "a.mcap", said))
+    assert log.dimension == 3 and scan.T_odom_base.shape == (4, 4) and scan.T_odom_base[0, 3] == 3.0
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
+    np.testing.assert_allclose(log.T_base_lidar[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+    np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
+
+
+# clouds of planar scanners
+
+
+def cloud_of(k, points):
+    rows = np.zeros(len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
+    for name, column in zip("xyz", np.transpose(points), strict=True):
+        rows[name] = column
+    rows["t"] = np.arange(len(points)) * 1_000_000
+    stamp_ns = STAMP_NS + k * SECOND // 10
+    return cloud_said(stamp_ns, point_cloud(stamp_ns, rows))
+
+
+def test_point_times_far_from_the_stamp_are_told_with_the_setting_that_mends_them(tmp_path):
+    """Whole numbers in nanoseconds, taken as seconds."""
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    path = write(tmp_path / "a.mcap", [cloud_of(k, points) for k in range(3)])
+    with pytest.raises(InputError, match=r"scan 0 of /points has a point 8e\+06 s from .* \(log.point_times sets"):
+        read(path, point_times="s", max_bad_scans_percent=0.0)
+    assert len(read(path, point_times="ns")[1]) == 3
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.3])
+def test_clouds_with_all_points_at_one_height_are_a_planar_log(tmp_path, height_m):
+    said = [cloud_of(k, [(1, 2, height_m), (3, 4, height_m), (5, 6, height_m)]) for k in range(3)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.dimension == 2 and log.T_base_lidar.shape == (3, 3)
+    assert f"the clouds of /points are planar (z = {height_m:g} m everywhere): read as a 2D log" in log.notes
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points, [(1, 2), (3, 4), (5, 6)])
+        np.testing.assert_allclose(scan.times_s, [0.0, 1e-3, 2e-3])
+        assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "points", [[(1, 2, 0)], [(1, 2, 0), (3, 4, 0), (5, 6, 0.01)], [(1, 0, 2), (3, 0, 4), (5, 0, 6)]]
+)
+def test_clouds_of_other_points_or_too_few_to_tell_are_not_planar(tmp_path, points):
+    log, _ = read(write(tmp_path / "a.mcap", [cloud_of(k, points) for k in range(5)]))
+    assert log.dimension == 3
+
+
+def test_a_cloud_that_leaves_the_plane_of_those_before_is_malformed(tmp_path):
+    flat = [(x, y, 0.0) for x, y in np.random.default_rng(0).uniform(1, 9, (1100, 2))]
+    path = write(tmp_path / "a.mcap", [cloud_of(0, flat), cloud_of(1, [*flat[:-1], (1, 1, 1)])])
+    with pytest.raises(InputError, match=r"scan 1 .* a point lies 1 m off the plane z = 0 m"):
+        read(path, max_bad_scans_percent=0.0)
+
+
+# a mounting that /tf tells
+
+
+def joined(at, *entries):
+    """A message of /tf, logged at its stamp."""
+    stamp_ns = STAMP_NS + round(at * SECOND)
+    return transforms_said(stamp_ns, transforms(*entries, stamp_ns=stamp_ns), "/tf")
+
+
+def swinging(roll, *, parent="base_link", yaw=lambda at: 0.0, seconds=2.0, extra=()):
+    """Scans at 10 Hz of a lidar whose joint is told at 20 Hz, ``roll`` and ``yaw`` of the seconds."""
+    said = [*extra]
+    for k in range(round(20 * seconds)):
+        at = k / 20
+        said.append(joined(at, (parent, "laser", 0.2, 0.0, yaw(at), roll(at))))
+        said += [] if k % 2 else [one_scan(at, at)]
+    return said
+
+
+def tilt(at):
+    return 0.7 * np.sin(2.0 * np.pi * at)
+
+
+@pytest.mark.parametrize("parent", ["base_link", "torso"])
+def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_path, capfd, parent):
+    path = write(tmp_path / "a.mcap", swinging(tilt, parent=parent))
+    with pytest.raises(InputError) as caught:
+        open_log(path)
+    for part in (
+        f"{parent} → laser in /tf turns from -40 to 40 deg about its x axis",
+        "--topic",
+        "/scan",
+        "--end",
+    ):
+        assert part in str(caught.value)
+    for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
+        assert main([str(word) for word in words]) == 2
+        assert capfd.readouterr().err == f"error: {caught.value}\n"
+    assert main(["info", str(path)]) == 0
+    assert f"problem   {caught.value}" in capfd.readouterr().out
+
+
+def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0))))
+    log, scans = read(path, end_s=0.95)
+    assert len(scans) == 10 and log.mounting.motion is None
+    with pytest.raises(InputError, match="does not stay in one plane"):
+        open_log(path)
+
+
+def test_a_planar_lidar_that_leaves_its_plane_where_nobody_looked_before_is_refused_there(tmp_path):
+    said = swinging(lambda at: 0.5 if 1.05 < at < 1.25 else 0.0, seconds=40.0)
+    path = write(tmp_path / "a.mcap", said, chunk_size=300)
+    log = open_log(path)
+    assert log.mounting.motion is None
+    with pytest.raises(InputError, match="laser has turned by 29 deg in /tf at scan 11"):
+        list(log.scans())
+
+
+@pytest.mark.parametrize("seconds", [2.0, 40.0])
+def test_a_transform_of_tf_that_repeats_itself_is_a_static_mounting(tmp_path, seconds):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.0, yaw=lambda at: 0.4, seconds=seconds))
+    log, _ = read(path)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.4), atol=1e-12)
+    assert log.mounting.motion is None and log.notes == []
+    assert log.mounting.source == "by transforms of /tf, which do not change"
+
+
+def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
+    fixed = transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.0, 0.0, 0.0)))
+    for name, mount in (("static", [fixed]), ("none", [])):
+        said = [*mount]
+        for k in range(20):
+            robot = ("odom", "base_link" if mount else "laser", 0.1 * k, 0.0, 0.1 * k, 0.0)
+            said += [joined(k / 10, ("map", "odom", 0.0, 0.01 * k, 0.0, 0.0), robot), one_scan(k / 10, k / 10)]
+        log, scans = read(write(tmp_path / f"{name}.mcap", said))
+        assert log.mounting.motion is None and len(scans) == 20 and log.notes == []
+        assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
+
+
+@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world"])
+def test_a_robot_that_turns_on_the_spot_in_a_frame_of_the_world_is_no_mount(tmp_path, frame):
+    log, _ = read(write(tmp_path / "a.mcap", swinging(tilt, parent=frame)))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
+def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
+    said = []
+    for k in range(20):
+        said += [joined(k / 10, ("start", "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion is None and log.mounting.base == ""
+
+
+def test_wheels_are_carried_over_to_a_lidar_that_pans_by_tf_at_the_stamp(tmp_path):
+    yaw = {0.0: 0.0, 0.1: 0.2, 0.2: 0.4}
+    said = []
+    for at, turn in yaw.items():
+        said += [joined(at, ("base_link", "laser", 0.2, 0.0, turn, 0.0)), *wheels((at, at, 10.0 * at))]
+    said += [one_scan(0.21, 0.0), one_scan(0.22, 0.05), one_scan(0.23, 0.1)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert "base_link → laser in /tf turns from 0 to 23 deg about its z axis" in log.notes[0]
+    for scan, at in zip(scans, (0.0, 0.05, 0.1), strict=True):
+        expected = lie.pose_2d(10.0 * at, 0.0, 0.0) @ lie.pose_2d(0.2, 0.0, 2.0 * at)
+        np.testing.assert_allclose(scan.T_odom_base @ log.T_base_lidar, expected, atol=1e-9)
+
+
+def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
+    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    said = []
+    for k in range(20):
+        time_ns = STAMP_NS + k * SECOND // 10
+        said += [joined(k / 10, ("base_link", "lidar", 0.0, 0.0, 0.0, tilt(k / 10)))]
+        said += [*wheels((k / 10, k / 10, 0.0)), cloud_said(time_ns, point_cloud(time_ns, rows))]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    assert log.mounting.motion.leaves_plane and "poses are the lidar's" in log.notes[0]
+    turned = [lie.apart(log.T_base_lidar, scan.T_odom_base @ log.T_base_lidar)[1] for scan in scans]
+    np.testing.assert_allclose(turned, np.abs([tilt(k / 10) for k in range(20)]), atol=1e-9)
+
+
+# real logs
+
+
+def test_intel_is_read_whole_in_log_time_order_with_a_prior_on_every_scan():
+    log, scans = read(shared_data("2d/intel.mcap"))
+    assert (log.dimension, log.topic, log.scan_count, len(scans)) == (2, "/scan", 13631, 13631)
+    log_times = np.array([scan.log_time_ns for scan in scans])
+    assert np.all(np.diff(log_times) >= 0)
+    assert np.count_nonzero(np.diff([scan.stamp_ns for scan in scans]) < 0) == 631
+    assert all(scan.T_odom_base is not None for scan in scans)
+    assert not log.damage
+
+
+def test_intel_scans_equal_an_independent_decoders():
+    path = shared_data("2d/intel.mcap")
+    _, scans = read(path, end_s=60.0)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        latest = {}
+        checked = 0
+        for _, channel, _, message in reader.iter_decoded_messages(["/scan", "/odom"]):
+            latest[channel.topic] = message
+            if channel.topic != "/scan":
+                continue
+            if checked == len(scans):
+                break
+            scan = scans[checked]
+            ranges = np.array(message.ranges)
+            angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+            valid = (ranges > message.range_min) & (ranges < message.range_max)
+            points = (ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))[valid]
+            np.testing.assert_allclose(scan.points, points, atol=1e-5)
+            position = latest["/odom"].pose.pose.position
+            np.testing.assert_allclose(scan.T_odom_base[:2, 2], [position.x, position.y])
+            checked += 1
+    assert checked == len(scans) > 100
+
+
+def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
+    path = shared_data("3d/kitti_0005_first60.mcap")
+    log = open_log([path], LogConfig())
+    assert (log.dimension, log.scan_count) == (3, 60)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for (_, _, message, cloud), scan in zip(reader.iter_decoded_messages(), log.scans(), strict=True):
+            rows = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)[:, :3]
+            rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
+            assert message.log_time == scan.log_time_ns
+            assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
+
+
+def test_the_mounting_of_a_real_lidar_on_its_imu_is_read():
+    files = [shared_data("3d/kitti_0005_first60.mcap"), shared_data("3d/kitti_0005_first60_imu_gnss.mcap")]
+    log = open_log(files)
+    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [0.811, -0.307, 0.802], atol=1e-3)
+    assert log.mounting.base == "imu_link" and "imu_link is taken as the base" in log.notes[0]
+
+
+def test_kitti_ground_truth_is_that_of_the_published_file():
+    log = open_log([shared_data("3d/kitti_0001_first54.mcap")], LogConfig())
+    truth = log.ground_truth()
+    published = np.loadtxt(shared_data("3d/kitti_0001_first54.tum"))
+    assert truth.poses.shape == (54, 4, 4)
+    np.testing.assert_allclose(truth.stamps_ns * 1e-9, published[:, 0], atol=1e-5)
+    np.testing.assert_allclose(truth.poses[:, :3, 3], published[:, 1:4], atol=1e-6)
+    np.testing.assert_allclose(truth.poses[:, :3, :3], lie.from_quaternion(published[:, 4:]), atol=1e-6)
+
+
+def test_ground_truth_of_a_planar_log_is_planar_and_a_missing_topic_is_named(tmp_path):
+    path = write(tmp_path / "a.mcap", [*office(3), *wheels((0.05, 0.05, 2.0), topic="/ground_truth")])
+    log = open_log([path], LogConfig())
+    truth = log.ground_truth()
+    assert truth.poses.shape == (1, 3, 3) and truth.poses[0, 0, 2] == 2.0
+    with pytest.raises(InputError, match=r"a\.mcap.*?/nowhere.*?/odom"):
+        open_log([path], LogConfig(ground_truth_topic="/nowhere"))
+
+
+def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own(tmp_path):
+    said = [*office(3), *wheels(*[(0.1 * k, 0.1 * k, float(k)) for k in range(5)], topic="/ground_truth")]
+    path = write(tmp_path / "a.mcap", said)
+    alone = open_log([path], LogConfig()).ground_truth()
+    log, _ = read(path)
+    np.testing.assert_array_equal(log.ground_truth().poses, alone.poses)
+    np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
+
+
+def test_the_truth_of_a_log_can_be_left_unused_and_does_not_become_wheels(tmp_path):
+    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)])
+    log = open_log([path], LogConfig(ground_truth_topic="none"))
+    assert log.ground_truth() is None and not log.ground_truth_topic and not log.has_odometry
+
+
+def test_a_log_without_truth_has_none(tmp_path):
+    assert open_log([write(tmp_path / "a.mcap", office(3))], LogConfig()).ground_truth() is None

@@ -1,0 +1,86 @@
+"""Loop closure in the plane: uncertainty from drift, and revisits after drift."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.data import Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.logs import open_log
+from scanchain.loops.connectivity import Drift
+from scanchain.runs.closures import final_verdicts
+from tests.support.drifting import drifting_slam, stretched
+from tests.support.scenes import configured, shared_data
+
+
+def chain(count, sigma_m=0.01):
+    """Keyframes a meter apart on a straight line."""
+    graph = PoseGraph(2)
+    information = np.diag([sigma_m**-2.0, sigma_m**-2.0, 1e6])
+    for index in range(count):
+        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
+        if index:
+            graph.add_edge(index - 1, index, lie.pose_2d(1.0, 0.0, 0.0), information)
+    return graph
+
+
+def test_uncertainty_grows_along_the_path_up_to_its_limit():
+    uncertainty_m = Drift(0.1).between(chain(30), 29, 2.0)
+    assert np.allclose(uncertainty_m, np.minimum(0.1 * (29 - np.arange(30)), 2.0))
+
+
+def test_a_loop_shortens_the_path_for_all_that_it_connects():
+    graph = chain(30)
+    graph.add_edge(5, 25, lie.pose_2d(20.0, 0.0, 0.0), 1e6 * np.eye(3), is_loop=True)
+    uncertainty_m = Drift(0.1).between(graph, 29, 5.0)
+    assert uncertainty_m[5] == pytest.approx(0.4, abs=1e-3)
+    assert uncertainty_m[8] == pytest.approx(0.7, abs=1e-3)
+
+
+def test_an_edge_counts_by_its_own_uncertainty_where_odometry_was_lost():
+    graph = chain(3)
+    graph.add_pose(lie.pose_2d(3.0, 0.0, 0.0), 3)
+    graph.add_edge(2, 3, lie.pose_2d(1.0, 0.0, 0.0), np.diag([2.0, 2.0, 25.0]))
+    assert Drift(0.1).between(graph, 3, 5.0) == pytest.approx([1.2, 1.1, 1.0, 0.0])
+
+
+def test_uncertainty_follows_a_graph_that_grows():
+    graph, drift = chain(10), Drift(0.1)
+    drift.between(graph, 9, 5.0)
+    graph.add_pose(lie.pose_2d(10.0, 0.0, 0.0), 10)
+    graph.add_edge(9, 10, lie.pose_2d(1.0, 0.0, 0.0), 1e6 * np.eye(3))
+    assert Drift(0.1).between(graph, 10, 5.0) == pytest.approx(drift.between(graph, 10, 5.0))
+
+
+def run(longer, turn_rad_m):
+    log = open_log(shared_data("2d/mit_csail.mcap"))
+    slam = drifting_slam(configured(2), log.T_base_lidar, stretched(longer, turn_rad_m))
+    for scan in log.scans():
+        slam.process(scan)
+    return slam.finish()
+
+
+@pytest.fixture(scope="module")
+def undrifted():
+    return run(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("longer", "turn_rad_m"), [(0.01, 0.002), (0.01, -0.005)])
+def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn_rad_m):
+    truth = undrifted.trajectory
+    drifted = run(longer, turn_rad_m)
+    before, after = (
+        absolute_error(pair(trajectory, truth)).translation_m.rmse
+        for trajectory in (drifted.odometry, drifted.trajectory)
+    )
+    assert before > 2.0
+    assert after < before / 5.0
+    judged = final_verdicts(drifted.closures, drifted.state)
+    accepted = [item.closure for item in judged if item.verdict is Verdict.ACCEPTED]
+    assert len(accepted) > 50
+    true = truth.poses[[keyframe.scan_index for keyframe in drifted.keyframes]]
+    for closure in accepted:
+        T_true = lie.inverse(true[closure.target]) @ true[closure.source]
+        off = lie.inverse(T_true) @ closure.match.T_target_source
+        assert np.linalg.norm(off[:2, 2]) < 0.5

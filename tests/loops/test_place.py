@@ -1,0 +1,239 @@
+"""Place recognition in 3D: descriptors, their database, submaps that agree or do not."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.data import Keyframe, Proposal, Verdict
+from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
+from scanchain.kernels.search.descriptor import count_heights, mark_heights
+from scanchain.loops import LoopCloser
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.descriptor import compare, describe, level_frame
+from scanchain.loops.descriptor_recognizer import DescriptorDatabase
+from scanchain.loops.submaps import VoxelSubmaps, submap_around
+from scanchain.loops.verification import SubmapVerifier, free_space_agreement
+from scanchain.simulation import plan
+from scanchain.simulation.sensors import take_sweep
+from tests.support import naive_loops
+from tests.support.scenes import configured, stored
+
+RADIUS_M = 32.0
+
+
+def pose(x=0.0, y=0.0, z=0.0, yaw=0.0, pitch=0.0):
+    return (
+        lie.exp(np.array([x, y, z, 0, 0, 0.0]))
+        @ lie.exp(np.array([0, 0, 0, 0, 0, yaw]))
+        @ lie.exp(np.array([0, 0, 0, 0, pitch, 0.0]))
+    )
+
+
+@cache
+def drive():
+    return plan("rounds", seed=3, sensor="vlp-16", duration_s=5.0)
+
+
+def scan_from(x, y, yaw, seed=0):
+    """Points (N, 3) of a lidar that stands still in the town, and its true pose."""
+    solids, sensor = drive().solids, drive().sensor
+    height = float(solids.ground_height(np.array([x, y]))) + 1.73
+    T = pose(x, y, height, yaw)
+
+    class Standing:
+        def lidar(self, times_s):
+            return np.repeat(T[None], len(times_s), axis=0)
+
+    sweep = take_sweep(solids, Standing(), sensor, 0, 0.0, np.random.default_rng(seed))
+    return sweep.points().astype(np.float64), T
+
+
+def passage(places, first_index=0, traveled_m=0.0):
+    """Keyframes along places (x, y, yaw), as odometry without drift has them."""
+    keyframes = []
+    for k, (x, y, yaw) in enumerate(places):
+        points, T = scan_from(x, y, yaw, seed=first_index + k)
+        if keyframes:
+            traveled_m += float(np.linalg.norm((T - keyframes[-1].T_odom_lidar)[:3, 3]))
+        index = first_index + k
+        keyframes.append(Keyframe(index, index, index, stored(points), T, traveled_m))
+    return keyframes
+
+
+@cache
+def street(offset_m=0.0, backwards=False):
+    """A drive of 60 m along one street, so far aside of its lane, perhaps the other way."""
+    along = np.arange(20.0, 80.1, 4.0)
+    if backwards:
+        return tuple((x, -2.0 + offset_m, np.pi) for x in along[::-1])
+    return tuple((x, -2.0 + offset_m, 0.0) for x in along)
+
+
+@cache
+def place_in_the_middle(offset_m=0.0, backwards=False):
+    """Submap and descriptor around the middle of that drive."""
+    keyframes = passage(street(offset_m, backwards))
+    submap = submap_around(keyframes, len(keyframes) // 2, RADIUS_M, Segments())
+    return submap, describe(submap, lie.identity(3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_view_from_above_equals_the_naive_one(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 6.0, (3000, 3)) * [1.0, 1.0, 3.0]
+    T = pose(1.0, -2.0, 0.5, yaw=0.7, pitch=0.1)
+    masks, counts = np.zeros((32, 32), np.uint64), np.empty((32, 32), np.uint8)
+    mark_heights(points, T, 0.5, masks)
+    count_heights(masks, counts)
+    expected = naive_loops.heights(points, T, 0.5, 32)
+    assert expected.max() > 5
+    np.testing.assert_array_equal(counts, expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ranges_compare_as_the_naive_ones(seed):
+    rng = np.random.default_rng(seed)
+    seen = rng.normal(0.0, 8.0, (2000, 3))
+    points = seen[::3] * rng.uniform(0.5, 1.2, (len(seen[::3]), 1))
+    T = pose(0.1, 0.2, 0.0, yaw=0.02)
+    ranges_m = np.empty((20, 40))
+    nearest_ranges(seen, ranges_m)
+    found = compare_ranges(points, T, ranges_m, 0.5, 0.05)
+    assert found == naive_loops.agreement(seen, points, T, ranges_m.shape, 0.5, 0.05)
+    assert min(found) > 20
+
+
+def test_where_nothing_was_seen_nothing_is_said():
+    ranges_m = np.empty((10, 20))
+    nearest_ranges(np.empty((0, 3)), ranges_m)
+    assert np.all(ranges_m == FAR)
+    assert compare_ranges(np.ones((5, 3)), lie.identity(3), ranges_m, 0.5, 0.0) == (0, 0)
+    assert compare_ranges(np.zeros((1, 3)), lie.identity(3), ranges_m, 0.5, 0.0) == (0, 0)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, 1.9, 3.0, -2.3, -0.7])
+def test_a_place_is_known_again_however_it_is_turned(yaw):
+    submap, place = place_in_the_middle()
+    turned = describe(submap, pose(3.0, -4.0, yaw=yaw))
+    alignment = compare(turned, place)
+    error = lie.log(alignment.T_target_source)
+    assert alignment.similarity > 0.8
+    assert np.linalg.norm(error[:3]) < 0.3 and np.linalg.norm(error[3:]) < 0.03
+    assert np.linalg.norm(turned.key - place.key) < 0.25
+
+
+@pytest.mark.parametrize(("offset_m", "backwards"), [(0.0, False), (4.0, False), (4.0, True), (0.0, True)])
+def test_a_place_is_known_again_from_the_other_lane_and_the_other_way(offset_m, backwards):
+    _, first = place_in_the_middle()
+    submap, second = place_in_the_middle(offset_m, backwards)
+    alignment = compare(second, first)
+    truth = lie.inverse(place_in_the_middle()[0].anchor.T_odom_lidar) @ submap.anchor.T_odom_lidar
+    error = lie.inverse(truth) @ alignment.T_target_source
+    assert alignment.similarity > 0.6
+    assert np.linalg.norm(error[:2, 3]) < 1.0 and lie.rotation_angle(error) < 0.1
+
+
+def test_a_heading_that_is_expected_is_kept_to():
+    submap, place = place_in_the_middle()
+    opposite = describe(submap, pose(yaw=np.pi))
+    free = compare(opposite, place)
+    held = compare(opposite, place, expected_rad=0.0, within_rad=0.5)
+    level = lie.inverse(place.T_anchor_level) @ held.T_target_source @ opposite.T_anchor_level
+    assert free.similarity > held.similarity
+    assert abs(np.arctan2(level[1, 0], level[0, 0])) < 0.6
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.35, 0.0), (-0.2, 0.25)])
+def test_up_is_where_the_ground_says_whatever_the_lidars_tilt(pitch, roll):
+    points, _ = scan_from(50.0, -2.0, 0.3)
+    T_level_tilted = lie.exp(np.array([0, 0, 0, roll, pitch, 0.0]))
+    tilted = lie.transform(lie.inverse(T_level_tilted), points)
+    T = level_frame(Keyframe(0, 0, 0, stored(tilted), lie.identity(3), 0.0), configured(3).local_map)
+    up = (T_level_tilted @ T)[:3, 2]
+    assert np.arccos(up[2]) < 0.05
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_the_database_finds_what_a_linear_search_finds():
+    rng = np.random.default_rng(0)
+    database, kept = DescriptorDatabase(), []
+    _, model = place_in_the_middle()
+    for k in range(120):
+        key = rng.normal(size=len(model.key)).astype(np.float32)
+        descriptor = type(model)(k, model.T_anchor_level, model.cell_m, model.image, model.spectrum, key)
+        found = database.most_similar(descriptor, 5, k - 10.0)
+        old = [other for other in kept if other.anchor <= k - 10]
+        expected = sorted(old, key=lambda other: float(np.linalg.norm(other.key - key)))[:5]
+        assert [other.anchor for other in found] == [other.anchor for other in expected]
+        database.add(descriptor, float(k))
+        kept.append(descriptor)
+
+
+def test_submaps_of_one_place_agree_and_those_of_two_do_not():
+    here, _ = place_in_the_middle()
+    again, _ = place_in_the_middle(4.0, True)
+    truth = lie.inverse(here.anchor.T_odom_lidar) @ again.anchor.T_odom_lidar
+    true = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
+    error = lie.inverse(truth) @ true.match.T_target_source
+    assert true.match.converged and true.overlap > 0.6 and true.agreement > 0.9
+    assert np.linalg.norm(error[:3, 3]) < 0.1 and lie.rotation_angle(error) < 0.005
+    false = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(0.0, 9.0))
+    assert false.agreement < 0.87
+
+
+def test_a_wall_in_what_was_seen_as_free_is_held_against_a_match():
+    here, _ = place_in_the_middle()
+    wall = np.stack(np.meshgrid([6.0], np.linspace(-3, 3, 40), np.linspace(-1, 2, 20)), axis=-1).reshape(-1, 3)
+    own = here.points()[::20]
+    assert free_space_agreement(here, own, lie.identity(3), 1.0) > 0.75
+    assert free_space_agreement(here, wall, lie.identity(3), 1.0) < 0.2
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
+    points, T = scan_from(50.0, -2.0, 0.0)
+    submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
+    submap = submaps.around(0, [Keyframe(0, 0, 0, stored(points), T, 0.0, scale)], 0)
+    assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
+
+
+@cache
+def there_and_back(lost_m=0.0):
+    """Keyframes of a street, and of it again the other way after a detour, odometry so far off."""
+    there = passage(street())
+    back = passage(street(4.0, True), len(there), there[-1].traveled_m + 120.0)
+    shift = pose(lost_m, 0.5 * lost_m, yaw=0.02 * lost_m)
+    moved = [
+        Keyframe(k.index, k.scan_index, k.stamp_ns, k.stored, shift @ k.T_odom_lidar, k.traveled_m) for k in back
+    ]
+    return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
+
+
+@pytest.mark.parametrize("lost_m", [0.0, 8.0])
+def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lost_m):
+    keyframes, truth = there_and_back(lost_m)
+    closer = LoopCloser(configured(3), 3).places
+    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+    accepted = [
+        closure
+        for k in range(1, len(keyframes) + 1)
+        for closure in closer.close(keyframes[:k], poses[:k], np.ones(k, bool), finish=k == len(keyframes))
+        if closure.verdict is Verdict.ACCEPTED
+    ]
+    assert any(closure.proposed_by is Proposal.PLACE for closure in accepted) and len(accepted) >= 3
+    for closure in accepted:
+        true = lie.inverse(truth[closure.target]) @ truth[closure.source]
+        assert np.linalg.norm((lie.inverse(true) @ closure.match.T_target_source)[:3, 3]) < 0.2
+
+
+def test_a_place_that_odometry_cannot_have_missed_by_so_much_is_refused(monkeypatch):
+    monkeypatch.setattr("scanchain.loops.place_closer._PLACE_DRIFT", 0.001)
+    keyframes, _ = there_and_back(8.0)
+    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+    closures = LoopCloser(configured(3), 3).places.close(
+        keyframes, poses, np.ones(len(keyframes), bool), finish=True
+    )
+    assert closures and all(closure.verdict is Verdict.REJECTED for closure in closures)
+    assert any("of the path between" in closure.reason for closure in closures)

@@ -1,0 +1,145 @@
+"""A place recognizer of the user's own: loaded by name, asked, checked, and fed again after a checkpoint."""
+
+import random
+import subprocess
+import sys
+from itertools import islice
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain import plugins
+from scanchain.data import Proposal, Verdict
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.loops import LoopCloser
+from scanchain.runs.directory import POINTS_FILE
+from scanchain.runs.resume.checkpoint import Checkpoints, read_checkpoint
+from scanchain.slam import Slam
+from tests.support.scenes import configured, shared_data
+
+RECOGNIZER = '''
+import numpy as np
+from scanchain import lie
+from scanchain.loops.recognizer import Candidate
+
+
+class Ranges:
+    """Submaps by the histogram of their ranges, the pose by odometry."""
+
+    def __init__(self, config, dimension):
+        self.seen = []
+
+    def add(self, submap):
+        ranges_m = np.linalg.norm(submap.points(), axis=1)
+        histogram, _ = np.histogram(ranges_m, 16, (0.0, submap.radius_m))
+        self.seen.append((submap.anchor, histogram / max(np.linalg.norm(histogram), 1e-9)))
+
+    def query(self, query):
+        _, histogram = self.seen[-1]
+        old = [(float(histogram @ h), a) for a, h in self.seen if a.traveled_m <= query.max_traveled_m]
+        best = sorted(old, key=lambda each: -each[0])[:2]
+        return [
+            Candidate(a.index, lie.between(query.T_world[a.index], query.T_world_anchor), score)
+            for score, a in best
+        ]
+
+
+class Careless(Ranges):
+    def query(self, query):
+        return [Candidate(query.submap.anchor.index, np.eye(3), 1.0)]
+
+
+class Mute:
+    def __init__(self, config, dimension):
+        pass
+'''
+SMALL = {"loops.place_radius_m": 2.0, "loops.min_travel_m": 8.0}
+CSAIL = "2d/mit_csail.mcap"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory, with the module in it; what it adds to the search path is taken back."""
+    (tmp_path / "my_places.py").write_text(RECOGNIZER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    sys.modules.pop("my_places", None)
+
+
+def by_place(closures):
+    return [
+        closure
+        for closure in closures
+        if closure.verdict is Verdict.ACCEPTED and closure.proposed_by is Proposal.PLACE
+    ]
+
+
+def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_bit(folder):
+    log = open_log(shared_data(CSAIL))
+    config = configured(2, SMALL | {"loops.recognizer": "my_places:Ranges"})
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, folder / POINTS_FILE)
+    breaks = set(random.Random(2).sample(range(600), 4))
+    for scan in islice(log.scans(), 600):
+        a, b = straight.process(scan), broken.process(scan)
+        assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
+        if scan.index in breaks:
+            Checkpoints(folder, 10.0).write(broken)
+            broken = read_checkpoint(folder).slam
+            broken.points.reopen(folder / POINTS_FILE)
+    a, b = straight.finish(), broken.finish()
+    assert len(by_place(a.closures)) > 3
+    assert [(c.target, c.source, c.verdict) for c in a.closures] == [
+        (c.target, c.source, c.verdict) for c in b.closures
+    ]
+    assert a.trajectory.poses.tobytes() == b.trajectory.poses.tobytes()
+
+
+def test_a_run_finds_it_in_the_working_directory_also_where_python_does_not_look_there(folder):
+    command = [sys.executable, "-P", "-m", "scanchain", "run", shared_data(CSAIL), "--out", "run", "--end", "150"]
+    command += [word for key, value in SMALL.items() for word in (f"--{key}", str(value))]
+    command += ["--loops.recognizer", "my_places:Ranges", "--rerun", "off"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "place" in pq.read_table("run/loops.parquet")["proposed_by"].to_pylist()
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("my_places:Mute", ("my_places:Mute", "no method add")),
+        ("my_places:Rangers", ("has no class Rangers", "Ranges, Careless, Mute")),
+        ("nowhere:Ranges", ("no module nowhere", "PYTHONPATH")),
+        ("my_places:", ("wanted module:Class",)),
+        ("ranges", ("one of auto, none, descriptor", "module:Class")),
+        ("descriptor", ("3D logs",)),
+    ],
+)
+def test_a_name_that_leads_to_no_recognizer_is_refused_with_what_to_do(folder, name, parts):
+    with pytest.raises(InputError) as error:
+        LoopCloser(configured(2, {"loops.recognizer": name}), 2)
+    assert all(part in str(error.value) for part in parts), str(error.value)
+
+
+def test_a_module_that_cannot_be_imported_says_why(folder):
+    (folder / "broken_places.py").write_text("import nothing_of_this_name\n")
+    with pytest.raises(InputError, match=r"importing broken_places failed with ModuleNotFoundError: .*nothing_of"):
+        plugins.load("broken_places:Ranges")
+
+
+def test_a_candidate_that_is_not_older_is_refused(folder):
+    log = open_log(shared_data(CSAIL))
+    slam = Slam(configured(2, SMALL | {"loops.recognizer": "my_places:Careless"}), log.T_base_lidar)
+    with pytest.raises(InputError, match="my_places:Careless: candidate 0 for keyframe 0 is not older"):
+        for scan in log.scans():
+            slam.process(scan)
+
+
+def test_without_one_nothing_is_loaded_from_the_working_directory(folder):
+    before = list(sys.path)
+    for name in ("auto", "none"):
+        assert LoopCloser(configured(2, {"loops.recognizer": name}), 2).places.recognizer is None
+    assert LoopCloser(configured(3), 3).places.recognizer is not None
+    assert np.array_equal(before, sys.path)

@@ -1,0 +1,91 @@
+"""All scans of a planar log aligned to the map of the keyframes at the end."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.data import Keyframe
+from scanchain.kernels.registration.icp import refine
+from scanchain.loops import refined
+from scanchain.point_store import PointStore
+from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import settings_of
+from tests.support import naive_loops
+from tests.support.scenes import configured
+
+ANGLES = np.linspace(-3.0, 3.0, 240)
+
+
+def seen_in_room(T, length_m=6.0, width_m=4.0, reach_m=np.inf):
+    """Points (N, 2) that a lidar at a pose sees of the four walls of a room around the origin."""
+    yaw = np.arctan2(T[1, 0], T[0, 0])
+    c, s = np.cos(ANGLES + yaw), np.sin(ANGLES + yaw)
+    x_m = (np.sign(c) * 0.5 * length_m - T[0, 2]) / c
+    y_m = (np.sign(s) * 0.5 * width_m - T[1, 2]) / s
+    ranges_m = np.minimum(x_m, y_m)
+    seen = ranges_m < reach_m
+    return (ranges_m[:, None] * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)]))[seen]
+
+
+def drive(**room):
+    """Twenty true poses in a room, the store and spans of their scans, and every fifth as a keyframe."""
+    truth = np.array([lie.pose_2d(0.1 * k - 1.0, 0.03 * k, 0.05 * k) for k in range(20)])
+    store = PointStore(2)
+    stored = [store.add(seen_in_room(T, **room)) for T in truth]
+    spans = np.array([(each.first, each.count) for each in stored])
+    keyframes = [Keyframe(k // 5, k, k, stored[k], truth[k], 0.1 * k) for k in range(0, 20, 5)]
+    return truth, store, spans, keyframes
+
+
+def shaken(truth, sigma_m, sigma_rad, seed=0):
+    """The poses, but for keyframes, off by so much."""
+    noise = np.random.default_rng(seed).normal(size=(len(truth), 3)) * [sigma_m, sigma_m, sigma_rad]
+    noise[::5] = 0.0
+    return truth @ lie.exp(noise)
+
+
+def error_m(poses, truth):
+    return np.sqrt(np.mean((poses - truth)[:, :2, 2] ** 2))
+
+
+def test_scans_find_the_place_that_the_keyframes_give_them():
+    truth, store, spans, keyframes = drive()
+    poses = shaken(truth, 0.03, 0.005)
+    after = refined(poses, spans, store, keyframes, configured(2))
+    assert error_m(after, truth) < 0.3 * error_m(poses, truth)
+
+
+def test_a_scan_stays_where_the_map_tells_nothing():
+    truth, store, spans, keyframes = drive(length_m=100.0, reach_m=10.0)
+    poses = truth.copy()
+    poses[7] = truth[7] @ lie.pose_2d(0.0, 0.03, 0.0)
+    poses[8] = lie.pose_2d(0.03, 0.0, 0.0) @ truth[8]
+    after = refined(poses, spans, store, keyframes, configured(2))
+    assert abs(after[7, 1, 2] - truth[7, 1, 2]) < 0.005
+    assert abs(after[8, 0, 2] - poses[8, 0, 2]) < 0.5 * 0.03
+
+
+def test_a_scan_without_points_or_far_from_everything_stays():
+    truth, store, spans, keyframes = drive()
+    spans[3, 1] = 0
+    poses = truth.copy()
+    poses[4] = lie.pose_2d(50.0, 50.0, 1.0)
+    after = refined(poses, spans, store, keyframes, configured(2))
+    assert np.array_equal(after[3:5], poses[3:5])
+
+
+@pytest.mark.parametrize("least_share", [0.3, 1.0])
+def test_the_kernel_is_one_alignment_after_the_other(least_share):
+    truth, store, spans, keyframes = drive()
+    config = configured(2)
+    surfaces = VoxelMap(2, config.local_map)
+    for keyframe in keyframes:
+        surfaces.insert(keyframe.points, truth[keyframe.scan_index])
+    points, starts = store.read(0, store.rows).astype(float), np.append(0, np.cumsum(spans[:, 1]))
+    prior, terms = np.diag([2.0, 2.0, 40.0]), settings_of(config.matching, surfaces, wide=False)
+    fast = shaken(truth, 0.05, 0.02)
+    slow = fast.copy()
+    refine(surfaces.voxels, points, starts, fast, prior, least_share, terms)
+    naive_loops.refine(surfaces.voxels, points, starts, slow, prior, least_share, terms)
+    np.testing.assert_allclose(fast, slow, atol=1e-9)
+    assert (fast != shaken(truth, 0.05, 0.02)).any()

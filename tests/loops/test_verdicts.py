@@ -1,0 +1,202 @@
+"""The last word on loop closures: wrong ones are found out, and the table says what became of each."""
+
+import json
+import re
+from collections import Counter
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain.__main__ import main
+from scanchain.config import GraphConfig, LogConfig
+from scanchain.data import Proposal, Verdict
+from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.files.g2o import read_g2o
+from scanchain.logs import open_log
+from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.metrics import Metrics
+from scanchain.simulation import simulate
+from scanchain.slam import Slam
+from tests.support.false_loops import MADE_UP, false_closures
+from tests.support.scenes import configured
+
+DURATION_S = 110.0  # round the office's ring once and on for a while
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("office") / "office.mcap"
+    simulate("office", path, duration_s=DURATION_S)
+    return open_log([path], LogConfig())
+
+
+def driven(log):
+    """The chain after the last scan, before it is asked for its result."""
+    slam = Slam(configured(2), log.T_base_lidar)
+    for scan in log.scans():
+        slam.process(scan)
+    return slam
+
+
+@pytest.fixture(scope="module")
+def undisturbed(log):
+    return driven(log).finish()
+
+
+@pytest.fixture(scope="module")
+def disturbed(log):
+    slam = driven(log)
+    slam._take(false_closures(slam, 0.3))
+    return slam.finish()
+
+
+def ate_m(result, log):
+    return absolute_error(pair(result.trajectory, log.ground_truth())).translation_m.rmse
+
+
+def test_with_thirty_percent_wrong_loops_the_map_is_as_good_and_all_of_them_are_named(log, undisturbed, disturbed):
+    judged = final_verdicts(disturbed.closures, disturbed.state)
+    wrong = [item for item in judged if item.closure.reason == MADE_UP]
+    accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
+    assert len(wrong) >= 0.3 * (len(wrong) + len(accepted)) and len(wrong) >= 5
+    assert all(item.verdict is Verdict.REJECTED and "contradicts" in item.reason for item in wrong)
+    assert ate_m(disturbed, log) == pytest.approx(ate_m(undisturbed, log), rel=0.2)
+
+
+def test_a_wrong_closure_keeps_a_large_chi2_and_a_true_one_ends_with_a_small_one(disturbed):
+    judged = final_verdicts(disturbed.closures, disturbed.state)
+    accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
+    wrong = [item for item in judged if item.closure.reason == MADE_UP]
+    assert max(item.chi2_after for item in accepted) < min(item.chi2_after for item in wrong)
+    assert sum(item.chi2_after for item in accepted) < sum(item.closure.chi2_before for item in accepted)
+
+
+def test_two_closures_of_the_same_keyframes_each_have_their_own_edge(disturbed):
+    judged = final_verdicts(disturbed.closures, disturbed.state)
+    entered = [item for item in judged if item.closure.verdict is Verdict.ACCEPTED]
+    loops = disturbed.state.edge_chi2[disturbed.state.is_loop]
+    assert sorted(item.chi2_after for item in entered) == pytest.approx(sorted(loops.tolist()))
+
+
+def test_the_table_says_who_proposed_and_what_the_graph_said(tmp_path, disturbed):
+    judged = final_verdicts(disturbed.closures, disturbed.state)
+    write_closures(tmp_path / "loops.parquet", judged, disturbed.keyframes, 2)
+    table = pq.read_table(tmp_path / "loops.parquet").to_pydict()
+    assert set(table["proposed_by"]) == {str(Proposal.POSITION)}
+    for closure, before, after in zip(disturbed.closures, table["chi2_before"], table["chi2_after"], strict=True):
+        entered = closure.verdict is Verdict.ACCEPTED
+        assert (before is not None and before >= 0.0) == entered
+        assert (after is not None and after >= 0.0) == entered
+
+
+@pytest.fixture(scope="module")
+def forced(log, tmp_path_factory):
+    """The directory of a run into which false loops were forced at its end."""
+
+    class Forced(Slam):
+        def finish(self, tell):
+            self._take(false_closures(self, 0.3))
+            return super().finish(tell)
+
+    out = tmp_path_factory.mktemp("forced") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scanchain.runs.processing.Slam", Forced)
+        assert main(["run", str(log.paths[0]), "--out", str(out), "--odometry.prior", "constant-velocity"]) == 0
+    return out
+
+
+def moved_m(poses, others):
+    return np.linalg.norm((poses - others)[:, :-1, -1], axis=1).max()
+
+
+def by_gtsam(path):
+    """The poses of a graph's minimum by GTSAM, started from the file's own."""
+    gtsam = pytest.importorskip("gtsam")
+    graph, values = gtsam.readG2o(str(path), False)
+    graph.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.array([found.atPose2(index).matrix() for index in range(found.size())])
+
+
+def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    assert metrics["closures_rejected_by_back_end"] >= 5
+    graph = read_g2o(forced / "graph.g2o").graph
+    before = graph.poses
+    answer = graph.optimize(GraphConfig())
+    assert moved_m(graph.poses, before) < 1e-3
+    assert answer.chi2_before == pytest.approx(metrics["chi2"], rel=1e-6)
+    assert (
+        answer.state.degrees_of_freedom == metrics["degrees_of_freedom"] == 3 * (len(graph.edges) - len(graph) + 1)
+    )
+    assert moved_m(by_gtsam(forced / "graph.g2o"), before) < 1e-3
+
+
+def test_rejected_loops_stand_in_a_file_of_their_own(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    rejected = read_g2o(forced / "graph_rejected.g2o").graph
+    table = pq.read_table(forced / "loops.parquet").to_pylist()
+    named = [[row["target"], row["source"]] for row in table if "contradicts" in row["reason"]]
+    assert rejected.edges.tolist() == named and len(named) == metrics["closures_rejected_by_back_end"]
+    kept = read_g2o(forced / "graph.g2o").graph
+    assert np.array_equal(rejected.poses, kept.poses)
+    kept.add_edges(rejected.edges, rejected.measurements, rejected.information, np.zeros(len(named), bool))
+    before = kept.poses
+    kept.optimize(GraphConfig(), initialize="given")
+    assert moved_m(kept.poses, before) > 0.5  # what a graph with all of them would do
+
+
+def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    assert metrics["chi2"] < 5.0 * metrics["degrees_of_freedom"]
+    said = re.search(
+        r"χ² ([0-9.,]+) over ([0-9,]+) degrees of freedom, ([0-9]+) closures rejected by the back end",
+        (forced / "summary.txt").read_text(encoding="utf-8"),
+    )
+    chi2, degrees, rejected = (float(word.replace(",", "")) for word in said.groups())
+    assert chi2 == pytest.approx(metrics["chi2"], rel=0.01)
+    assert (degrees, rejected) == (metrics["degrees_of_freedom"], metrics["closures_rejected_by_back_end"])
+    assert said[0] in (forced / "report.html").read_text(encoding="utf-8")
+
+
+def test_closures_tried_are_those_rejected_by_verification_or_by_the_back_end_and_those_accepted(forced):
+    metrics = json.loads((forced / "metrics.json").read_bytes())
+    tried, by_verification, verified, by_back_end, accepted = (
+        metrics[f"closures_{name}"]
+        for name in ("tried", "rejected_by_verification", "verified", "rejected_by_back_end", "accepted")
+    )
+    assert min(by_verification, by_back_end, accepted) > 0
+    assert tried == by_verification + verified and verified == by_back_end + accepted
+    rows = pq.read_table(forced / "loops.parquet").to_pylist()
+    assert Counter(row["rejected_by"] for row in rows) == {
+        "verification": by_verification, "back end": by_back_end, "": accepted
+    }  # fmt: skip
+    assert all((row["verdict"] == "accepted") == (not row["rejected_by"]) for row in rows)
+    line = (
+        f"{tried:,} tried: {by_verification:,} rejected by verification, {by_back_end:,} by the back end, "
+        f"{accepted:,} accepted"
+    )
+    page = (forced / "report.html").read_text(encoding="utf-8")
+    assert f"loop closures  {line}\n" in (forced / "summary.txt").read_text(encoding="utf-8")
+    assert f"<dd>{line}</dd>" in page
+    legend = Counter(re.findall(r"</i>(?:closures )?((?:rejected by|accepted)[^:<]*: [\d,]+)", page))
+    assert legend == {
+        f"rejected by verification: {by_verification:,}": 2,  # trajectory, loop closures
+        f"rejected by the back end: {by_back_end:,}": 2,
+        f"accepted: {accepted:,}": 2,
+    }
+
+
+def test_loops_without_degrees_of_freedom_are_not_said_to_be_none(forced):
+    metrics = msgspec.json.decode((forced / "metrics.json").read_bytes(), type=Metrics)
+    assert msgspec.structs.replace(metrics, chi2=2.0, degrees_of_freedom=0).fit.startswith("χ² 2 over 0 degrees")
+
+
+def test_a_run_without_loops_has_none_to_check(tmp_path, log):
+    words = ["run", log.paths[0], "--out", tmp_path / "run", "--end", "3", "--no-loops", "--rerun", "off"]
+    assert main([str(word) for word in words]) == 0
+    said = (tmp_path / "run" / "summary.txt").read_text(encoding="utf-8")
+    assert "no loops to check" in said and "χ²" not in said
+    assert not (tmp_path / "run" / "graph_rejected.g2o").exists()

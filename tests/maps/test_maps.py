@@ -1,0 +1,353 @@
+"""Maps: kernels equal their slow twins, files mean to others what the grid means to us."""
+
+import laspy
+import numpy as np
+import pytest
+from PIL import Image
+from ruamel.yaml import YAML
+
+from scanchain import lie
+from scanchain.baselines.open3d_pairs import Open3dPairs
+from scanchain.config import MapsConfig
+from scanchain.errors import InputError
+from scanchain.logs.formats.cloud_file import read_pcd
+from scanchain.maps import (
+    OccupancyGrid,
+    PointMap,
+    build_point_map,
+    draw_grid,
+    fitting_resolution,
+    read_map,
+    read_ply,
+    write_laz,
+    write_map,
+    write_pcd,
+    write_ply,
+)
+from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
+from scanchain.simulation import SENSORS
+from scanchain.simulation.solids import Scenery
+from scanchain.trajectory import read_tum
+from tests.support import naive_maps as naive
+from tests.support.scenes import kitti_scans, shared_data
+
+RESOLUTION_M = 0.1
+CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
+
+
+def random_scans(count=12, beams=80, seed=0):
+    """Poses that wander over some meters, and scans of returns all around."""
+    random = np.random.default_rng(seed)
+    poses = np.array([lie.pose_2d(*random.normal(scale=[3, 2, 2])) for _ in range(count)])
+    angles = random.uniform(-np.pi, np.pi, (count, beams))
+    ranges = random.uniform(0.02, 9.0, (count, beams))
+    return poses, np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=2)
+
+
+def cell(grid, x, y):
+    """Log-odds of the cell at a place in the world."""
+    column, row = np.floor((np.array([x, y]) - grid.origin_m) / grid.resolution_m).astype(int)
+    return grid.log_odds[row, column]
+
+
+def test_drawn_beams_equal_naive():
+    poses, scans = random_scans()
+    grid = draw_grid(zip(poses, scans, strict=True), CONFIG)
+    beams = [
+        [(T[:2, 2], lie.transform(T, point[None])[0]) for point in scan]
+        for T, scan in zip(poses, scans, strict=True)
+    ]
+    expected = naive.draw(beams, RESOLUTION_M, _HIT, _MISS, _LOW, _HIGH)
+    corner = np.round(grid.origin_m / RESOLUTION_M).astype(int)
+    rows, columns = np.nonzero(grid.drawn)
+    seen = {(int(c + corner[0]), int(r + corner[1])) for r, c in zip(rows, columns, strict=True)}
+    assert seen == set(expected)
+    for (column, row), value in expected.items():
+        assert grid.log_odds[row - corner[1], column - corner[0]] == pytest.approx(value, abs=1e-5)
+
+
+def test_a_batch_and_scan_after_scan_draw_the_same_grid():
+    poses, scans = random_scans()
+    single = draw_grid(zip(poses, scans, strict=True), CONFIG)
+    batch = OccupancyGrid(CONFIG)
+    batch.insert_batch(poses[:5], scans[:5].reshape(-1, 2), np.arange(6) * 80)
+    batch.insert_batch(poses[5:], scans[5:].reshape(-1, 2), np.arange(8) * 80)
+    batch = batch.trimmed()
+    np.testing.assert_array_equal(batch.log_odds, single.log_odds)
+    np.testing.assert_allclose(batch.origin_m, single.origin_m)
+    assert (batch.scans, batch.beams) == (12, 960)
+
+
+def test_growing_moves_nothing():
+    grid = OccupancyGrid(CONFIG)
+    grid.insert(lie.identity(2), np.array([[1.05, 0.05]]))
+    before = cell(grid, 1.05, 0.05)
+    for x, y in ((-30.0, 2.0), (40.0, -50.0), (3.0, 60.0)):
+        grid.insert(lie.pose_2d(x, y, 0.0), np.array([[0.5, 0.0]]))
+    assert cell(grid, 1.05, 0.05) == before == np.float32(_HIT)
+    assert cell(grid, 0.55, 0.05) == np.float32(_MISS)
+    assert cell(grid, -29.45, 2.05) == np.float32(_HIT)
+
+
+def test_a_scan_counts_once_in_a_cell_and_its_end_outweighs_crossings():
+    grid = OccupancyGrid(CONFIG)
+    wall = np.array([[2.05, 0.05], [2.06, 0.05], [2.07, 0.05], [4.05, 0.1]])
+    grid.insert(lie.pose_2d(0.05, 0.0, 0.0), wall)
+    assert cell(grid, 2.1, 0.05) == np.float32(_HIT)
+    assert cell(grid, 1.05, 0.02) == np.float32(_MISS)
+
+
+def test_returns_beyond_the_usable_range_do_not_carve():
+    grid = OccupancyGrid(CONFIG, max_range_m=5.0)
+    grid.insert(lie.identity(2), np.array([[0.0, 4.0], [9.0, 0.0], [np.nan, 1.0], [np.inf, 1.0]]))
+    assert (grid.beams, grid.skipped) == (1, 3)
+    assert grid.trimmed().log_odds.shape == (41, 1)
+
+
+def test_a_3d_scan_is_drawn_by_its_slice_at_the_height_of_the_lidar():
+    T = lie.exp(np.array([1.0, 2.0, 10.0, 0.0, 0.0, 0.0])) @ lie.exp(np.array([0, 0, 0, 0.0, 0.0, np.pi / 2]))
+    points = np.array([[3.0, 0.0, 0.2], [0.0, 3.0, 1.5], [0.0, -3.0, -1.7]])
+    grid = draw_grid([(T, points)], CONFIG)
+    assert (grid.beams, grid.skipped) == (1, 2)
+    assert cell(grid, 1.0, 5.05) == np.float32(_HIT)
+    assert cell(grid, 1.0, 3.5) == np.float32(_MISS)
+
+
+def test_a_tilted_lidar_is_sliced_along_the_worlds_vertical():
+    T = lie.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
+    forward, level = np.array([[4.0, 0.0, 0.0]]), lie.transform(lie.inverse(T), np.array([[4.05, 0.05, 0.0]]))
+    grid = draw_grid([(T, np.concatenate([forward, level]))], CONFIG)
+    assert grid.beams == 1
+    assert cell(grid, 4.05, 0.05) == np.float32(_HIT)
+
+
+@pytest.mark.parametrize(("low", "high", "z"), [(0.5, 2.0, 1.0), (-2.0, -0.5, -1.0)])
+def test_a_beam_is_drawn_only_where_it_runs_within_the_slice(low, high, z):
+    config = MapsConfig(grid_resolution_m=RESOLUTION_M, slice_min_z_m=low, slice_max_z_m=high)
+    grid = draw_grid([(lie.identity(3), np.array([[4.05, 0.05, z]]))], config)
+    assert cell(grid, 3.0, 0.05) == np.float32(_MISS)
+    assert grid.origin_m[0] == pytest.approx(2.0)
+
+
+def test_a_map_server_reads_walls_where_they_are_and_unknown_as_unknown(tmp_path):
+    grid = OccupancyGrid(CONFIG)
+    wall = np.stack([np.linspace(-1.0, 2.0, 200), np.full(200, 3.05)], axis=1)
+    for _ in range(5):
+        grid.insert(lie.pose_2d(7.0, -4.0, 0.0), wall)
+    write_map(tmp_path, grid.trimmed())
+    cells, origin, resolution = naive.served_map(tmp_path)
+
+    def served(x, y):
+        column, row = np.floor((np.array([x, y]) - origin[:2]) / resolution).astype(int)
+        return cells[row, column]
+
+    assert served(7.5, -0.95) == 100
+    assert served(7.2, -3.0) == 0
+    assert served(8.9, -3.9) == -1
+    assert set(np.unique(cells)) == {-1, 0, 100}
+
+
+def nav2_map(folder):
+    """A map as nav2's map_server loads it (map_io.cpp), by libraries for YAML and images; trinary mode alone."""
+    told = YAML(typ="safe").load((folder / "map.yaml").read_text())
+    assert (told["mode"], told["negate"]) == ("trinary", 0)
+    with Image.open(folder / told["image"]) as image:
+        occupancy = (255.0 - np.array(image.convert("L"), float)) / 255.0
+    cells = np.full(occupancy.shape, -1)
+    cells[occupancy < told["free_thresh"]] = 0
+    cells[occupancy > told["occupied_thresh"]] = 100
+    return cells[::-1], np.array(told["origin"]), told["resolution"]
+
+
+def room_scans(west, south, east, north):
+    """A laser scanner that turns and moves about in an empty room between four walls; it measures exactly."""
+    scenery = Scenery()
+    for x, y, size in (
+        (west - 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
+        (east + 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
+        (0.5 * (west + east), south - 0.5, (east - west + 2.0, 1.0)),
+        (0.5 * (west + east), north + 0.5, (east - west + 2.0, 1.0)),
+    ):
+        scenery.box((x, y), size, (0.0, 2.0))
+    solids, rays = scenery.finish(), SENSORS["lms-270"].rays(0)
+    for share in np.linspace(0.2, 0.8, 25):
+        T = lie.pose_2d(west + share * (east - west), south + share**2 * (north - south), 20.0 * share)
+        raised = lie.lift(T)
+        raised[2, 3] = 1.0
+        ranges_m = solids.cast(raised[None], np.zeros(len(rays.directions), np.int32), rays.directions, 30.0)
+        yield T, (rays.directions * ranges_m[:, None])[:, :2]
+
+
+def test_nav2_reads_the_walls_of_a_known_room_to_one_cell(tmp_path):
+    west, south, east, north = -3.33, 1.27, 4.12, 5.58
+    write_map(tmp_path, draw_grid(room_scans(west, south, east, north), CONFIG))
+    cells, origin, resolution_m = nav2_map(tmp_path)
+    assert resolution_m == RESOLUTION_M and origin[2] == 0.0
+    assert np.abs(origin[:2] - [west, south]).max() <= RESOLUTION_M
+    rows, columns = np.indices(cells.shape)
+    x, y = origin[0] + (columns + 0.5) * resolution_m, origin[1] + (rows + 0.5) * resolution_m
+    inwards_m = np.minimum.reduce([x - west, east - x, y - south, north - y])
+    walls = cells == 100
+    assert np.abs(inwards_m[walls]).max() <= RESOLUTION_M
+    assert (cells[inwards_m > RESOLUTION_M] == 0).all() and not (cells[inwards_m < -RESOLUTION_M] == 0).any()
+    for across, axis, places in ((x, 1, (west, east)), (y, 0, (south, north))):
+        for place in places:
+            assert (walls & (np.abs(across - place) <= RESOLUTION_M)).any(axis=axis).mean() > 0.95
+
+
+def test_nav2_reads_cell_0_0_at_the_origin_and_rows_upwards(tmp_path):
+    grid = OccupancyGrid(CONFIG)
+    for _ in range(5):
+        grid.insert(lie.pose_2d(-4.95, 2.05, 0.0), np.array([[3.0, 0.0], [0.0, 2.0]]))
+    write_map(tmp_path, grid.trimmed())
+    cells, origin, _ = nav2_map(tmp_path)
+    np.testing.assert_allclose(origin, [-5.0, 2.0, 0.0], atol=1e-9)
+    assert cells.shape == (21, 31)
+    assert (cells[0, 0], cells[0, 30], cells[20, 0], cells[20, 30]) == (0, 100, 100, -1)
+
+
+def test_an_empty_grid_is_written_as_one_unknown_pixel(tmp_path):
+    write_map(tmp_path, OccupancyGrid(CONFIG).trimmed())
+    assert naive.served_map(tmp_path)[0].tolist() == [[-1]]
+
+
+def test_a_written_map_is_read_back(tmp_path):
+    poses, scans = random_scans()
+    grid = draw_grid(zip(poses, scans, strict=True), CONFIG)
+    write_map(tmp_path, grid)
+    cells, resolution_m, origin_m = read_map(tmp_path)
+    probability = grid.probability()
+    assert resolution_m == RESOLUTION_M and origin_m == pytest.approx(tuple(grid.origin_m))
+    assert np.array_equal(cells == 100, probability > 0.65) and np.array_equal(cells == 0, probability < 0.35)
+
+
+@pytest.mark.parametrize("name", ["map.pgm", "map.yaml"])
+def test_a_map_that_is_missing_or_of_another_make_is_refused(tmp_path, name):
+    write_map(tmp_path, OccupancyGrid(CONFIG))
+    (tmp_path / name).write_bytes(b"P2 1 1 255 0")
+    with pytest.raises(InputError, match="run it again"):
+        read_map(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(InputError, match=name):
+        read_map(tmp_path)
+
+
+def test_a_grid_too_large_for_memory_is_refused_and_a_coarser_one_fits():
+    poses = np.array([lie.pose_2d(0, 0, 0), lie.pose_2d(30_000, 20_000, 0)])
+    grid = OccupancyGrid(CONFIG)
+    grid.insert(poses[0], np.array([[1.0, 0.0]]))
+    with pytest.raises(InputError, match=r"raise maps\.grid_resolution_m"):
+        grid.insert(poses[1], np.array([[1.0, 0.0]]))
+    coarse = fitting_resolution(poses, resolution_m=RESOLUTION_M, max_range_m=80.0)
+    assert coarse == 32 * RESOLUTION_M
+    grid = OccupancyGrid(MapsConfig(grid_resolution_m=coarse))
+    for T in poses:
+        grid.insert(T, np.array([[10.0, 0.0]]))
+    assert fitting_resolution(poses[:1], resolution_m=RESOLUTION_M, max_range_m=80.0) == RESOLUTION_M
+
+
+def test_a_pose_that_is_not_finite_is_refused():
+    with pytest.raises(InputError, match="not finite"):
+        OccupancyGrid(CONFIG).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))
+    with pytest.raises(InputError, match="not finite"):
+        PointMap(2, 0.1).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_point_map_equals_naive(dimension):
+    random = np.random.default_rng(4)
+    poses = [lie.exp(random.normal(size=3 if dimension == 2 else 6)) for _ in range(4)]
+    scans = [random.normal(scale=3.0, size=(6000, dimension)) for _ in range(4)]
+    built = build_point_map(zip(poses, scans, strict=True), dimension=dimension, voxel_size_m=0.2)
+    world = np.concatenate([lie.transform(T, scan) for T, scan in zip(poses, scans, strict=True)])
+    np.testing.assert_allclose(built.points(), naive.voxel_means(world, 0.2), atol=1e-9)
+
+
+def test_a_full_point_map_doubles_its_voxels_and_keeps_every_point():
+    random = np.random.default_rng(4)
+    built = PointMap(3, 0.1, max_voxels=500, max_range_m=50.0)
+    points = random.uniform(-10.0, 10.0, (20_000, 3))
+    points[0] = 60.0
+    for part in np.array_split(points, 7):
+        built.insert(lie.identity(3), part)
+    assert len(built) <= 500
+    assert built.voxel_size_m in (3.2, 6.4)
+    assert built.counts[: len(built)].sum() == 19_999
+    voxels = np.floor(built.points() / built.voxel_size_m).astype(int)
+    assert len(np.unique(voxels, axis=0)) == len(built)
+    np.testing.assert_allclose(built.sums[: len(built)].sum(axis=0), points[1:].sum(axis=0))
+
+
+def test_points_that_are_not_finite_stay_out_of_the_maps():
+    points = np.array([[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0], [0.0, -np.inf, 0.0], [1.0, 2.0, 0.3]])
+    built = build_point_map([(lie.identity(3), points)], dimension=3, voxel_size_m=0.1)
+    np.testing.assert_allclose(built.points(), points[3:])
+    assert draw_grid([(lie.identity(3), points)], CONFIG, max_range_m=float("inf")).beams == 1
+
+
+def test_a_ply_file_holds_the_points(tmp_path):
+    points = np.random.default_rng(0).normal(size=(100, 2))
+    write_ply(tmp_path / "a.ply", points)
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    assert b"format binary_little_endian 1.0\n" in header
+    assert b"element vertex 100\n" in header
+    rows = np.frombuffer(body, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(rows[:, :2], points, atol=1e-6)
+    assert (rows[:, 2] == 0.0).all()
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply"), rows)
+
+
+def test_a_ply_file_of_another_make_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    with pytest.raises(InputError, match="not a PLY file as scanchain writes it"):
+        read_ply(tmp_path / "a.ply")
+    with pytest.raises(InputError, match=r"b\.ply"):
+        read_ply(tmp_path / "b.ply")
+
+
+def test_small_gicp_reads_our_ply(tmp_path):
+    library = pytest.importorskip("small_gicp")
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    write_ply(tmp_path / "a.ply", points)
+    np.testing.assert_allclose(library.read_ply(str(tmp_path / "a.ply")).points()[:, :3], points, atol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_pcd_and_laz_hold_the_points(tmp_path, dimension):
+    points = np.random.default_rng(0).normal(scale=300.0, size=(100, dimension)) + 1000.0
+    expected = np.pad(points, ((0, 0), (0, 3 - dimension)))
+    write_pcd(tmp_path / "a.pcd", points)
+    rows = read_pcd(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(np.column_stack([rows[axis] for axis in "xyz"]), expected.astype(np.float32))
+    write_laz(tmp_path / "a.laz", points)
+    cloud = laspy.read(tmp_path / "a.laz")
+    assert cloud.header.are_points_compressed
+    np.testing.assert_allclose(cloud.xyz, expected, atol=0.0006)
+
+
+def test_pcd_and_laz_of_no_points_are_read_as_empty(tmp_path):
+    write_pcd(tmp_path / "a.pcd", np.empty((0, 3)))
+    write_laz(tmp_path / "a.laz", np.empty((0, 3)))
+    assert len(read_pcd(tmp_path / "a.pcd")) == len(laspy.read(tmp_path / "a.laz")) == 0
+
+
+def test_open3d_reads_our_pcd(tmp_path):
+    library = Open3dPairs("point-to-point").open3d  # with the libusb that slim machines lack
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    write_pcd(tmp_path / "a.pcd", points)
+    read = np.asarray(library.io.read_point_cloud(str(tmp_path / "a.pcd")).points)
+    np.testing.assert_allclose(read, points, atol=1e-6)
+
+
+def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():
+    sweeps = kitti_scans(10)
+    truth = read_tum(shared_data("3d/kitti_0001_first54.tum"))
+    scans = [(pose, sweep.points) for pose, sweep in zip(truth.poses, sweeps, strict=False)]
+    grid = draw_grid(scans, MapsConfig())
+    road = [cell(grid, *pose[:2, 3]) for pose in truth.poses[:10]]
+    assert max(road) < 0.0
+    probability = grid.probability()
+    assert 1000 < (probability > 0.65).sum() < 0.1 * (probability < 0.35).sum()
+    cloud = build_point_map(scans, dimension=3, voxel_size_m=0.2, max_range_m=100.0)
+    assert 50_000 < len(cloud) < 200_000
+    assert np.isfinite(cloud.points()).all()

@@ -1,0 +1,107 @@
+"""Scans made ready for matching: cropped, downsampled, deskewed."""
+
+import numpy as np
+import pytest
+
+from scanchain.config import PreprocessConfig
+from scanchain.data import Scan
+from scanchain.preprocess import Resolution, downsample, sweep_of
+from tests.support import naive
+from tests.support.scenes import configured
+
+CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
+
+
+def scan_of(points, times_s=()):
+    return Scan(0, 0, 0, points.astype(np.float32), np.array(times_s, np.float32), 0, None)
+
+
+def some_scan(dimension=3, n=2000, with_times=True):
+    rng = np.random.default_rng(0)
+    return scan_of(rng.uniform(-60.0, 60.0, (n, dimension)), rng.uniform(0.02, 0.12, n) if with_times else ())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_sweep_is_the_first_point_of_every_voxel_in_range_with_its_time(dimension):
+    scan = some_scan(dimension)
+    sweep = sweep_of(scan, CONFIG)
+    chosen = naive.first_per_voxel(scan.points, 0.5, 1.0, 50.0)
+    assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
+    assert sweep.middle_s == pytest.approx(0.07, abs=1e-3)
+    np.testing.assert_allclose(sweep.times_s, scan.times_s[chosen] - sweep.middle_s, atol=1e-7)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_points_are_seen_from_the_middle_at_constant_velocity(dimension):
+    sweep = sweep_of(some_scan(dimension), CONFIG)
+    before = sweep.points.copy()
+    velocity = np.array([8.0, 0.5, 0.3] if dimension == 2 else [8.0, 0.5, -0.2, 0.1, -0.2, 0.6])
+    np.testing.assert_allclose(
+        sweep.from_middle(velocity), naive.deskew(sweep.points, sweep.times_s, velocity), atol=1e-9
+    )
+    assert np.array_equal(sweep.points, before)
+
+
+def test_a_thinned_sweep_keeps_the_times_of_its_points():
+    sweep = sweep_of(some_scan(), CONFIG)
+    thin = sweep.downsampled(4.0)
+    assert 10 < len(thin.points) < len(sweep.points)
+    assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
+    place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
+    assert [place[tuple(point)] for point in thin.points] == thin.times_s.tolist()
+
+
+@pytest.mark.parametrize(("with_times", "deskew"), [(False, True), (True, False)])
+def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_times, deskew):
+    config = configured(3, {"preprocess.deskew": deskew}).preprocess
+    sweep = sweep_of(some_scan(with_times=with_times), config)
+    assert not sweep.is_distorted and sweep.middle_s == 0.0
+    assert np.array_equal(sweep.from_middle(np.ones(6)), sweep.points)
+    assert not sweep.downsampled(4.0).is_distorted
+
+
+def box_scan(half_m, n=60_000, seed=0):
+    """A lidar in the middle of a box."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3))
+    return scan_of(half_m * points / np.abs(points).max(axis=1)[:, None])
+
+
+@pytest.mark.parametrize(("half_m", "scale"), [(30.0, 1.0), (13.0, 1.0), (5.0, 0.5), (2.5, 0.25), (0.8, 0.125)])
+def test_voxels_are_small_where_the_place_is_narrow_and_enough_points_are_matched(half_m, scale):
+    resolution = Resolution(PreprocessConfig(match_points=2000), 1.0)
+    for k in range(5):
+        sweep, sparse = resolution.downsampled(box_scan(half_m, seed=k))
+    assert resolution.scale == scale
+    assert len(sweep.points) == len(
+        naive.first_per_voxel(box_scan(half_m, seed=4).points, 0.5 * scale, 0.5, 100.0)
+    )
+    most = resolution.match_voxel_m == 1.5 * scale
+    least = resolution.match_voxel_m == 0.5 * scale
+    assert most or least or 1500 < len(sparse.points) < 2600
+    assert len(sparse.points) > 1500 or least
+
+
+def test_voxels_change_when_the_place_does_and_not_for_a_glance():
+    resolution = Resolution(PreprocessConfig(), 1.0)
+    resolution.downsampled(box_scan(6.0))
+    assert resolution.scale == 0.5
+    for half_m in (4.5, 9.0, 6.0):
+        resolution.downsampled(box_scan(half_m))
+        assert resolution.scale == 0.5
+    resolution.downsampled(box_scan(30.0))
+    assert resolution.scale == 1.0
+
+
+def test_the_plane_keeps_the_voxels_of_its_preset():
+    resolution = Resolution(configured(2).preprocess, 0.1)
+    resolution.downsampled(scan_of(np.random.default_rng(0).uniform(-1.0, 1.0, (500, 2))))
+    assert (resolution.scale, resolution.match_voxel_m) == (1.0, 0.01)
+
+
+def test_a_scan_without_a_point_in_range_leaves_the_voxels_alone():
+    resolution = Resolution(PreprocessConfig(), 1.0)
+    sweep, sparse = resolution.downsampled(scan_of(np.zeros((10, 3))))
+    assert len(sweep.points) == len(sparse.points) == 0
+    resolution.downsampled(box_scan(2.5))
+    assert resolution.scale == 0.25

@@ -1,0 +1,117 @@
+"""Two clouds in one call: any unit, any origin; clouds that do not fit are not said to."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+
+import scanchain
+from scanchain import lie
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from tests.support.scenes import configured, kitti_scans, shared_data
+
+CSAIL, KITTI = "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"
+FIRST = {CSAIL: 92, KITTI: 0}
+TURN = {2: np.array([4.0, -7.0, 2.0]), 3: np.array([4.0, -7.0, 1.0, 0.5, -0.3, 2.0])}
+
+
+def real_pair(name, apart):
+    """Two real scans, and the motion between them by odometry."""
+    log = open_log(shared_data(name))
+    odometry = Odometry(configured(log.dimension), np.eye(log.dimension + 1))
+    tracked = [odometry.process(scan) for scan in islice(log.scans(), FIRST[name] + apart + 1)]
+    target, source = tracked[FIRST[name]].scan.points, tracked[-1].scan.points
+    motion = lie.between(tracked[FIRST[name]].T_odom_lidar, tracked[-1].T_odom_lidar)
+    return target.astype(float), source.astype(float), motion
+
+
+@pytest.mark.parametrize(("name", "apart"), [(KITTI, 3), (CSAIL, 5)])
+def test_real_scans_about_a_meter_apart_are_aligned_without_a_guess(name, apart):
+    target, source, motion = real_pair(name, apart)
+    match = scanchain.align(target, source)
+    assert np.linalg.norm(motion[:-1, -1]) > 0.8
+    assert np.linalg.norm(match.T_target_source[:-1, -1] - motion[:-1, -1]) < 0.05
+    assert match.converged
+
+
+@pytest.mark.parametrize("name", [KITTI, CSAIL])
+@pytest.mark.parametrize("matcher", ["plicp", "svd"])
+def test_the_unit_of_the_clouds_is_free(name, matcher):
+    target, source, _ = real_pair(name, 2)
+    d = target.shape[1]
+    one = scanchain.align(target, source, matcher=matcher)
+    for unit in (0.01, 100.0):
+        scaled = scanchain.align(unit * target, unit * source, matcher=matcher)
+        np.testing.assert_allclose(scaled.T_target_source[:d, :d], one.T_target_source[:d, :d], atol=1e-6)
+        np.testing.assert_allclose(
+            scaled.T_target_source[:d, d], unit * one.T_target_source[:d, d], atol=1e-6 * unit
+        )
+        units = np.where(np.arange(len(one.information)) < d, unit, 1.0)
+        np.testing.assert_allclose(
+            scaled.information * np.outer(units, units), one.information, rtol=1e-4, atol=1e-3
+        )
+        assert scaled.residual_m == pytest.approx(unit * one.residual_m, rel=1e-4)
+        assert scaled.converged == one.converged
+
+
+@pytest.mark.parametrize("name", [KITTI, CSAIL])
+def test_frames_change_the_pose_as_they_must_and_the_information_by_the_sources_own_alone(name):
+    """A frame A of the target: A T, the same information. A frame B of the source: T B⁻¹, Ad(B)⁻ᵀ Ω Ad(B)⁻¹."""
+    target, source, _ = real_pair(name, 2)
+    A = lie.exp(TURN[target.shape[1]])
+    A[:-1, -1] += 1e5
+    B = lie.exp(0.1 * TURN[target.shape[1]])
+    one = scanchain.align(target, source)
+    T = one.T_target_source
+    moved = scanchain.align(lie.transform(A, target), source, A @ T)
+    np.testing.assert_allclose(moved.T_target_source, A @ T, atol=5e-3)
+    np.testing.assert_allclose(moved.information, one.information, rtol=0.3, atol=0.02 * one.information.max())
+    moved = scanchain.align(target, lie.transform(B, source), T @ lie.inverse(B))
+    back = lie.inverse(B)
+    wanted = lie.adjoint(back).T @ one.information @ lie.adjoint(back)
+    np.testing.assert_allclose(moved.T_target_source, T @ back, atol=0.03)
+    np.testing.assert_allclose(moved.information, wanted, rtol=0.5, atol=0.05 * wanted.max())
+
+
+def test_another_place_and_too_far_a_motion_do_not_converge():
+    sweeps = [scan.points for scan in kitti_scans(7)]
+    elsewhere = real_pair(KITTI, 1)[0]
+    for target, source in ((sweeps[0], elsewhere), (sweeps[0], sweeps[6])):
+        match = scanchain.align(target, source)
+        assert not match.converged
+        assert "units of" in match.reason
+
+
+CLOUD = np.random.default_rng(0).normal(size=(500, 3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "words"),
+    [
+        ((CLOUD, CLOUD[:, :2]), {}, "source has the shape"),
+        ((CLOUD.T, CLOUD), {}, "target has the shape"),
+        ((np.hstack([CLOUD, CLOUD]), CLOUD), {}, "target has the shape"),
+        ((CLOUD, CLOUD[:0]), {}, "source has no points"),
+        ((np.zeros((50, 3)), CLOUD), {}, "target: its 50 points lie on one point"),
+        ((CLOUD, np.full((5, 3), np.nan)), {}, "source: 5 of 5 points are NaN"),
+        ((CLOUD, CLOUD, 2.0 * np.eye(4)), {}, "T_guess is no rigid"),
+        ((CLOUD, CLOUD, np.eye(3)), {}, "T_guess has the shape"),
+        ((CLOUD, CLOUD + 1e6), {}, "T_guess puts the centroid of the source 1.73e+06 m"),
+        ((CLOUD, CLOUD), {"voxel_size_m": -1.0}, "voxel_size_m is -1"),
+        ((CLOUD, CLOUD), {"matcher": "gicp"}, "matcher"),
+        (("clouds", CLOUD), {}, "target"),
+    ],
+)
+def test_what_cannot_be_aligned_is_named(arguments, options, words):
+    with pytest.raises(InputError, match=words.replace("+", r"\+")):
+        scanchain.align(*arguments, **options)
+
+
+def test_a_few_points_without_a_shape_are_no_match():
+    for points in (CLOUD[:1], CLOUD[:3], CLOUD[:20], CLOUD[:, :2][:10]):
+        try:
+            assert not scanchain.align(points, points + 0.01).converged
+        except InputError as error:
+            assert "lie on one point" in str(error)

@@ -1,0 +1,158 @@
+"""A matcher of the user's, outside the package: named on the command line, compared, stopped and resumed."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from scanchain.comparison.methods import resolve
+from scanchain.comparison.outcome import Status
+from scanchain.comparison.table import read_table
+from scanchain.config import MatchingConfig
+from scanchain.errors import InputError
+from scanchain.registration import create_matcher
+from scanchain.runs.directory import CHECKPOINT_FILE
+from scanchain.simulation import simulate
+from tests.comparison.test_compare import row
+from tests.support.killing import partial, same_result, steps_on_disk
+
+MATCHER = '''
+import numpy as np
+from scipy.spatial import KDTree
+
+from scanchain import Match, rigid_transform
+
+
+class PointToPoint:
+    """Point-to-point ICP to the means of the map's voxels (Besl & McKay 1992)."""
+
+    def __init__(self, config):
+        self.config = config
+
+    def align(self, points, target, T_first, prior=None, *, wide=False):
+        limit_m = self.config.wide_max_distance_m if wide else self.config.max_distance_m
+        means, T, d = target.points(), T_first, points.shape[1]
+        tree = KDTree(means)
+        for iteration in range(self.config.max_iterations):
+            moved = points @ T[:d, :d].T + T[:d, d]
+            distance_m, nearest = tree.query(moved, distance_upper_bound=limit_m)
+            paired = np.isfinite(distance_m)
+            if paired.sum() < 10:
+                break
+            correction = rigid_transform(moved[paired], means[nearest[paired]])
+            T = correction @ T
+            if np.abs(correction - np.eye(d + 1)).max() < self.config.tolerance_m:
+                break
+        k, inliers = 3 * (d - 1), int(paired.sum())
+        is_good = inliers > self.config.min_inlier_share * len(points)
+        return Match(
+            T_target_source=T, information=np.eye(k) * inliers / self.config.sensor_noise_m**2,
+            cost=float(np.minimum(distance_m, limit_m) @ np.minimum(distance_m, limit_m)),
+            inliers=inliers, points=len(points), iterations=iteration + 1,
+            residual_m=float(np.sqrt(np.mean(distance_m[paired] ** 2))) if inliers else 0.0,
+            fit=1.0, at_minimum=is_good, converged=is_good, reason="" if is_good else "few correspondences",
+            degeneracy_eigenvalue=1.0, observability=1.0, degeneracy_direction=np.eye(k)[0],
+        )
+'''
+NAME = "my_module:PointToPoint"
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """Twelve seconds in the simulated office, 120 scans."""
+    path = tmp_path_factory.mktemp("log") / "office.mcap"
+    simulate("office", path, duration_s=12.0)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A working directory with the user's module."""
+    (tmp_path / "my_module.py").write_text(MATCHER)
+    return tmp_path
+
+
+def started(folder, *words):
+    """A command as a user gives it, in the folder of the module, which is on no path."""
+    command = [sys.executable, "-P", "-m", "scanchain", *map(str, words)]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
+    assert len(MATCHER.strip().splitlines()) <= 40
+    words = ("run", office, "--matcher", NAME, "--rerun", "off", "--checkpoint", "0.1")
+    whole = started(folder, *words, "--out", "whole")
+    assert whole.wait() == 0, whole.stderr.read()
+    assert NAME in (folder / "whole" / "config.toml").read_text()
+    child = started(folder, *words, "--out", "run")
+    while steps_on_disk(folder / "run") < 40 or not (partial(folder / "run") / CHECKPOINT_FILE).exists():
+        assert child.poll() is None, child.stderr.read()
+    child.kill()
+    child.wait()
+    again = started(folder, *words, "--out", "run", "--resume")
+    assert again.wait() == 0, again.stderr.read()
+    same_result(folder / "run", folder / "whole")
+    assert "resumed after" in (folder / "run" / "summary.txt").read_text()
+
+
+def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder):
+    words = ("compare", office, "--log.end_s", "3")
+    child = started(folder, *words, "--methods", "svd,PointToPoint", "--matcher", NAME, "--out", "a")
+    _, errors = child.communicate()
+    assert child.returncode == 0, errors
+    again = ("--methods", "svd,PointToPoint", "--settings", folder / "a" / "settings.toml", "--out", "b")
+    child = started(folder, *words, *again)
+    _, errors = child.communicate()
+    assert child.returncode == 0, errors
+    tables = [read_table(folder / name) for name in ("a", "b")]
+    own = [row(table, "PointToPoint") for table in tables]
+    assert own[0].status is Status.OK and NAME in own[0].description
+    assert own[0].figures.ate_m == own[1].figures.ate_m < 0.1
+    assert own[0].figures.ate_m != row(tables[0], "svd").figures.ate_m
+
+
+def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for names in (("svd",), ("svd", "PointToPoint+loops")):
+        chosen = [method.name for method in resolve(names, 2, file=None, matcher=NAME)]
+        assert chosen == list(names if len(names) > 1 else (*names, "PointToPoint"))
+    assert [method.name for method in resolve(("svd",), 2, file=None, matcher="plicp")] == ["svd", "plicp"]
+    with pytest.raises(InputError, match="no module absent"):
+        resolve(("svd",), 2, file=None, matcher="absent:Matcher")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("my_modul:PointToPoint", "there is no module my_modul in"),
+        ("my_module:PointToPlane", "has no class PointToPlane"),
+        ("my_module:KDTree", "has no method align"),
+        ("broken:Matcher", "importing broken failed with SyntaxError"),
+        ("needy:Matcher", "No module named 'not_there'"),
+        ("my_module.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
+    ],
+)
+def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, name, words):
+    (folder / "broken.py").write_text("class Matcher(:\n")
+    (folder / "needy.py").write_text("import not_there\n")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    with pytest.raises(InputError) as raised:
+        create_matcher(MatchingConfig(matcher=name))
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_the_working_directory_comes_last(folder, monkeypatch):
+    (folder / "numpy.py").write_text("raise RuntimeError('a stranger')\n")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "my_module", raising=False)
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each not in ("", str(folder))])
+    before = [*sys.path]
+    assert callable(create_matcher(MatchingConfig(matcher=NAME)).align)
+    assert sys.path[: len(before)] == before and str(folder) in sys.path
+    code = f"from scanchain import plugins; plugins.load({NAME!r}, 'align')"
+    assert subprocess.run([sys.executable, "-P", "-c", code], cwd=folder).returncode == 0
+    assert np.__file__ != str(folder / "numpy.py")

@@ -1,0 +1,368 @@
+"""A run may be killed at any moment: its steps are on disk, and it goes on to the same result."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from itertools import islice
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
+from scanchain.runs.resume.checkpoint import _CLASSES, Checkpoints, read_checkpoint
+from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.simulation import simulate
+from scanchain.slam import Slam
+from scanchain.trajectory import read_tum
+from scanchain.viz.recording import entities
+from tests.support.killing import assert_readable, kill_at_random, partial, same_result, start, steps_on_disk
+from tests.support.scenes import ROOT, configured, shared_data
+from tests.viz.test_recording import column
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+LOOPING = ("--loops.min_travel_m", "3", "--loops.min_radius_m", "15")  # else half a minute has no closures
+RECORDED = (*LOOPING, "--checkpoint", "0.2")
+LIVELY = (*RECORDED, "--rerun", "off")
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """Half a minute in the simulated office, 300 scans."""
+    path = tmp_path_factory.mktemp("log") / "office.mcap"
+    simulate("office", path, duration_s=30.0)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(office, tmp_path_factory):
+    """A run of it that nobody disturbed."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert start(office, out, *RECORDED).wait() == 0
+    return out
+
+
+@pytest.fixture(scope="module", params=["2D", "3D"])
+def undisturbed(request, office, whole, tmp_path_factory):
+    """A log and its run."""
+    if request.param == "2D":
+        return office, whole
+    log, out = (tmp_path_factory.mktemp("town") / name for name in ("town.mcap", "run"))
+    simulate("town", log, duration_s=18.0, sensor="vlp-16")
+    assert start(log, out, *RECORDED).wait() == 0
+    return log, out
+
+
+def test_killed_again_and_again_a_run_goes_on_to_the_same_result_bit_by_bit(undisturbed, tmp_path):
+    log, whole = undisturbed
+    rng, out = random.Random(1), tmp_path / "run"
+    reached = []
+    for _ in range(3):
+        child = start(log, out, *LIVELY, "--resume")
+        enough = steps_on_disk(out) + rng.randrange(20, 60)
+        while steps_on_disk(out) < enough or not (partial(out) / CHECKPOINT_FILE).exists():
+            assert child.poll() is None
+        child.kill()
+        child.wait()
+        table, _ = read_journal(partial(out))
+        reached.append(len(table))
+        np.testing.assert_array_equal(  # readable, and those of the undisturbed run
+            table.odometry.stamps_ns, read_tum(whole / "odometry.tum").stamps_ns[: len(table)]
+        )
+        table.write(tmp_path / "steps.parquet", table.best_known)
+        assert pq.read_metadata(tmp_path / "steps.parquet").num_rows == len(table)
+    assert start(log, out, *LIVELY, "--resume").wait() == 0
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
+    same_result(out, whole)
+    assert "resumed after" in (out / "summary.txt").read_text()
+    assert not list(out.glob("*.journal")) and not list(out.glob("*.checkpoint"))
+
+
+def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_same_result(undisturbed, tmp_path):
+    log, whole = undisturbed
+    began = time.perf_counter()
+    assert start(log, tmp_path / "warm", *RECORDED).wait() == 0
+    seed = random.randrange(1000)
+    print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
+    longest_s = time.perf_counter() - began
+    killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=6, seed=seed, longest_s=longest_s))
+    assert len(killed) == 6
+
+
+def test_the_recording_of_a_run_that_was_interrupted_equals_that_of_one_that_was_not(undisturbed, tmp_path):
+    log, whole = undisturbed
+    out, count = tmp_path / "run", len(read_tum(whole / "trajectory.tum"))
+    assert pq.read_table(whole / "loops.parquet").num_rows > 0
+    reached = []
+    for interruption, share in ((signal.SIGKILL, 0.3), (signal.SIGINT, 0.5), (signal.SIGKILL, 0.7)):
+        child = start(log, out, *RECORDED, "--resume")
+        while steps_on_disk(out) < share * count or not (partial(out) / CHECKPOINT_FILE).exists():
+            assert child.poll() is None
+        child.send_signal(interruption)
+        child.wait()
+        reached.append(read_checkpoint(partial(out)).scans)
+        assert (partial(out) / RECORDING_FILE).exists()
+    assert 0 < reached[0] < reached[1] <= reached[2] < count
+    assert start(log, out, *RECORDED, "--resume").wait() == 0
+    same_result(out, whole)
+
+
+@pytest.mark.parametrize(
+    "module, kind, method",
+    [
+        ("scanchain.viz.recording.recording", "Recording", "resume"),
+        ("scanchain.runs.resume.checkpoint", "Checkpoints", "write"),
+    ],
+)
+def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
+    office, whole, tmp_path, module, kind, method
+):
+    out = tmp_path / "run"
+    child = start(office, out, *RECORDED)
+    while steps_on_disk(out) < 100 or not (partial(out) / CHECKPOINT_FILE).exists():
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    dying = f"""
+import os, signal, sys
+from scanchain.__main__ import main
+from {module} import {kind}
+act = {kind}.{method}
+def dying(self, *values):
+    act(self, *values)
+    os.kill(os.getpid(), signal.SIGKILL)
+{kind}.{method} = dying
+sys.exit(main(sys.argv[1:]))
+"""
+    words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
+    assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
+    assert list(partial(out).glob("recording.part_*.rrd"))
+    assert start(office, out, *RECORDED, "--resume").wait() == 0
+    same_result(out, whole)
+
+
+def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, *LIVELY)
+    while steps_on_disk(out) < 150 or not (partial(out) / CHECKPOINT_FILE).exists():
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    assert start(office, out, *RECORDED, "--resume").wait() == 0
+    assert "the recording begins there" in (out / "summary.txt").read_text()
+    assert "the recording lacks something" not in (out / "summary.txt").read_text()
+    for entity, name in ((entities.KEYFRAMES, "Points3D:positions"), (entities.REJECTED, "LineStrips3D:strips")):
+        assert column(out / RECORDING_FILE, entity, name)[-1] == column(whole / RECORDING_FILE, entity, name)[-1]
+
+
+@pytest.mark.parametrize(
+    "name, count, changes",
+    [
+        ("office", 300, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
+        ("2d/intel.mcap", 400, {"matching.matcher": "svd", "loops.enabled": False}),
+        ("3d/kitti_0001_first54.mcap", 54, {"loops.min_travel_m": 3.0, "loops.place_radius_m": 4.0}),
+    ],
+)
+def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit(
+    office, tmp_path, name, count, changes
+):
+    log = open_log(office if name == "office" else shared_data(name))
+    scans = list(islice(log.scans(), count))
+    config = configured(log.dimension, changes)
+    points_file = tmp_path / POINTS_FILE
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, points_file)
+    breaks = set(random.Random(2).sample(range(count), 8)) | {0}
+    for scan in scans:
+        a, b = straight.process(scan), broken.process(scan)
+        assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
+        assert a.match.information.tobytes() == b.match.information.tobytes()
+        if scan.index in breaks:
+            Checkpoints(tmp_path, 10.0).write(broken)
+            broken = read_checkpoint(tmp_path).slam
+            broken.points.reopen(points_file)
+    a, b = straight.finish(), broken.finish()
+    assert len(a.closures) == len(b.closures)
+    assert len(a.closures) > 0 or not config.loops.enabled
+    assert a.trajectory.poses.tobytes() == b.trajectory.poses.tobytes()
+    assert a.state.weight.tobytes() == b.state.weight.tobytes()
+
+
+def waiting_at(scan):
+    """The command line as a script that says "there" before it places that scan, and then waits."""
+    return f"""
+import sys, time
+from scanchain.__main__ import main
+from scanchain.slam import Slam
+place = Slam.place
+def waiting(self, located):
+    if located.tracked.scan.index == {scan}:
+        print("there", flush=True)
+        time.sleep(60)
+    return place(self, located)
+Slam.place = waiting
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_every_step_is_on_disk_within_a_second(office, tmp_path):
+    out = tmp_path / "run"
+    child = subprocess.Popen(
+        [sys.executable, "-c", waiting_at(40), "run", str(office), "--out", str(out)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+    )
+    assert child.stdout.readline() == b"there\n"
+    child.kill()
+    child.communicate()
+    assert steps_on_disk(out) == 40
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, *LOOPING, "--checkpoint", "1000", "--rerun", "off", stderr=subprocess.PIPE)
+    while steps_on_disk(out) < 30:
+        assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    errors = child.communicate(timeout=60)[1].decode()
+    assert child.returncode == 1 and errors.startswith("error: stopped by the user after ")
+    stopped_after = len(read_tum(partial(out) / "trajectory.tum"))
+    child = start(office, out, *LIVELY, "--resume", stderr=subprocess.PIPE)
+    errors = child.communicate()[1].decode()
+    assert child.returncode == 0 and f"resuming after {stopped_after} scans" in errors
+    same_result(out, whole)
+
+
+def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
+    out = tmp_path / "run"
+    words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
+    child = subprocess.Popen(
+        [sys.executable, "-c", waiting_at(100), *words],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout.readline() == "there\n"
+    child.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    errors = child.communicate(timeout=20)[1]
+    assert child.returncode == 1 and errors.count("\n") == 1
+    assert "interrupted; 100 scans until then are in" in errors
+    assert f"to resume: scanchain {' '.join(words)} --resume\n" in errors
+    assert assert_readable(partial(out)) == 100
+    assert start(office, out, *LIVELY, "--resume").wait() == 0
+    same_result(out, whole)
+
+
+def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
+    out, other = tmp_path / "run", tmp_path / "other.mcap"
+    simulate("office", other, duration_s=30.0, seed=5)
+    child = start(office, out, *LIVELY)
+    while not list(tmp_path.glob("*/state.checkpoint")):
+        assert child.poll() is None
+
+    def refusal(log, *words):
+        refused = start(log, out, *LIVELY, "--resume", *words, stderr=subprocess.PIPE)
+        errors = refused.communicate()[1].decode()
+        assert refused.returncode == 2 and errors.count("error: ") == 1
+        return errors
+
+    child.send_signal(signal.SIGSTOP)
+    assert f"is being written by process {child.pid}" in refusal(office)
+    child.kill()
+    child.wait()
+    assert "another configuration" in refusal(office, "--matching.matcher", "svd")
+    assert "scan 0 of the log is not the one that was run" in refusal(other)
+    checkpoint = partial(out) / "state.checkpoint"
+    data = checkpoint.read_bytes()
+    older = data[:-8].replace(b"(code ", b"(c0de ", 1)
+    checkpoint.write_bytes(older + zlib.crc32(older[:-8]).to_bytes(8, "little"))
+    assert "state.checkpoint: was made by scanchain" in refusal(office)
+    damaged = bytearray(data)
+    damaged[len(data) // 2] ^= 1
+    checkpoint.write_bytes(damaged)
+    assert "is no whole snapshot" in refusal(office)
+
+
+def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, whole, tmp_path):
+    assert start(office, tmp_path / "run", *LIVELY, "--resume").wait() == 0
+    same_result(tmp_path / "run", whole)
+
+
+@pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, LIVELY), (400, RECORDED)])
+def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
+    full = f"""
+import resource, signal, sys
+from scanchain.__main__ import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10))
+sys.exit(main(sys.argv[1:]))
+"""
+    out = tmp_path / "run"
+    words = ["run", str(office), "--out", str(out), *words]
+    child = subprocess.run([sys.executable, "-c", full, *words], cwd=ROOT, capture_output=True, text=True)
+    assert child.returncode == 1 and child.stderr.startswith("error: ") and child.stderr.count("\n") == 1
+    assert "File too large" in child.stderr and not out.exists()
+    folder = partial(out)
+    assert len(read_journal(folder)[0]) > 0
+    assert b'"complete": false' in (folder / "run.json").read_bytes()
+    for table in folder.glob("*.parquet"):
+        pq.read_table(table)
+    assert not list(folder.glob("*.new"))
+
+
+def test_a_torn_journal_is_read_up_to_the_tear(office, tmp_path):
+    out = tmp_path / "run"
+    child = start(office, out, *LIVELY)
+    while steps_on_disk(out) < 20:
+        assert child.poll() is None
+    child.kill()
+    child.wait()
+    journal = partial(out) / JOURNAL_FILE
+    data = journal.read_bytes()
+    count = len(read_journal(partial(out))[0])
+    for size in range(len(data) - 300, len(data), 7):
+        journal.write_bytes(data[:size])
+        table, read = read_journal(partial(out))
+        assert count - 2 <= len(table) < count and read <= size
+    damaged = bytearray(data)
+    damaged[read // 2] ^= 1
+    journal.write_bytes(damaged)
+    assert 0 < len(read_journal(partial(out))[0]) < count
+
+
+def test_a_snapshot_makes_only_what_is_listed(tmp_path):
+    write_snapshot(tmp_path / "a", {"a": (1, 2.5, None, "x", [np.arange(3)])}, _CLASSES)
+    value = read_snapshot(tmp_path / "a", _CLASSES)
+    assert value["a"][:4] == (1, 2.5, None, "x") and value["a"][4][0].tolist() == [0, 1, 2]
+    with pytest.raises(TypeError, match="is not listed"):
+        write_snapshot(tmp_path / "b", random.Random(1), _CLASSES)
+    assert not list(tmp_path.glob("b*"))
+    config = configured(2)
+    write_snapshot(tmp_path / "c", config, _CLASSES)
+    assert read_snapshot(tmp_path / "c", _CLASSES) == config
+    with pytest.raises(InputError, match="'Config', which does not belong"):
+        read_snapshot(tmp_path / "c", Classes([], {}, _CLASSES.version))
+
+
+def test_arrays_come_back_with_their_order_their_type_and_their_bits(tmp_path):
+    rows = np.arange(12.0).reshape(3, 4)
+    locked = rows.copy()
+    locked.flags.writeable = False
+    arrays = [rows, np.asfortranarray(rows), rows[:, ::2], locked, np.empty((0, 3), np.float32), np.array(-0.0)]
+    arrays.append(rows)
+    write_snapshot(tmp_path / "a", [arrays, np.float32(1.5)], _CLASSES)
+    again, scalar = read_snapshot(tmp_path / "a", _CLASSES)
+    for a, b in zip(arrays, again, strict=True):
+        assert a.tobytes() == b.tobytes() and (a.dtype, a.shape) == (b.dtype, b.shape)
+        assert a.flags.writeable == b.flags.writeable
+    assert again[1].flags.f_contiguous and again[6] is again[0] and type(scalar) is np.float32

@@ -1,0 +1,647 @@
+"""Simulated sequences: the truth is true, the log says what the sensor saw, the same seed gives the same bytes."""
+
+from dataclasses import replace
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from scanchain import catalog, lie
+from scanchain.errors import InputError
+from scanchain.simulation import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
+from scanchain.simulation.information import surface_normals
+from scanchain.simulation.motion import wheel_odometry
+from scanchain.simulation.sensors import take_sweep
+from scanchain.simulation.solids import Solids
+from scanchain.simulation.worlds.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
+from tests.support import naive_raycast
+
+LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
+STRESSING = [name for name in WORLDS if name not in ("office", "town")]
+
+
+def drive(name, duration_s, seed=0):
+    world = WORLDS[name]
+    solids = world.build(np.random.default_rng(seed))
+    rng = np.random.default_rng(seed + 100)
+    return solids, world.motion(solids, duration_s=duration_s, rng=rng)
+
+
+@cache
+def planned(name, sensor, seed=0):
+    """A drive of the world's usual length, without noise and losses."""
+    return plan(name, sensor=sensor, seed=seed, noise_m=0.0, dropout=0.0)
+
+
+def in_reach(solids, place, reach_m):
+    """The solids that a sensor at a place could hit."""
+
+    def near(group, size):
+        return group[np.linalg.norm(group[:, :2] - place[:2], axis=1) - size < reach_m]
+
+    return replace(
+        solids,
+        boxes=near(solids.boxes, np.linalg.norm(solids.boxes[:, 2:4], axis=1)),
+        cylinders=near(solids.cylinders, solids.cylinders[:, 2]),
+        ellipsoids=near(solids.ellipsoids, solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)),
+    )
+
+
+@pytest.fixture(scope="module")
+def drives():
+    return {"office": drive("office", 240.0), "town": drive("town", 60.0)}
+
+
+def perfect(name):
+    return replace(SENSORS[name], noise_m=0.0, dropout=0.0)
+
+
+def undistorted(sweep, motion, start_s):
+    poses = motion.lidar(start_s + sweep.times_s())
+    return np.einsum("nij,nj->ni", poses[:, :3, :3], sweep.points().astype(np.float64)) + poses[:, :3, 3]
+
+
+def messages(path, topic):
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [(item.message, item.decoded_message) for item in reader.iter_decoded_messages(topics=[topic])]
+
+
+def nanoseconds(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def pose_of(odometry):
+    p, q = odometry.pose.pose.position, odometry.pose.pose.orientation
+    pose = np.eye(4)
+    pose[:3, :3] = lie.from_quaternion(np.array([q.x, q.y, q.z, q.w]))
+    pose[:3, 3] = p.x, p.y, p.z
+    return pose
+
+
+# --- ray casting -----------------------------------------------------------------------------------------------
+
+
+SMOOTH = np.array([-3.0, 0.9, 0.08, 1.0, 0.7, 0.11, 2.0])
+ROUGH = np.concatenate([SMOOTH, [0.15, 0.5, 0.4, 1.0], [-0.1, -0.9, 0.5, 0.3]])
+
+
+def random_solids(rng, ground=SMOOTH):
+    yaw = rng.uniform(-np.pi, np.pi, 30)
+    places = rng.uniform(-40.0, 40.0, (30, 2))
+    bottom = rng.uniform(-3.0, 3.0, 30)
+    height = rng.uniform(0.5, 6.0, 30)
+    size = rng.uniform(0.1, 6.0, (30, 3))
+    return Solids(
+        boxes=np.column_stack([places, size[:, :2], bottom, bottom + height, np.cos(yaw), np.sin(yaw)]),
+        cylinders=np.column_stack([places[::-1] + 3.0, size[:, 0], bottom, bottom + height]),
+        ellipsoids=np.column_stack([places[:, ::-1], bottom, size]),
+        ground=ground,
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "ground"), [(0, SMOOTH), (1, SMOOTH), (2, SMOOTH), (3, SMOOTH), (4, ROUGH), (5, ROUGH)]
+)
+def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
+    rng = np.random.default_rng(seed)
+    solids = random_solids(rng, ground)
+    poses = lie.exp(np.column_stack([rng.uniform(-0.8, 0.8, (20, 3)), rng.normal(0.0, 0.1, (20, 3))]))
+    directions = rng.normal(size=(400, 3)) * [1.0, 1.0, 0.25]
+    directions[0], directions[1], directions[2] = [0, 0, 1], [0, 0, -1], [1, 0, 0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    pose_of_ray = rng.integers(0, 20, 400).astype(np.int32)
+    fast = solids.cast(poses, pose_of_ray, directions, 50.0)
+    naive = np.array([
+        naive_raycast.cast(poses[p, :3, 3], poses[p, :3, :3] @ d, solids, 50.0)
+        for p, d in zip(pose_of_ray, directions, strict=True)
+    ])  # fmt: skip
+    assert 100 < np.isfinite(naive).sum() < 400  # the test sees both hits and misses
+    assert np.array_equal(np.isfinite(fast), np.isfinite(naive))
+    assert np.allclose(fast, naive, atol=1e-7, rtol=0.0)
+
+
+def test_a_ray_into_empty_space_comes_back_infinite():
+    solids = Solids(np.zeros((0, 8)), np.zeros((0, 5)), np.zeros((0, 6)), np.zeros(7))
+    pose = np.eye(4)[None]
+    pose[0, 2, 3] = 2.0
+    directions = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0, -0.8], [0.999, 0, -0.0447]])
+    ranges = solids.cast(pose, np.zeros(5, dtype=np.int32), directions, 30.0)
+    assert np.allclose(ranges, [np.inf, np.inf, 2.0, 2.5, np.inf])
+
+
+def test_a_normal_is_the_way_straight_off_the_surface():
+    rng = np.random.default_rng(0)
+    solids = random_solids(rng, ROUGH)
+    directions = rng.normal(size=(600, 3)) * [1.0, 1.0, 0.25]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranges, solid = solids.strike(np.eye(4)[None], np.zeros(600, dtype=np.int32), directions, 50.0)
+    hit = np.isfinite(ranges)
+    places = directions[hit] * ranges[hit, None]
+    normals = surface_normals(places, solid[hit], solids)
+    assert set(np.digitize(solid[hit], [30, 60, 90])) == {0, 1, 2, 3}  # boxes, cylinders, ellipsoids, ground
+    assert np.all(np.sum(normals * directions[hit], axis=1) < 0.0)
+    off = naive_raycast.distance_to_surface(places + 1e-4 * normals, solids)
+    assert np.mean(np.abs(off - 1e-4) < 1e-7) > 0.98  # but near the seam of two solids
+
+
+# --- worlds and motion -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
+    solids, motion = drive(name, 120.0, seed)
+    places = motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
+    assert solids.clearance_m(places, below_m=2.0).min() > WORLDS[name].vehicle.radius_m + 0.05
+
+
+@pytest.mark.parametrize("name", ["office", "town"])
+def test_the_drive_starts_from_standstill_and_never_jerks(drives, name):
+    _, motion = drives[name]
+    vehicle = WORLDS[name].vehicle
+    step = 1e-3
+    times = np.arange(0.0, 50.0, step)
+    poses = motion.base(times)
+    assert motion.speed_m_s(np.array([0.0]))[0] < 1e-3
+    speed = motion.speed_m_s(times)
+    traveled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
+    assert np.allclose(traveled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
+    assert speed.max() < 1.01 * vehicle.speed_m_s
+    assert np.abs(np.diff(speed)).max() / step < 1.5 * vehicle.acceleration_m_s2
+    yaw_rate = lie.wrap(np.diff(lie.yaw(poses))) / step
+    assert np.abs(yaw_rate).max() > 0.5  # it does turn
+    assert np.abs(np.diff(yaw_rate)).max() < 0.02  # within a millisecond
+
+
+def test_the_car_follows_the_ground(drives):
+    solids, motion = drives["town"]
+    poses = motion.base(np.arange(0.0, 60.0, 0.1))
+    height = poses[:, 2, 3]
+    assert height.max() - height.min() > 0.3
+    assert np.abs(height - solids.ground_height(poses[:, :2, 3])).max() < 1.1 * WORLDS["town"].vehicle.heave_m
+    assert np.allclose(poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2), np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["demo-office", "demo-town", "office", "town"])
+def test_a_sequence_comes_back_to_where_it_was(name):
+    source = catalog.load(name).source
+    _, motion = drive(source.world, source.duration_s, source.seed)
+    times = np.arange(0.0, source.duration_s, 0.1)
+    poses = lie.flatten(motion.lidar(times))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1))])
+    gap = np.linalg.norm(poses[:, None, :2, 2] - poses[None, :, :2, 2], axis=-1)
+    turn = np.abs(lie.wrap(lie.yaw(poses)[:, None] - lie.yaw(poses)[None]))
+    again = (gap < 1.5) & (turn < 0.3) & (arc[:, None] - arc[None] > 20.0)
+    revisited_m = np.diff(arc, prepend=0.0)[again.any(axis=1)].sum()
+    assert revisited_m > 20.0
+
+
+# --- worlds that are hard on odometry ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_the_seed_alone_draws_the_place_and_the_motion(name):
+    first, same, other = (plan(name, seed=seed, duration_s=5.0) for seed in (3, 3, 4))
+    for kind in ("boxes", "cylinders", "ellipsoids", "ground"):
+        assert np.array_equal(getattr(first.solids, kind), getattr(same.solids, kind))
+    assert np.array_equal(first.truth().poses, same.truth().poses)
+    assert any(
+        not np.array_equal(getattr(first.solids, kind), getattr(other.solids, kind))
+        for kind in ("boxes", "cylinders")
+    )
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_the_motion_is_smooth(name):
+    motion, step = planned(name, "vlp-16").motion, 1e-3
+    poses = motion.lidar(np.arange(0.0, WORLDS[name].duration_s, step))
+    rates = lie.log(lie.inverse(poses[:-1]) @ poses[1:]) / step
+    change = np.abs(np.diff(rates, axis=0)).max(axis=0)  # within a millisecond
+    assert change[:3].max() < 0.01 and change[3:].max() < 0.02
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+@pytest.mark.parametrize("name", STRESSING)
+def test_every_lidar_sees_something_everywhere(name, sensor):
+    drive = planned(name, sensor)
+    fewest = {"hdl-64": 90_000, "os1-32": 13_000, "vlp-16": 11_000, "rosette": 3_000}[sensor]
+    if (name, sensor) == ("identical", "hdl-64"):
+        fewest = 60_000  # where its walls are nearer than it can see
+    for index in drive.scans[[0, len(drive.scans) // 2, -1]]:
+        sweep = take_sweep(
+            drive.solids, drive.motion, drive.sensor, int(index), index * 0.1, np.random.default_rng(0)
+        )
+        assert sweep.returned.sum() > fewest
+
+
+def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
+    poses = planned("rounds", "vlp-16").truth().poses[::5]
+    traveled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)))
+    same = opposite = aside = 0
+    for k, T in enumerate(poses):
+        old = poses[traveled_m < traveled_m[k] - 100.0]
+        place = lie.inverse(T) @ old
+        near = (np.abs(place[:, 0, 3]) < 3.0) & (np.abs(place[:, 1, 3]) < 6.0)
+        ahead = place[near, 0, 0]
+        same += np.any(ahead > 0.9)
+        opposite += np.any(ahead < -0.9)
+        aside += np.any((ahead > 0.9) & (np.abs(place[near, 1, 3]) > 3.0))
+    assert min(same, opposite, aside) > 30  # of some 320 places
+
+
+def test_all_rooms_of_the_identical_floor_look_the_same():
+    drive = plan("identical", noise_m=0.0, dropout=0.0)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = [[2.5, 4.0, 0.3], [17.5, 32.0, 0.3], [32.5, 10.0, 0.3]]
+    poses[2, :2, :2] *= -1.0  # the rooms south of a corridor are turned by half
+    rays = drive.sensor.rays(0)
+    rooms = [
+        drive.solids.cast(T[None], np.zeros(len(rays.directions), np.int32), rays.directions, 2.9) for T in poses
+    ]
+    assert np.isfinite(rooms[0]).sum() > 100
+    np.testing.assert_allclose(rooms[1], rooms[0], atol=1e-9)
+    np.testing.assert_allclose(rooms[2], rooms[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", STRESSING)
+def test_rays_hit_what_the_naive_ray_caster_says(name):
+    drive = planned(name, "rosette" if name == "hall" else "os1-32")
+    index = int(drive.scans[-20])
+    sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
+    poses = drive.motion.lidar(index * 0.1 + sweep.rays.instants_ns * 1e-9)[sweep.rays.instant_of_ray]
+    reach_m = drive.sensor.max_range_m
+    solids = in_reach(drive.solids, poses[0, :3, 3], reach_m)
+    some = np.random.default_rng(1).choice(len(poses), 16, replace=False)
+    naive = [
+        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], solids, reach_m)
+        for k in some
+    ]  # fmt: skip
+    assert np.allclose(sweep.ranges_m[some], naive, atol=1e-6, rtol=0.0)
+
+
+def test_the_highway_is_at_full_speed_from_the_first_scan():
+    drive = planned("highway", "vlp-16")
+    steps = np.linalg.norm(np.diff(drive.truth().poses[:, :3, 3], axis=0), axis=1)
+    assert np.all(np.abs(steps - 2.5) < 0.02)
+    assert np.abs(np.diff(lie.yaw(drive.truth().poses))).max() > 0.007  # a bend of 300 m is part of it
+
+
+def test_the_hall_stands_still_for_two_seconds_then_moves_half_a_meter_a_scan():
+    poses = planned("hall", "vlp-16").truth().poses
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps[:20].max() < 1e-6
+    assert np.all(np.abs(steps[47:85] - 0.5) < 1e-3)
+
+
+def test_rings_on_a_flat_floor_stay_where_they_are_while_the_lidar_moves():
+    drive = planned("hall", "vlp-16")
+    height = WORLDS["hall"].vehicle.T_base_lidar[2, 3]
+    for index in (5, 60):  # at rest, at 5 m/s
+        sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
+        points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
+        floor = np.abs(points[:, 2] + height) < 1e-4
+        for lowest, elevation_deg in enumerate((-15.0, -13.0, -11.0)):
+            radius = np.hypot(*points[floor & (ring == lowest), :2].T)
+            assert len(radius) > 1000
+            assert np.allclose(radius, height / np.tan(np.deg2rad(-elevation_deg)), atol=1e-4)
+
+
+def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
+    motion = planned("turns", "vlp-16").motion
+    times = np.arange(0.0, 40.0, 0.01)
+    poses = motion.base(times)
+    rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(poses))) / 0.01)
+    assert rate.max() == pytest.approx(120.0, abs=1.0) and rate.min() == pytest.approx(-120.0, abs=1.0)
+    turning = np.abs(rate) > 5.0
+    assert turning.mean() > 0.25 and motion.speed_m_s(times[:-1])[turning].max() < 1e-6
+    assert np.linalg.norm(poses[:, :2, 3], axis=1).max() < 5.0
+
+
+def test_the_staircase_is_climbed_with_a_swaying_hand():
+    drive = planned("staircase", "vlp-16")
+    poses = drive.motion.lidar(np.arange(0.0, 40.0, 0.05))
+    assert np.ptp(poses[:, 2, 3]) > 6.0
+    assert np.abs(poses[:, 2, :2]).max() > 0.03  # rolls and pitches
+    assert np.ptp(np.unwrap(lie.yaw(poses))) > 4.0 * np.pi  # turns the same way on every landing
+    for seed in range(3):
+        path = planned("staircase", "vlp-16", seed)
+        places = path.motion.lidar(np.arange(0.0, 40.0, 0.2))[:, :3, 3]
+        assert naive_raycast.distance_to_surface(places, path.solids).min() > 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gap_lacks_one_second_in_a_bend_and_one_on_a_straight(seed):
+    drive = planned("gap", "vlp-16", seed)
+    stamps = drive.truth().stamps_ns
+    steps = np.diff(stamps)
+    holes = np.flatnonzero(steps > 100_000_000)
+    assert steps[holes].tolist() == [1_100_000_000] * 2 and set(np.delete(steps, holes)) == {100_000_000}
+    yaw_rates = []
+    for hole in holes:
+        begin_s = (drive.scans[hole] + 1) * 0.1
+        times = np.linspace(begin_s, begin_s + 1.0, 101)
+        yaw_rates.append(np.diff(np.unwrap(lie.yaw(drive.motion.base(times)))) / 0.01)
+    assert np.abs(yaw_rates[0]).min() > 0.4 and np.abs(yaw_rates[1]).max() < 0.05
+
+
+def test_wheel_odometry_goes_on_in_a_gap_and_log_time_never_steps_back(tmp_path):
+    truth = simulate("gap", tmp_path / "a.mcap", duration_s=16.0, sensor="lms-270")
+    assert len(truth) == 150
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+    stamps = [nanoseconds(odometry) for _, odometry in messages(tmp_path / "a.mcap", "/odom")]
+    assert set(np.diff(stamps)) == {20_000_000} and stamps[-1] - stamps[0] == 16_000_000_000
+    assert [nanoseconds(scan) for _, scan in messages(tmp_path / "a.mcap", "/scan")] == truth.stamps_ns.tolist()
+
+
+# --- information -----------------------------------------------------------------------------------------------
+
+
+def informed(drive, scan):
+    """Shares, and the undetermined twists seen from the world: left perturbations of T_world_lidar."""
+    index = int(np.searchsorted(drive.scans, scan))
+    pose = drive.truth().poses[index]
+    H = information(drive.solids, pose, drive.sensor, index=scan)
+    return pose, spectrum(H)[0], undetermined(H) @ lie.adjoint(pose).T
+
+
+def test_information_is_the_curvature_of_the_point_to_plane_error():
+    drive, sensor = planned("forest", "vlp-16"), SENSORS["vlp-16"]
+    pose, rays = drive.truth().poses[100], sensor.rays(0)
+    standing = np.zeros(len(rays.directions), dtype=np.int32)
+    ranges, solid = drive.solids.strike(pose[None], standing, rays.directions, sensor.max_range_m)
+    hit = np.isfinite(ranges) & (ranges >= sensor.min_range_m)
+    points = rays.directions[hit] * ranges[hit, None]
+    places = lie.transform(pose, points)
+    normals = surface_normals(places, solid[hit], drive.solids)
+
+    def residuals(twist):
+        return np.sum(normals * (lie.transform(pose @ lie.exp(twist), points) - places), axis=1)
+
+    J = np.stack([(residuals(step) - residuals(-step)) / 2e-6 for step in 1e-6 * np.eye(6)], axis=1)
+    assert np.allclose(information(drive.solids, pose, sensor), J.T @ J, rtol=1e-5, atol=1e-3 * len(points))
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+def test_the_middle_of_the_corridor_leaves_the_way_along_it_undetermined(sensor):
+    drive = planned("corridor", sensor)
+    seen = set()
+    for scan in range(0, 400, 40):
+        pose, shares, twists = informed(drive, scan)
+        x = pose[0, 3]
+        if STRUCTURE_M + SIGHT_M < x < LENGTH_M - STRUCTURE_M - SIGHT_M:
+            assert shares[0] < 1e-12 and shares[1] > 1e-3 and len(twists) == 1
+            assert np.allclose(np.abs(twists[0]), [1.0, 0, 0, 0, 0, 0], atol=1e-6)
+            seen.add("middle")
+        elif x > LENGTH_M - 12.0:
+            assert shares[0] > 3e-3 and len(twists) == 0
+            seen.add("end")
+    assert seen == {"middle", "end"}
+
+
+@pytest.mark.parametrize("sensor", LIDARS)
+def test_the_field_leaves_place_and_heading_undetermined_where_no_pole_is_in_range(sensor):
+    drive = planned("field", sensor)
+    poles = drive.solids.cylinders[:, :2]
+    reach_m, wide = (58.0, 0.3) if sensor == "rosette" else (50.0, np.inf)  # it looks ahead only
+    seen = set()
+    for scan in range(0, 400, 20):
+        pose, shares, twists = informed(drive, scan)
+        offsets = (poles - pose[:2, 3]) @ pose[:2, :2]  # ahead, to the left
+        distance = np.linalg.norm(offsets, axis=1)
+        if distance.min() > WORLDS["field"].sight_m:
+            assert shares[2] < 1e-12 and shares[3] > 1e-3 and len(twists) == 3
+            assert np.abs(twists[:, [2, 3, 4]]).max() < 1e-6  # neither height nor roll nor pitch
+            seen.add("none")
+        elif np.sum((distance < reach_m) & (np.abs(offsets[:, 1]) < wide * offsets[:, 0])) == 3:
+            assert shares[0] > 1e-5 and len(twists) == 0
+            seen.add("poles")
+    assert seen == {"none", "poles"}
+
+
+# --- sweeps ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor"),
+    [("office", "lms-270"), ("office", "utm-30"), ("office", "vlp-16"), ("town", "hdl-64"), ("town", "os1-32"),
+     ("town", "vlp-16"), ("town", "rosette"), ("highway", "hdl-64"), ("corridor", "rosette"), ("field", "vlp-16"),
+     ("forest", "os1-32"), ("staircase", "hdl-64"), ("hall", "rosette"), ("turns", "os1-32")],
+)  # fmt: skip
+def test_undistorted_with_the_truth_every_point_lies_on_a_surface(drives, world, sensor):
+    planned_drive = planned(world, sensor)
+    solids, motion = drives.get(world, (planned_drive.solids, planned_drive.motion))
+    sweep = take_sweep(solids, motion, perfect(sensor), 37, 12.3, np.random.default_rng(0))
+    points = undistorted(sweep, motion, 12.3)
+    some = np.random.default_rng(1).choice(len(points), min(len(points), 1500), replace=False)
+    assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
+    assert naive_raycast.distance_to_surface(points[some], solids).max() < 1e-5
+
+
+def test_a_scan_of_a_moving_car_is_distorted(drives):
+    solids, motion = drives["town"]
+    sweep = take_sweep(solids, motion, perfect("hdl-64"), 0, 12.3, np.random.default_rng(0))
+    frozen = lie.transform(motion.lidar(np.array([12.3]))[0], sweep.points().astype(np.float64))
+    shift = np.linalg.norm(frozen - undistorted(sweep, motion, 12.3), axis=1)
+    expected = 0.1 * motion.speed_m_s(np.array([12.3]))[0]
+    assert 0.8 * expected < shift.max()
+    assert shift[sweep.times_s() < 0.001].max() < 0.02 * shift.max() + 0.02
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_rays_are_unit_vectors_fired_in_order_within_the_period(name):
+    sensor = SENSORS[name]
+    rays = sensor.rays(3)
+    assert np.allclose(np.linalg.norm(rays.directions, axis=1), 1.0)
+    times = rays.instants_ns[rays.instant_of_ray]
+    assert times[0] == 0 and np.all(np.diff(times) >= 0) and times[-1] < sensor.period_ns
+
+
+def test_the_rosette_never_repeats():
+    rays = SENSORS["rosette"].rays
+    assert np.abs(rays(0).directions - rays(1).directions).max() > 0.1
+
+
+def test_a_64_ring_scan_of_the_town_has_a_hundred_thousand_points(drives):
+    solids, motion = drives["town"]
+    sweep = take_sweep(solids, motion, SENSORS["hdl-64"], 0, 20.0, np.random.default_rng(0))
+    assert sweep.returned.sum() > 100_000
+
+
+def test_noise_and_losses_are_as_large_as_asked_for(drives):
+    solids, motion = drives["town"]
+    clean = take_sweep(solids, motion, perfect("hdl-64"), 0, 20.0, np.random.default_rng(0))
+    sensor = replace(SENSORS["hdl-64"], noise_m=0.05, dropout=0.1)
+    noisy = take_sweep(solids, motion, sensor, 0, 20.0, np.random.default_rng(0))
+    both = clean.returned & noisy.returned
+    assert both.sum() / clean.returned.sum() == pytest.approx(0.9, abs=0.01)
+    assert np.std(noisy.ranges_m[both] - clean.ranges_m[both]) == pytest.approx(0.05, rel=0.02)
+
+
+# --- wheels ----------------------------------------------------------------------------------------------------
+
+
+def test_wheels_without_drift_report_the_planar_truth(drives):
+    poses = drives["office"][1].base(np.arange(0.0, 100.0, 0.02))
+    odometry = wheel_odometry(poses, drift=0.0, rng=np.random.default_rng(0))
+    planar = lie.flatten(poses)
+    assert np.allclose(odometry, lie.inverse(planar[0]) @ planar, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["office", "town"])
+def test_wheel_odometry_drifts_more_the_larger_the_drift(drives, name):
+    poses = drives[name][1].base(np.arange(0.0, 60.0, 0.02))
+    planar = lie.flatten(poses)
+    truth = lie.inverse(planar[0]) @ planar
+    length = np.linalg.norm(np.diff(truth[:, :2, 2], axis=0), axis=1).sum()
+    errors = []
+    for drift in (0.3, 1.0, 3.0):
+        odometry = wheel_odometry(poses, drift=drift, rng=np.random.default_rng(5))
+        errors.append(np.linalg.norm(odometry[:, :2, 2] - truth[:, :2, 2], axis=1).max() / length)
+    assert errors[0] < errors[1] < errors[2]
+    assert 0.002 < errors[1] < 0.1
+
+
+# --- the log ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("world", "duration_s"), [("office", 3.0), ("town", 0.3)])
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, world, duration_s):
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        simulate(world, tmp_path / f"{name}.mcap", seed=seed, duration_s=duration_s)
+    for suffix in (".mcap", ".tum"):
+        first, same, other = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "abc")
+        assert first == same
+        assert first != other
+
+
+def test_an_office_log_reads_back(tmp_path):
+    seen = []
+    path = tmp_path / "office.mcap"
+    truth = simulate(
+        "office", path, duration_s=4.0, noise_m=0.0, dropout=0.0, progress=lambda *done: seen.append(done)
+    )
+    assert seen == [(count + 1, 40) for count in range(40)]
+    assert truth.poses.shape == (40, 3, 3)
+    scans, poses = messages(path, "/scan"), messages(path, "/ground_truth")
+    assert [nanoseconds(scan) for _, scan in scans] == truth.stamps_ns.tolist()
+    assert [nanoseconds(pose) for _, pose in poses] == truth.stamps_ns.tolist()
+    assert [record.log_time - nanoseconds(scan) for record, scan in scans] == [100_000_000] * 40
+    assert np.allclose([lie.flatten(pose_of(pose)) for _, pose in poses], truth.poses, atol=1e-9)
+
+    scan = scans[0][1]  # the robot stands still
+    angles = scan.angle_min + np.arange(len(scan.ranges)) * scan.angle_increment
+    assert (len(angles), scan.range_max) == (541, 30.0)
+    assert np.rad2deg([scan.angle_min, scan.angle_max]) == pytest.approx([-135.0, 135.0], abs=1e-3)
+    assert scan.time_increment * 720 == pytest.approx(0.1)
+    ranges = np.array(scan.ranges)
+    flat = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[np.isfinite(ranges)]
+    world = lie.transform(truth.poses[0], flat)
+    solids = WORLDS["office"].build(np.random.default_rng(np.random.SeedSequence(0, spawn_key=(0,))))
+    height = WORLDS["office"].vehicle.T_base_lidar[2, 3]
+    lifted = np.column_stack([world, np.full(len(world), height)])
+    assert naive_raycast.distance_to_surface(lifted, solids).max() < 2e-5
+
+
+def test_a_town_log_reads_back(tmp_path):
+    path = tmp_path / "town.mcap"
+    truth = simulate("town", path, duration_s=0.5, sensor="vlp-16")
+    assert truth.poses.shape == (5, 4, 4)
+    clouds = messages(path, "/points")
+    assert [nanoseconds(cloud) for _, cloud in clouds] == truth.stamps_ns.tolist()
+    for _, cloud in clouds:
+        layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4"), ("ring", "<u2")])
+        assert [field.name for field in cloud.fields] == list(layout.names) and cloud.point_step == layout.itemsize
+        rows = np.frombuffer(cloud.data, dtype=layout)
+        assert rows["t"][0] < 1_000_000 and rows["t"].max() < 100_000_000 and rows["ring"].max() == 15
+    ((_, static),) = messages(path, "/tf_static")
+    assert static.transforms[0].transform.translation.z == 1.73
+    wheels = messages(path, "/odom")
+    stamps = [nanoseconds(odometry) for _, odometry in wheels]
+    assert stamps == list(range(truth.stamps_ns[0], truth.stamps_ns[0] + 500_000_001, 20_000_000))
+
+
+def test_log_time_never_steps_back(tmp_path):
+    simulate("office", tmp_path / "a.mcap", duration_s=2.0)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+
+
+def test_the_tum_file_holds_the_truth_to_the_nanosecond(tmp_path):
+    truth = simulate("town", tmp_path / "a.mcap", duration_s=0.3, sensor="vlp-16")
+    lines = (tmp_path / "a.tum").read_text().splitlines()
+    stamps = [line.split()[0] for line in lines]
+    assert [int(stamp.replace(".", "")) for stamp in stamps] == truth.stamps_ns.tolist()
+    values = np.array([[float(word) for word in line.split()[1:]] for line in lines])
+    assert np.allclose(values[:, :3], truth.poses[:, :3, 3], atol=1e-9)
+    assert np.allclose(lie.from_quaternion(values[:, 3:]), truth.poses[:, :3, :3], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"world": "moon"}, "choose one of office, town"),
+        ({"sensor": "sonar"}, "choose one of lms-270"),
+        ({"duration_s": 0.0}, "duration_s 0 is out of range"),
+        ({"duration_s": float("nan")}, "duration_s nan"),
+        ({"drift": float("inf")}, "drift inf"),
+        ({"drift": -1.0}, "drift -1 is out of range"),
+        ({"dropout": 1.5}, "choose one from 0 to 1"),
+        ({"noise_m": float("nan")}, "noise_m nan"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_and_leaves_no_file(tmp_path, arguments, message):
+    world = arguments.pop("world", "office")
+    with pytest.raises(InputError, match=message) as caught:
+        simulate(world, tmp_path / "a.mcap", **{"duration_s": 1.0, **arguments})
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("existing", ["a.mcap", "a.tum"])
+def test_nothing_is_overwritten_without_force(tmp_path, existing):
+    (tmp_path / existing).write_text("precious")
+    with pytest.raises(InputError, match="exists"):
+        simulate("office", tmp_path / "a.mcap", duration_s=0.2)
+    assert (tmp_path / existing).read_text() == "precious"
+    simulate("office", tmp_path / "a.mcap", duration_s=0.2, force=True)
+
+
+# --- the catalog ---------------------------------------------------------------------------------------------
+
+
+def test_every_sequence_of_the_catalog_can_be_read():
+    assert {"office", "town", "demo-office", "demo-town", "intel", "kitti"} <= set(catalog.names())
+    for name in catalog.names():
+        source = catalog.load(name).source
+        if isinstance(source, catalog.Simulated):
+            assert source.world in WORLDS and source.sensor in SENSORS
+
+
+def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
+    short = catalog.Simulated(world="office", sensor="lms-270", seed=0, duration_s=0.5)
+    sequence = catalog.load("demo-office")
+    monkeypatch.setattr(catalog, "load", lambda name: msgspec.structs.replace(sequence, source=short))
+    path = catalog.prepare("demo-office", tmp_path)
+    assert path == tmp_path / "demo-office.mcap" and len(messages(path, "/scan")) == 5
+    written = path.stat().st_mtime_ns
+    assert catalog.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
+
+
+def test_an_unknown_sequence_names_the_known_ones():
+    with pytest.raises(InputError, match="demo-office, demo-town"):
+        catalog.load("mars")
+
+
+def test_a_misspelt_key_is_refused(tmp_path):
+    text = (catalog._folder() / "office" / "sequence.toml").read_text()
+    (tmp_path / "sequence.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
+    with pytest.raises(InputError, match="sede"):
+        catalog.read(tmp_path / "sequence.toml")

@@ -1,0 +1,276 @@
+"""Judging how damaged logs that are no MCAP are read: bags, CARMEN text, folders of sweeps."""
+
+import bz2
+import gzip
+import shutil
+import struct
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import lzf
+import numpy as np
+from rosbags import rosbag1
+
+from scanchain.config import LogConfig
+from scanchain.errors import InputError
+from scanchain.logs import open_log
+from tests.support import recorders
+from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser
+from tests.support.folders import PCD, PLY, kitti_odometry, kitti_raw, xyzi
+from tests.support.fuzzing import within_bounds
+from tests.support.mutations import Mutant, any_mutant
+
+SCANS = 12
+UNPACKED_AT_ONCE = 64  # bytes of packed text, which are lost with those that are damaged
+Expect = Callable[[str, Mutant], set[int]]
+
+
+@dataclass
+class Seed:
+    """A healthy log: the folder it lies in, what of it is opened, and its scans, as (stamp, points).
+
+    ``untouched`` tells from a damaged file, by its path in the folder, which scans must still be there.
+    """
+
+    name: str
+    folder: Path
+    opened: Path
+    untouched: Callable[[str, Mutant], set[int]]
+    rate_hz: float = 0.0
+
+    def __post_init__(self):
+        scans, told = read(self.opened, self.rate_hz)
+        assert told == [], told
+        self.scans = dict(scans)
+        assert len(self.scans) == SCANS, self.name
+        self.files = {
+            str(path.relative_to(self.folder)): path.read_bytes()
+            for path in sorted(self.folder.rglob("*"))
+            if path.is_file()
+        }
+
+
+def seeds(folder):
+    yield from _bags(folder / "bags")
+    yield from _carmen(folder / "carmen")
+    yield from _clouds(folder / "clouds")
+    yield from _kitti(folder / "kitti")
+
+
+def complaints(seed, rng, count):
+    """Each damaged log that is read badly: (the file, what was done to it, what is wrong)."""
+    names = list(seed.files)
+    for _ in range(count):
+        name = names[rng.integers(len(names))]
+        damaged = any_mutant(seed.files[name], rng)
+        path = seed.folder / name
+        path.write_bytes(damaged.data)
+        wrong = _complaint(seed, seed.untouched(name, damaged))
+        path.write_bytes(seed.files[name])
+        if wrong:
+            yield name, damaged, wrong
+
+
+def read(path, rate_hz):
+    """The scans recovered, as (stamp, points), and the lines told about what was not."""
+    scans = []
+    try:
+        log = open_log(path, LogConfig(max_bad_scans_percent=100.0, rate_hz=rate_hz))
+        for scan in log.scans():
+            scans.append((scan.stamp_ns, scan.points.tobytes()))
+        log.ground_truth()
+    except InputError as error:
+        assert "\n" not in str(error) and str(path) in str(error), f"no line of ours: {error}"
+        return scans, [str(error)]
+    assert not [line for line in log.damage if "\n" in line], log.damage
+    return scans, log.damage
+
+
+def _complaint(seed, untouched):
+    def quietly():
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.simplefilter("ignore", ResourceWarning)
+            return read(seed.opened, seed.rate_hz)
+
+    problem, answer = within_bounds(quietly)
+    if problem:
+        return problem
+    scans, told = answer
+    counted = Counter(scans)
+    missing = sorted(stamp_ns for stamp_ns in untouched if not counted[stamp_ns, seed.scans[stamp_ns]])
+    if missing:
+        return f"{len(missing)} of {len(untouched)} untouched scans are missing ({missing[:3]}); told: {told}"
+    return ""
+
+
+# bags
+
+
+def _bags(folder):
+    ros1, ros2 = recorders.Ros(recorders.ROS1), recorders.Ros(recorders.ROS2)
+    for compression in (None, "BZ2", "LZ4"):
+        inside = _made(folder / f"bag_{compression}")
+        path = recorders.bag1_of(inside / "a.bag", _sweeps(ros1), compression, chunk_bytes=2000)
+        yield Seed(f"bag {compression}", inside, path, _by_chunk(path))
+    for compression in ("NONE", "FILE", "MESSAGE"):
+        inside = recorders.bag2_of(folder / f"bag2_{compression}", _sweeps(ros2), compression=compression)
+        yield Seed(f"ROS 2 bag {compression}", inside, inside, _nothing)
+    inside = recorders.bag2_of(folder / "db3", _sweeps(ros2))
+    yield Seed("db3", inside, inside / "db3.db3", _nothing)
+
+
+def _sweeps(ros):
+    for cloud in recorders.clouds(SCANS):
+        yield "/points", "sensor_msgs/msg/PointCloud2", cloud.stamp_ns, ros.point_cloud(cloud)
+
+
+def _by_chunk(path):
+    """Scans of the chunks of a ROS 1 bag that nothing has touched, where its first line and topics are whole."""
+    data = path.read_bytes()
+    (topics_at,) = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)
+    with rosbag1.Reader(path) as reader:
+        begins = sorted(reader.chunks)
+        ends = [*begins[1:], topics_at]
+        times_ns = [
+            {entry.time for index in reader.indexes.values() for entry in index if entry.chunk_pos == begin}
+            for begin in begins
+        ]
+
+    def untouched(_, damaged):
+        if any(begin < 13 or end > topics_at for begin, end in damaged.touched if end < len(data)):
+            return set()
+        told = (begins[0], ends[0]), (begins[-1], len(data))  # the topics: in the first chunk and behind the last
+        if all(any(first < end and last > begin for first, last in damaged.touched) for begin, end in told):
+            return set()
+        return {
+            time_ns
+            for begin, end, times in zip(begins, ends, times_ns, strict=True)
+            for time_ns in times
+            if not any(first < end and last > begin for first, last in damaged.touched)
+        }
+
+    return untouched
+
+
+def _nothing(_name, _damaged):
+    return set()
+
+
+# CARMEN
+
+
+def _carmen(folder):
+    lines = ["# CARMEN", "PARAM robot_frontlaser_offset 0.2 nohost 0"]
+    for k in range(SCANS):
+        made = flaser(k) if k % 3 else robotlaser(k, np.linspace(1, 9, 12), (0.1, 0, 0), (0, 0, 0))
+        lines += [odom(k, 0.1 * k), made]
+    text = "\n".join([*lines, ""]).encode()
+    for name, pack in (("a.log", bytes), ("a.log.bz2", bz2.compress), ("a.log.gz", gzip.compress)):
+        inside = _made(folder / name.rpartition(".")[2])
+        (inside / name).write_bytes(pack(text))
+        yield Seed(f"CARMEN {name}", inside, inside / name, _by_line(text, name))
+
+
+def _by_line(text, name):
+    """Scans of the lines that nothing has touched; of packed text those that lie before the damage."""
+    lines, begin = [], 0
+    for line in text.splitlines(keepends=True):
+        if line.startswith((b"FLASER", b"ROBOTLASER1")):
+            lines.append((begin, begin + len(line), int(float(line.split()[-3]) * 1e9)))
+        begin += len(line)
+    assert lines[0][2] == int(BEGIN_S * 1e9)
+
+    def untouched(_, damaged):
+        touched = damaged.touched
+        if not name.endswith(".log"):
+            before = damaged.data[: max(0, min(begin for begin, _ in touched) - UNPACKED_AT_ONCE)]
+            touched = [(_unpacked(before, name), len(text))]
+        whole = (line for line in lines if not any(a < line[1] and b > line[0] - 1 for a, b in touched))
+        return {stamp_ns for _, _, stamp_ns in whole}
+
+    return untouched
+
+
+def _unpacked(data, name):
+    """How many bytes of text come out of the beginning of a packed file."""
+    unpacker = bz2.BZ2Decompressor() if name.endswith("bz2") else zlib.decompressobj(zlib.MAX_WBITS | 16)
+    return len(unpacker.decompress(data))
+
+
+# folders
+
+
+def _clouds(folder):
+    said = recorders.clouds(SCANS)
+    kinds = {"pcd": (PCD, ("ascii", "binary", "binary_compressed")), "bin": ("", ("raw",))}
+    kinds["ply"] = PLY, ("ascii", "binary_little_endian", "binary_big_endian")
+    for suffix, (head, forms) in kinds.items():
+        for form in forms:
+            inside = _made(folder / f"{suffix}_{form}")
+            stamps = {f"{cloud.stamp_ns}.{suffix}": cloud.stamp_ns for cloud in said}
+            for name, cloud in zip(stamps, said, strict=True):
+                (inside / name).write_bytes(_cloud(cloud, suffix, head, form))
+            yield Seed(f"{suffix} {form}", inside, inside, _by_file(stamps))
+    inside = _made(folder / "numbered")
+    for k, cloud in enumerate(said):
+        xyzi(cloud).tofile(inside / f"{k:04d}.bin")
+    yield Seed("numbered", inside, inside, _by_file({f"{k:04d}.bin": k * 10**8 for k in range(SCANS)}), 10.0)
+
+
+def _cloud(cloud, suffix, head, form):
+    if suffix == "bin":
+        return xyzi(cloud).tobytes()
+    order = ">" if "big" in form else "<"
+    if suffix == "pcd":
+        point = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<u8"), ("ring", "<u2")]
+    else:
+        point = [("x", order + "f8"), ("y", order + "f4"), ("z", order + "f4"), ("ring", "u1")]
+    rows = np.zeros(len(cloud.rows) - 1, point)
+    for name in "xyz":
+        rows[name] = cloud.rows[name][1:]
+    if suffix == "pcd":
+        rows["timestamp"] = cloud.stamp_ns + cloud.rows["t"][1:].astype(np.uint64)
+    told = head.format(count=len(rows), form=form).encode()
+    if form == "ascii":
+        return told + b"".join(b" ".join(repr(value).encode() for value in row) + b"\n" for row in rows.tolist())
+    if form == "binary_compressed":
+        data = b"".join(rows[name].tobytes() for name in rows.dtype.names)
+        packed = lzf.compress(data, 2 * len(data))
+        return told + struct.pack("<II", len(packed), len(data)) + packed
+    return told + rows.tobytes() + (b"\x03" + bytes(12) if suffix == "ply" else b"")
+
+
+def _kitti(folder):
+    said = recorders.clouds(SCANS)
+    raw = kitti_raw(_made(folder / "raw"), said)
+    yield Seed("KITTI raw", folder / "raw", raw, _by_sweep(raw, "timestamps"))
+    sequence = kitti_odometry(_made(folder / "odometry"), said)
+    yield Seed("KITTI odometry", folder / "odometry", sequence, _by_sweep(sequence, "times"))
+
+
+def _by_sweep(opened, times):
+    """As ``_by_file``; the sweeps' own times govern all of them, whatever tells the truth none."""
+    scans, _ = read(opened, 0.0)
+    files = [path.name for path in sorted(opened.rglob("*.bin"))]
+    by_file = _by_file(dict(zip(files, (stamp_ns for stamp_ns, _ in scans), strict=True)))
+
+    def untouched(name, damaged):
+        path = Path(name)
+        return set() if path.stem == times and path.parent.name != "oxts" else by_file(name, damaged)
+
+    return untouched
+
+
+def _by_file(stamps):
+    return lambda name, _: {stamp_ns for file, stamp_ns in stamps.items() if file != Path(name).name}
+
+
+def _made(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder

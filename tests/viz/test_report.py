@@ -1,0 +1,363 @@
+"""Reports in a real browser: everything is there, nothing overlaps or is cut, nothing of a log is ever obeyed."""
+
+import html
+import json
+import re
+import subprocess
+from base64 import b64decode, b64encode
+from hashlib import sha256
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rerun.chunk import RrdReader
+
+from scanchain.__main__ import main
+from scanchain.comparison.figures import COLUMNS
+from scanchain.comparison.table import read_table
+from scanchain.logs.writing.writer import LogWriter
+from scanchain.maps import read_ply
+from scanchain.simulation import simulate
+from scanchain.viz.pictures.map_figures import surroundings
+from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
+from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
+from tests.support.browser import find_browser, look
+from tests.support.scenes import ROOT
+
+EVIL = "<script>alert(1)</script>"
+SUPPORT = ROOT / "tests" / "support"
+SIZES = [(1200, False), (1200, True), (390, False), (390, True)]
+
+
+def renamed(source, destination, old, new):
+    """A copy of a log with one topic called otherwise."""
+    with source.open("rb") as read, destination.open("wb") as written:
+        writer = Writer(written)
+        writer.start()
+        channels = {}
+        for schema, channel, message in make_reader(read).iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                topic = new if channel.topic == old else channel.topic
+                channels[channel.id] = writer.register_channel(topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def evil(tmp_path_factory):
+    """Twelve seconds in the office, of a log whose lidar topic is a script."""
+    folder = tmp_path_factory.mktemp("log")
+    simulate("office", folder / "office.mcap", duration_s=12.0)
+    renamed(folder / "office.mcap", folder / "evil.mcap", "/scan", EVIL)
+    return folder / "evil.mcap"
+
+
+@pytest.fixture(scope="module")
+def comparison(evil, tmp_path_factory):
+    """The directory of a comparison of ours, a variant of an evil name, and one that raises evil words."""
+    folder = tmp_path_factory.mktemp("compared")
+    (folder / "a.toml").write_text(
+        f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}")
+        code = main(
+            [
+                "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),
+                "--methods", f"plicp,plicp+loops,{EVIL},raises",
+            ]
+        )  # fmt: skip
+    assert code == 1
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def one_run(evil, tmp_path_factory):
+    """The directory of a run."""
+    folder = tmp_path_factory.mktemp("run") / "out"
+    arguments = ["--odometry.prior", "constant-velocity", "--loops.min_travel_m", "5", "--rerun", "off"]
+    assert main(["run", str(evil), "--out", str(folder), *arguments]) == 0
+    return folder
+
+
+@pytest.mark.parametrize(("width", "dark"), SIZES)
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, request, tmp_path):
+    seen = look(request.getfixturevalue(which) / "report.html", tmp_path, width=width, dark=dark)
+    assert seen["wide"] <= seen["width"] and seen["outside"] == []
+    for number, drawing in enumerate(seen["svgs"]):
+        assert drawing["cut"] == [] and drawing["overlapping"] == [], number
+        assert drawing["width"] > 200 and drawing["height"] > 80
+    assert seen["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+
+
+def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, tmp_path):
+    seen, table = look(comparison / "report.html", tmp_path, width=1200), read_table(comparison)
+    for title in (
+        "Summary", "More on accuracy", "More on time",
+        "Trajectories", "Plan", "Error", "Over the distance", "Distribution", "Time per scan", "Along the log",
+        "Covariance consistency", "Observability", "Maps", "Loop closures of plicp+loops",
+        "Disagreement", "Command", "Versions", "Settings",
+    ):  # fmt: skip
+        assert title in seen["text"], title
+    assert len(seen["svgs"]) >= 11 and seen["tables"] >= 2 and seen["bold"] >= 5
+    for row in table.rows:
+        assert row.name in seen["text"]
+    assert "raises crashed: at scan 10: ValueError: no more <b>patience</b>" in seen["text"]
+    for column in COLUMNS:
+        for cell in column.cells(table.figures):
+            assert cell.text in seen["text"], column.key
+
+
+def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
+    seen = look(one_run / "report.html", tmp_path, width=1200)
+    for title in (
+        "Trajectory and map",
+        "Error",
+        "Time per scan",
+        "Observability",
+        "Loop closures",
+        "Versions",
+        "ATE",
+    ):
+        assert title in seen["text"], title
+    assert len(seen["svgs"]) >= 8
+
+
+def test_a_run_tells_its_result_first_and_its_time_last(one_run):
+    page = (one_run / "report.html").read_text(encoding="utf-8")
+    titles = re.findall(r"<h2>(.*?)</h2>", page)
+    assert titles == [
+        "Accuracy", "Trajectory and map", "Loop closures", "Trajectories", "Error", "Uncertainty",
+        "Time of a scan", "Time per scan", "How it was made",
+    ]  # fmt: skip
+    facts = re.findall(r"<dt>(.*?)</dt>", page)
+    assert facts[:2] == ["trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
+
+
+def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):
+    """The truth of a log twice as large as it is."""
+    truth = np.loadtxt(evil.parent / "office.tum")
+    truth[:, 1:4] *= 2.0
+    rows = [" ".join([f"{row[0]:.9f}", *(f"{value:.9f}" for value in row[1:])]) for row in truth]
+    (tmp_path / "twice.tum").write_text("\n".join(rows))
+    arguments = ["--rerun", "off", "--gt", str(tmp_path / "twice.tum")]
+    assert main(["run", str(evil), "--out", str(tmp_path / "out"), *arguments]) == 0
+    assert capfd.readouterr()[1].startswith("warning: far from the ground truth: ATE ")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    warned = re.search(
+        r'<div class="warning" role="alert">far from the ground truth: ATE [\d.]+ m, [\d.]+ %', page
+    )
+    assert warned and warned.start() < page.index("<dl>") < page.index("<h2>")
+
+
+def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one_run, tmp_path):
+    page = (one_run / "report.html").read_text(encoding="utf-8")
+    digest = b64encode(sha256(SCRIPT.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in html.unescape(page) and page.count("<script") == 1
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+        "--virtual-time-budget=2000", "--dump-dom", f"file://{one_run / 'report.html'}",
+    ]  # fmt: skip
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    drawn = re.search(r'data-drawn="(\d+)"', answer.stdout)
+    assert drawn and int(drawn[1]) == len(read_ply(one_run / "map.ply"))
+    assert answer.stdout.count("<button") == 4
+
+
+_HANDLED = """
+<script>
+(async () => {
+  const canvas = document.querySelector("canvas.scene");
+  const [plus, minus, above, reset] = document.querySelectorAll("button");
+  const frame = () => new Promise(done => setTimeout(done, 50));
+  const look = async () => { await frame(); return canvas.toDataURL(); };
+  const point = (type, x, y, shiftKey) => canvas.dispatchEvent(
+    new PointerEvent(type, {pointerId: 1, clientX: x, clientY: y, buttons: 1, shiftKey}));
+  const drag = shift => {
+    point("pointerdown", 300, 300, shift); point("pointermove", 360, 330, shift); point("pointerup");
+  };
+  const wheel = () => canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -50, cancelable: true}));
+  canvas.setPointerCapture = () => {};  // there is no such finger
+  const seen = {first: await look()};
+  wheel(); seen.scrolled = await look();
+  drag(false); seen.turned = await look();
+  wheel(); seen.zoomed = await look();
+  drag(true); seen.moved = await look();
+  reset.click(); seen.reset = await look();
+  plus.click(); seen.larger = await look();
+  minus.click(); above.click(); seen.above = await look();
+  const names = Object.keys(seen), images = Object.values(seen);
+  const same = Object.fromEntries(names.map((name, i) => [name, names[images.indexOf(images[i])]]));
+  document.title = "PROBE" + JSON.stringify(same);
+})();
+</script></body>"""
+
+
+def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_clicked(tmp_path):
+    points = np.random.default_rng(2).uniform([-20.0, -10.0, 0.0], [20.0, 10.0, 6.0], (5000, 3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    lines = [
+        PathLine(np.linspace(low, high, 50), "red", 1.0),
+        PathLine(np.linspace(high, low, 9), "", 1.0, is_dashed=True),
+    ]
+    scene = map_scene(points, lines, low, high, grain_m=0.2, is_flat=False)
+    section = Section("Map", drawings=(Drawing("Map", "", scene, is_wide=True),))
+    write_page(tmp_path / "a.html", Page("a", "b", (), (), (), (section,), script=SCRIPT))
+    text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "a.html").read_text())
+    frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window
+    (tmp_path / "b.html").write_text(text.replace("<body>", f"<body>{frames}").replace("</body>", _HANDLED))
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+        "--window-size=1000,900", "--virtual-time-budget=5000", "--dump-dom", f"file://{tmp_path / 'b.html'}",
+    ]  # fmt: skip
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    same = json.loads(html.unescape(re.search("<title>PROBE(.*?)</title>", answer.stdout)[1]))
+    assert same == {name: name for name in same} | {"scrolled": "first", "reset": "first"}
+    assert len(same) == 8
+
+
+def test_the_map_in_a_page_stays_small_and_lies_where_the_points_are():
+    random = np.random.default_rng(3)
+    points = random.normal(0.0, [80.0, 50.0, 4.0], (900_000, 3)).astype(np.float32)
+    path = np.linspace([-60.0, 0.0, 0.0], [60.0, 5.0, 1.0], 20_000)
+    low, high = surroundings(path.min(axis=0), path.max(axis=0), [points])
+    broken = np.where(np.arange(20_000)[:, None] % 7 < 5, path, np.nan)
+    lines = [PathLine(path, "red", 1.0), PathLine(broken[:500], "", 1.0)]
+    scene = map_scene(points, lines, low, high, grain_m=0.3, is_flat=False)
+    assert len(scene) < 2_000_000
+    told = json.loads(html.unescape(re.search('data-scene="(.*?)"', scene)[1]))
+
+    def positions(text):
+        fractions = np.frombuffer(b64decode(text), "<u2").reshape(-1, 3) / 65535.0
+        return low + fractions * (high - low)
+
+    shown = positions(told["points"])
+    assert 140_000 < len(shown) <= 160_000
+    np.testing.assert_allclose(shown.std(axis=0), points.std(axis=0), rtol=0.02)
+    first, second = (positions(line["points"]) for line in told["lines"])
+    np.testing.assert_allclose(first[[0, -1]], path[[0, -1]], atol=0.01)
+    assert [line["pairs"] for line in told["lines"]] == [False, True]
+    assert len(first) <= 4000 and len(second) % 2 == 0
+    np.testing.assert_allclose(second[:2], path[:2], atol=0.01)
+
+
+def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
+    random = np.random.default_rng(0)
+    points = random.uniform([-90.0, -20.0, -2.0], [70.0, 20.0, 8.0], (20_000, 3))
+    points[:30, 0] = 130.0  # a gable far away
+    points[30:40] = [[9000.0, -3000.0, 50.0]] * 10
+    low, high = surroundings(np.array([-1.0, -1.0, 0.0]), np.array([30.0, 1.0, 0.1]), [points])
+    np.testing.assert_allclose(low, [-90.0, -20.0, -2.0], atol=0.1)
+    np.testing.assert_allclose(high, [130.0, 20.0, 8.0], atol=0.1)
+
+
+def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_told_apart():
+    states = ["ok"] * 10 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
+    keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
+    fits = [0.3] * 2 + [0.9] * 38
+    steps = pa.table({"state": states, "keyframe": keyframes, "fit": fits})
+    closures = pa.table(
+        {
+            "target_scan": [0, 5, 0], "source_scan": [30, 35, 20], "rejected_by": ["", "back end", "verification"],
+        }
+    )  # fmt: skip
+    positions = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
+    points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
+    section = trajectory_section(course(positions), Tables(steps, closures), positions + 0.1, points, 0.2)
+    assert [chip.name for chip in section.chips] == [
+        "trajectory",
+        "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
+        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans",
+        "at closures rejected by the back end: 10 scans", "ground truth",
+    ]  # fmt: skip
+    told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
+    assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})
+    assert [line["color"] for line in told["lines"]] == [chip.color for chip in section.chips]
+    assert all(chip.color in section.drawings[0].svg for chip in section.chips)
+
+
+def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
+    ranges_m = np.random.default_rng(0).normal(3.0, 0.01, 181)
+    with LogWriter(tmp_path / "still.mcap") as log:
+        for k in range(8):
+            stamp_ns = 10**18 + k * 10**8
+            log.laser_scan(
+                "/scan", stamp_ns, "lidar", -1.57, 0.01745, 0.0, ranges_m, range_min_m=0.1, range_max_m=30.0
+            )
+            log.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(3))
+    arguments = [
+        "run",
+        str(tmp_path / "still.mcap"),
+        "--out",
+        str(tmp_path / "out"),
+        "--rerun",
+        "off",
+        "--no-loops",
+    ]
+    assert main(arguments) == 0
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Accuracy" in text and "<td>–</td>" in text and "Loop closures" not in text
+
+
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_a_topic_that_is_a_script_is_shown_as_text_and_not_run(which, request, tmp_path):
+    page = request.getfixturevalue(which) / "report.html"
+    seen = look(page, tmp_path, width=1200)
+    assert EVIL in seen["text"]
+    ours = 1 if which == "one_run" else 0
+    assert seen["scripts"] == ours + 1  # and that of the probe
+    text = page.read_text(encoding="utf-8")
+    assert text.count("<script") == ours and html.escape(EVIL) in text
+
+
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_a_page_needs_nothing_but_itself(which, request):
+    text = (request.getfixturevalue(which) / "report.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    linked = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\')\s>]+)', text)
+    assert linked and all(link.startswith(("data:", "#")) for link in linked), set(linked)
+    assert len(text) < 3_000_000
+
+
+def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
+    from scanchain.viz.report.comparison import write_compare_report
+
+    before = (comparison / "report.html").read_bytes()
+    write_compare_report(comparison)
+    assert (comparison / "report.html").read_bytes() == before
+
+
+def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparison):
+    entities = {str(chunk.entity_path) for chunk in RrdReader(comparison / "compare.rrd").stream()}
+    for method in ("plicp", "plicp\\+loops"):
+        for part in ("world/{}/trajectory", "world/{}/lidar", "world/{}/map", "plots/error/{}", "plots/time/{}"):
+            assert "/" + part.format(method) in entities
+    assert "/world/ground_truth" in entities
+
+
+def course(positions, **known):
+    count = len(positions)
+    unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "observability")}
+    unknown["relation_error_m"] = np.empty(0)
+    return DrawnTrajectory("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
+
+
+def test_a_drawing_takes_the_colors_of_its_page():
+    positions = np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=0)
+    svg = plan("a", [course(positions)], None, positions.min(axis=0), positions.max(axis=0))
+    assert "var(--ink)" in svg and "var(--line)" in svg and "#010203" not in svg
+    assert re.search(r"<svg[^>]* viewBox=", svg) and not re.search(r"<svg[^>]* width=", svg)
+
+
+def test_every_text_of_a_page_is_escaped(tmp_path):
+    chip, drawing = Chip(EVIL, "red"), Drawing(EVIL, EVIL, svg="<svg></svg>")
+    grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),), (EVIL,))
+    section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
+    fold = Collapsible(EVIL, EVIL)
+    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), (EVIL,), (section,), (fold,)))
+    assert "<script" not in (tmp_path / "a.html").read_text()
