@@ -223,7 +223,7 @@ def path(value: object, name: str) -> Path:
 
 @contextmanager
 def writing(path: Path) -> Generator[None]:
-    """A context in which a place that takes no file, or none of this user, is told as InputError."""
+    """A context in which a path that takes no file, or none of this user, raises InputError."""
     try:
         yield
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:

@@ -99,7 +99,7 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        is_untimed = config.point_times == "none"  # told from scans that have no times at all
+        is_untimed = config.point_times == "none"  # distinguished from scans without any times
         self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2

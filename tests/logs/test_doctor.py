@@ -207,7 +207,7 @@ def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_p
 
     path = saved(tmp_path, drive(ranges=ranges))
     finding = diagnose(path)["no return"]
-    assert finding.severity == "warning" and "15 % of the beams tell exactly 29.99 m" in finding.found
+    assert finding.severity == "warning" and "15 % of the beams have exactly 29.99 m" in finding.found
     flag, value = finding.remedy.split()
     assert flag == "--log.max_range_m" and 29.98 < float(value) < np.float32(29.99)
     assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"

@@ -128,8 +128,8 @@ def _no_return(seen: Survey) -> Finding:
     stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
     limit_m = min(stated_m, seen.log.config.max_range_m)
     if share < _STUCK_SHARE:
-        return Finding("no return", Severity.OK, "no range is told so often that it must stand for no return")
-    found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"
+        return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
+    found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
     if farthest_m >= limit_m:
         return Finding("no return", Severity.OK, f"{found}; range limits take it out")
     effect = "if it stands for no return, it is taken for a wall that moves along"
@@ -164,17 +164,17 @@ def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
             "surfaces", Severity.OK, f"they determine every motion in {counted(len(found), 'scan')} looked at"
         )
     motions = " and ".join(motion for motion, _ in open_motions.most_common(2))
-    told = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
+    extent = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
     effect = "scans are degenerate there, that motion is predicted; a run most of whose scans are so is unreliable"
     if not seen.wheels:
         effect += "; wheel odometry, or a lidar with a wider view or a longer range, helps"
-    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, told, effect)
+    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, extent, effect)
 
 
 def _rings(seen: Survey) -> Finding:
     rings = [scan.rings for scan in seen.scans]
     if not any(rings):
-        return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
+        return Finding("rings", Severity.OK, "points have no field of their ring; a run does not need it")
     most, least = max(rings), min(rings)
     found = counted(most, "ring") if most == least else f"{least} to {most} rings"
     if least < most:
@@ -205,7 +205,7 @@ def _rest(seen: Survey) -> Finding:
         f"{still_s:.1f} of {total_s:.1f} s nothing changes from scan to scan, {first_s:.1f} s of it at the start"
     )
     if rests and rests[0].last - rests[0].first == len(seen.scans) - 1:
-        effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
+        effect = "nothing moves, or all scans are the same as in a bare corridor: the trajectory is one point"
         return Finding("rest", Severity.WARNING, found, effect)
     if first_s > _LONG_REST_S:
         effect = "the trajectory drifts by millimeters meanwhile, and it takes time"
@@ -235,13 +235,13 @@ def _mounting(seen: Survey) -> Finding:
         return Finding(
             "mounting", Severity.PROBLEM, f"scans in several frames: {', '.join(sorted(frames))}", effect
         )
-    told = next((note for note in seen.log.notes if note.startswith("no static transform")), "")
-    if told:
+    note = next((line for line in seen.log.notes if line.startswith("no static transform")), "")
+    if note:
         effect = "trajectories are the lidar's; record /tf_static"
         if not seen.wheels:
-            return Finding("mounting", Severity.WARNING, told, effect)
+            return Finding("mounting", Severity.WARNING, note, effect)
         effect += ", as the wheels' turns are taken about the lidar instead of the robot"
-        return Finding("mounting", Severity.WARNING, told, effect, "--odometry.prior constant-velocity")
+        return Finding("mounting", Severity.WARNING, note, effect, "--odometry.prior constant-velocity")
     place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
     mounting = seen.log.mounting
     if mounting.motion is not None:
@@ -249,7 +249,7 @@ def _mounting(seen: Survey) -> Finding:
         effect += "; wheels are carried over to it by /tf" if seen.log.has_odometry else ""
         return Finding("mounting", Severity.NOTE, f"the lidar moves: {mounting.motion}", effect)
     if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
-        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not told")
+        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not stated")
     return Finding(
         "mounting", Severity.OK, f"lidar frame {frame}: at {place} m of {mounting.base_name}, {mounting.source}"
     )

@@ -95,7 +95,7 @@ def _periods(seen: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _jitter(seen: Survey) -> Finding:
     _, off_s = _periods(seen)
     if not len(off_s):
-        return Finding("jitter", Severity.OK, "too few scans to tell")
+        return Finding("jitter", Severity.OK, "too few scans for statistics")
     jitter_s = float(np.std(off_s))
     share = jitter_s / seen.period_s
     found = (
