@@ -112,5 +112,5 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     if name in _COMPILED:
-        import_module("scanchain.clock").tell_compilation()
+        import_module("scanchain.clock").warn_of_compilation()
     return globals().setdefault(name, getattr(import_module(f"scanchain.{_HOMES[name]}"), name))

@@ -25,7 +25,7 @@ from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
 from scanchain.commands.view import view
-from scanchain.errors import InputError, ScanchainError, told
+from scanchain.errors import InputError, ScanchainError, remedy_of
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -84,8 +84,8 @@ def _unforeseen(error: Exception) -> int:
     """Exit code of an unexpected error: the remedy of a system error, else how to get the traceback."""
     if os.environ.get("SCANCHAIN_DEBUG"):
         raise error
-    if isinstance(error, OSError) and told(error):
-        return _fail(told(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
+    if isinstance(error, OSError) and remedy_of(error):
+        return _fail(remedy_of(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
     return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows the traceback", 1)
 
 

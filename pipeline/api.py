@@ -1,4 +1,4 @@
-"""The commands for scripts: process a log, compare methods on it, optimize a graph, downsample points."""
+"""The commands as functions: process a log, compare methods on it, optimize a graph, downsample points."""
 
 from __future__ import annotations
 

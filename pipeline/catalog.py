@@ -1,4 +1,4 @@
-"""The catalog of sequences: the folders under sequences/, and how a log is made from each."""
+"""The catalog of sequences: the folders under sequences/, and the preparation of a log from each."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind
 class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="download"):
     """A recording that others publish, in a form that ``scanchain convert`` takes.
 
-    ``page`` is where its authors describe it. ``reference_url`` is what it is judged by, or calibrated with, empty
+    ``page`` is where its authors describe it. ``reference_url`` is its reference or calibration, empty
     if there is nothing. Of an archive ``converts`` is the folder in it that becomes the log.
     """
 
@@ -47,9 +47,9 @@ class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
 
 class Page(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="page"):
-    """A recording that only a person can fetch, because it asks for an account or its files have no fixed address.
+    """A recording behind an account or without a fixed address, to be downloaded by hand.
 
-    ``steps`` says what to fetch there and how it becomes MCAP.
+    ``steps`` are the instructions for its download and conversion to MCAP.
     """
 
     page: str
@@ -98,9 +98,9 @@ def read(file: Path) -> Sequence:
 def prepare(
     name: str, folder: Path, *, force: bool = False, progress: Callable[[int, int], None] | None = None
 ) -> Path:
-    """The path of the sequence's log in ``folder``; made, or fetched and converted, unless it is there already.
+    """The path of the sequence's log in ``folder``; simulated, or downloaded and converted, where it is missing.
 
-    progress : told of scans made, or of MiB fetched, so many of all
+    progress : called with the scans made, or the MiB downloaded, and their total
     """
     source = load(name).source
     destination = folder / f"{name}.mcap"
@@ -132,7 +132,7 @@ def prepare(
 
 
 def _download(name: str, source: Download, folder: Path, progress: Callable[[int, int], None] | None) -> Path:
-    """Fetch the recording and what belongs to it; the file or folder that is to be converted."""
+    """Download the recording and what belongs to it; the file or folder that is to be converted."""
     sha256 = "" if source.sha256 == "unknown" else source.sha256
     recording = folder / _file_name(source.url)
     fetch(source.url, recording, sha256=sha256, progress=progress)

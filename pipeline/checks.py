@@ -20,11 +20,11 @@ from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
-_MOST_VOXELS = float((1 << 20) - 64)  # to each side of the origin, beyond which keys of voxels repeat
-_LATEST_S = 1e11  # of a stamp: the year 5138
+_MOST_VOXELS = float((1 << 20) - 64)  # largest distance from the origin, beyond which keys of voxels repeat
+_LATEST_S = 1e11  # latest stamp, seconds: the year 5138
 SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
-LARGEST = 1e50  # number in points, weights or a graph: products of a few such are still numbers
-LONGEST_SWEEP_S = 10.0  # between the stamp of a scan and any of its points
+LARGEST = 1e50  # largest number in points, weights or a graph: products of a few are still finite
+LONGEST_SWEEP_S = 10.0  # largest time between the stamp of a scan and any of its points
 
 
 def dimension(value: object, name: str = "dimension") -> int:
@@ -193,7 +193,7 @@ def matrices(value: object, name: str, wanted: tuple[int, ...]) -> NDArray[np.fl
 
 
 def whole_numbers(value: object, name: str, wanted: str) -> NDArray[np.int64]:
-    """An array of whole numbers; floats are refused, since seconds are told from nanoseconds by that alone."""
+    """An array of whole numbers; floats are refused, since that alone distinguishes seconds from nanoseconds."""
     array = _array(value, name, wanted)
     if array.dtype.kind not in "iu" and array.size:
         raise InputError(f"{name} holds {_kind(array)}; wanted whole numbers: {wanted}")
@@ -223,7 +223,7 @@ def path(value: object, name: str) -> Path:
 
 @contextmanager
 def writing(path: Path) -> Generator[None]:
-    """A context in which a place that takes no file, or none of this user, is told as InputError."""
+    """A context in which a path that takes no file, or none of this user, raises InputError."""
     try:
         yield
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:

@@ -1,4 +1,4 @@
-"""Compilation of kernels, once after an installation: announced, and left out of the times that are measured."""
+"""Compilation of kernels, once after an installation: announced, and subtracted from the measured times."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from numba.core import event
 
-_TOLD = "compiling kernels, once after an installation: the first calls take up to a minute in all"
+_WARNING = "compiling kernels, once after an installation: the first calls take up to a minute in all"
 
 
 class _Compilation(event.Listener):
@@ -29,7 +29,7 @@ class _Compilation(event.Listener):
         self.depth += 1
         if not self.is_silent and event.data["dispatcher"].py_func.__module__.startswith("scanchain."):
             self.is_silent = True
-            logging.getLogger("scanchain").warning(_TOLD)
+            logging.getLogger("scanchain").warning(_WARNING)
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
@@ -41,8 +41,8 @@ _compilation = _Compilation()
 event.register("numba:compile", _compilation)
 
 
-def tell_compilation() -> None:
-    """Log a warning when kernels are next compiled: a caller of the Python API would wait in silence."""
+def warn_of_compilation() -> None:
+    """Log a warning when kernels are next compiled, so that callers of the Python API know of the delay."""
     _compilation.is_silent = False
 
 

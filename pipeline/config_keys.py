@@ -56,7 +56,7 @@ class ConfigKey:
 
     @property
     def range(self) -> str:
-        """What it may hold, in words."""
+        """Range of its values as text."""
         if self.kind == "choice":
             return " | ".join((*self.choices, "MODULE:CLASS") if self.is_open else self.choices)
         if self.kind in ("bool", "str"):

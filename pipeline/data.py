@@ -127,7 +127,7 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """The answer of a registration.
+    """Result of a registration.
 
     Attributes
     ----------
@@ -278,7 +278,7 @@ def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: 
     """Fit of the edges in force as text: χ², its degrees of freedom, how many edges do not count.
 
     rejected : how many edges are not in force, in words; empty for none
-    Loops that measure too little to leave degrees of freedom have a χ² all the same: ``has_loops`` tells of them.
+    Loops that measure too little to leave degrees of freedom have a χ² all the same: see ``has_loops``.
     """
     left_out = rejected and f", {rejected}"
     if degrees_of_freedom == 0 and not has_loops:

@@ -15,7 +15,7 @@ from scanchain.errors import InputError, ScanchainError
 
 Progress = Callable[[int, int], None]
 
-_PIECE_BYTES = 1 << 18
+_BLOCK_BYTES = 1 << 18
 _MIB = 1 << 20
 _TIMEOUT_S = 30.0
 _ATTEMPTS = 4
@@ -23,15 +23,15 @@ _BROKEN = (http.client.HTTPException, ConnectionError, TimeoutError, urllib.erro
 
 
 class DownloadError(ScanchainError):
-    """A file that could not be fetched; what there is of it is kept for the next try."""
+    """A file that could not be downloaded; the part received is retained for the next try."""
 
 
 def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress | None = None) -> str:
     """Download a file unless it exists, resuming an earlier try; returns its SHA-256.
 
-    sha256 : what it must be, empty where nobody knows. Raises InputError where it is not, and for what is no
-        HTTP address; DownloadError where the server does not answer as it should.
-    progress : told how many MiB of how many are there, 0 where the server does not say
+    sha256 : the expected one, empty where unknown. Raises InputError where it is not, and for what is no
+        HTTP address; DownloadError where the server does not respond as it should.
+    progress : called with the MiB received and their total, 0 where unknown
     """
     if urlsplit(url).scheme not in ("http", "https"):
         raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")
@@ -47,7 +47,7 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """As much of a file as has come. Beside it lies what tells whether the server still has the same one."""
+    """The part of a file received so far, and beside it the server's validator of that version."""
 
     url: str
     path: Path
@@ -58,7 +58,7 @@ class _Part:
         return self.path.with_name(f"{self.path.name}.etag")
 
     def complete(self, progress: Progress | None) -> None:
-        """Fetch what is missing, asking again where the line breaks."""
+        """Download the missing bytes, with a new request after each interruption."""
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 if self._more(progress):
@@ -80,28 +80,32 @@ class _Part:
                 raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
     def _more(self, progress: Progress | None) -> bool:
-        """One request from the first missing byte on; whether the file is complete."""
+        """One request from the first missing byte on; True if the file is complete."""
         have = self.path.stat().st_size if self.path.exists() else 0
         validator = self.validator_path.read_text() if have and self.validator_path.exists() else ""
         have = have if validator else 0
-        asked = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
-        with urllib.request.urlopen(urllib.request.Request(self.url, headers=asked), timeout=_TIMEOUT_S) as answer:
-            is_rest = answer.status == http.client.PARTIAL_CONTENT
+        headers = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
+        with urllib.request.urlopen(
+            urllib.request.Request(self.url, headers=headers), timeout=_TIMEOUT_S
+        ) as response:
+            is_rest = response.status == http.client.PARTIAL_CONTENT
             have = have if is_rest else 0
-            length = answer.headers.get("Content-Length")
+            length = response.headers.get("Content-Length")
             total = have + int(length) if length is not None else 0
-            self.validator_path.write_text(answer.headers.get("ETag") or answer.headers.get("Last-Modified") or "")
+            self.validator_path.write_text(
+                response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
+            )
             with self.path.open("ab" if is_rest else "wb") as file:
-                while piece := answer.read(_PIECE_BYTES):
-                    file.write(piece)
-                    have += len(piece)
+                while block := response.read(_BLOCK_BYTES):
+                    file.write(block)
+                    have += len(block)
                     if progress is not None:
                         progress(have // _MIB, total // _MIB)
         return not total or have == total
 
 
 def _verify(path: Path, sha256: str, url: str) -> str:
-    """The SHA-256 of a file; one that is not what it must be is deleted."""
+    """The SHA-256 of a file; one with another than expected is deleted."""
     with path.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if sha256 and found != sha256:

@@ -38,7 +38,7 @@ _REMEDIES = {
 }
 
 
-def told(error: OSError) -> str:
+def remedy_of(error: OSError) -> str:
     """Remedy of a system error on one line; empty if none is known."""
     remedy = _REMEDIES.get(error.errno or 0, "")
     return f"{error.filename}: {remedy}" if error.filename and remedy else remedy

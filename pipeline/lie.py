@@ -43,7 +43,7 @@ def between(T_a: Pose, T_b: Pose) -> Pose:
 
 
 def apart(T_a: Pose, T_b: Pose) -> tuple[float, float]:
-    """How far apart two poses are: meters, and the angle in [0, π] between their rotations."""
+    """Distance between two poses: meters, and the angle in [0, π] between their rotations."""
     return poses.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
 
 
@@ -156,7 +156,7 @@ def normalize(T: Pose) -> Pose:
 
 
 def interpolate(T_a: Pose, T_b: Pose, share: float) -> Pose:
-    """The pose a ``share`` of the way from T_a to T_b, along the screw that joins them."""
+    """The pose at a ``share`` of the motion from T_a to T_b, along the screw that joins them."""
     return exp(share * log(T_b @ inverse(T_a))) @ T_a
 
 
@@ -232,7 +232,7 @@ def _so3_coefficients(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 def _log_so3(R: Matrix) -> NDArray[np.float64]:
-    """Rotation vectors (..., 3) by way of the quaternion, which is well conditioned from 0 to π."""
+    """Rotation vectors (..., 3) by the quaternion, which is well conditioned from 0 to π."""
     result = np.empty((*R.shape[:-2], 3))
     pose_log.rotation_vectors(_stack(R), result.reshape(-1, 3))
     return result

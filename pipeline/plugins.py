@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 
 
 def is_class_name(text: str) -> bool:
-    """Whether a text has the form ``package.module:Class``."""
+    """True if a text has the form ``package.module:Class``."""
     return re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", text) is not None
 
 
@@ -66,5 +66,5 @@ def _imported(module_name: str, name: str) -> ModuleType:
 
 
 def _is_missing(module_name: str, error: Exception) -> bool:
-    """Whether it is the module itself, or a package it lies in, that was not found."""
+    """True if the module itself, or a package it lies in, was not found."""
     return isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}.")

@@ -1,4 +1,4 @@
-"""Points of scans in a file instead of memory, so that a log of hours takes no more of that than a short one."""
+"""Points of scans in a file instead of memory, so that memory does not grow with the length of the log."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PointStore:
         self._take(path.open("r+b", buffering=0))
 
     def close(self) -> None:
-        """Let the file go; nothing can be read any more."""
+        """Close the file; nothing can be read any more."""
         self.file.close()
 
     def _take(self, file: FileIO) -> None:

@@ -62,7 +62,7 @@ def available_mib() -> float:
 
 
 def die_first() -> None:
-    """Make the kernel kill this process, not the one that watches it, when memory runs out."""
+    """Make the kernel kill this process, not its parent, when memory runs out."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
 
@@ -110,14 +110,14 @@ def run_within(
     *,
     output: Path,
     errors: Path | None = None,
-    look_s: float,
+    interval_s: float,
     is_own_session: bool = False,
     stop: Event | None = None,
 ) -> Ending:
     """Run a command to its end, or kill it and its children when it takes too much or ``stop`` is set.
 
     output, errors : files for stdout and stderr; without ``errors`` both go into one
-    look_s : seconds between two looks at its memory
+    interval_s : seconds between two readings of its memory
     is_own_session : whether a Ctrl-C on the terminal does not reach it
     """
     with output.open("wb") as out, (errors or output).open("ab") as err:
@@ -130,12 +130,12 @@ def run_within(
             start_new_session=is_own_session,
         )
         try:
-            return _watch(process, limits, look_s, stop or Event())
+            return _watch(process, limits, interval_s, stop or Event())
         finally:
             _end(process)
 
 
-def _watch(process: subprocess.Popen[bytes], limits: Limits, look_s: float, stop: Event) -> Ending:
+def _watch(process: subprocess.Popen[bytes], limits: Limits, interval_s: float, stop: Event) -> Ending:
     """Wait for the end, or for the moment at which there is a reason to kill it."""
     began, peak = monotonic(), 0.0
     while process.poll() is None:
@@ -144,13 +144,13 @@ def _watch(process: subprocess.Popen[bytes], limits: Limits, look_s: float, stop
             return Ending(0, KilledFor.MEMORY, peak, monotonic() - began)
         if monotonic() - began > limits.time_s:
             return Ending(0, KilledFor.TIME, peak, monotonic() - began)
-        if stop.wait(look_s):
+        if stop.wait(interval_s):
             return Ending(0, KilledFor.STOP, peak, monotonic() - began)
     return Ending(process.returncode, KilledFor.NOTHING, peak, monotonic() - began)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Nothing of it stays, children included."""
+    """Kill the process and its children."""
     if process.poll() is None:
         family = psutil.Process(process.pid).children(recursive=True)
         process.kill()

@@ -43,7 +43,7 @@ class Override:
 
 
 def named(overrides: Sequence[Override], key: str) -> str:
-    """What flags set a key to, the last of several; empty where none does."""
+    """Text that flags set a key to, the last of several; empty where none does."""
     return next((change.text for change in reversed(overrides) if change.key == key), "")
 
 
@@ -136,7 +136,7 @@ def _as_in_toml(value: Value) -> str:
 
 
 def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:
-    """The keys that other keys, or the kind of log, leave without an effect, and why."""
+    """The keys without an effect under other keys, or for this kind of log, with the reason."""
     matches_all = float(values["preprocess.match_voxel_m"]) <= float(values["preprocess.map_voxel_m"])
     recognizer = str(values["loops.recognizer"])
     is_own = ":" in recognizer
@@ -183,7 +183,7 @@ def read_layer(file: Path) -> dict[str, Value]:
 
 
 def preset_path(name: str) -> Path:
-    """Where a preset lies: in the installed package, or beside it in a checkout."""
+    """Path of a preset: in the installed package, or beside it in a checkout."""
     here = Path(__file__).resolve().parent
     for folder in (here / "presets", here.parent / "configs"):
         if (folder / f"{name}.toml").is_file():

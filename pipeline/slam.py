@@ -36,9 +36,9 @@ from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
-_LOST_SIGMAS = (1.0, 0.2)  # m and rad, of the motion over one scan that was lost
-_OPTIMIZE_EVERY = 10  # keyframes between two optimizations, at least
-_GROWTH = 0.05  # of the graph, between two optimizations that change little
+_LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
+_OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
+_GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -148,10 +148,10 @@ class Slam:
             timing=timing,
         )
 
-    def finish(self, tell: Callable[[str], None] = lambda stage: None) -> SlamResult:
+    def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
         """Close what is left, optimize once more, spread the corrections over all scans and refine these.
 
-        tell : told which of these stages begins
+        progress : called with the name of each stage when it begins
         Raises InputError without a scan, and when called again.
         """
         self._check_unfinished()
@@ -159,16 +159,16 @@ class Slam:
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
         if self.config.loops.enabled:
-            tell("closing the last loops")
+            progress("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
-        tell(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
+        progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
         corrected = spread(state.poses, numbers, odometry)
         if self.keeps_scans:
-            tell(f"refining {counted(len(odometry), 'scan')}")
+            progress(f"refining {counted(len(odometry), 'scan')}")
             corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),
@@ -240,7 +240,7 @@ class Slam:
         return taken
 
     def _add(self, closure: Closure) -> Closure:
-        """Make an edge of a closure, which is returned with what the graph said of it before."""
+        """Make an edge of a closure; returns the closure with its innovation in the graph before."""
         config = self.config.loops
         information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
         Z_ij = closure.match.T_target_source
@@ -254,7 +254,7 @@ class Slam:
     def _optimize_when_due(self) -> GraphState | None:
         """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
 
-        The growth asked for is a share of the graph, so that all optimizations together cost little more than a
+        The required growth is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
@@ -275,7 +275,7 @@ class Slam:
 def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:
     """Information (k, k) of a pose-graph edge: the matcher's, with a floor under its variances.
 
-    Residuals share the map's errors and are far from independent, so that H alone promises too much.
+    Residuals share the map's errors and are far from independent, so that H alone is overconfident.
     """
     floor = lie.by_component(len(match.information), sigma_m, sigma_rad) ** 2
     covariance = np.linalg.inv(match.information + np.diag(1e-6 / floor)) + np.diag(floor)

@@ -17,10 +17,10 @@ from scanchain.words import counted
 _NS_PER_S = 1_000_000_000
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
-_UNIT = 0.01  # how far the length of a quaternion, which may be written with two digits, may be from 1
+_UNIT = 0.01  # largest deviation from 1 of the length of a quaternion, which may be written with two digits
 _NO_ROTATION = 1e-3  # a quaternion that is shorter stands for an unknown rotation
 _NO_COORDINATE_M, _DAY_S = 1e8, 86_400.0  # x above it, and within a day of the stamp, is a stamp
-_ORTHONORMAL = 1e-3  # how far RᵀR of a KITTI file, which is written with few digits, may be from identity
+_ORTHONORMAL = 1e-3  # largest deviation of RᵀR from identity in a KITTI file, which is written with few digits
 
 
 def read_tum(path: Path | str) -> Trajectory:

@@ -1,4 +1,4 @@
-"""A file that is there whole or not at all."""
+"""Atomic writing of a file: it is complete, or not there."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Shows what the pipeline did: rerun recording, plots."""
+"""Presentation of the pipeline's results: rerun recording, pictures, reports."""

@@ -32,7 +32,7 @@ class Entry:
     ----------
     make : constructor, given the settings; the package is imported there and not before
     package : distribution whose version is reported
-    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing tells point-to-
+    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing sets point-to-
         plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
     is_raised : whether a 2D scan must be given height, because surfaces are looked for
     forgets : whether a second instance in a process is independent of the first

@@ -1,4 +1,4 @@
-"""The protocol of a baseline, and what adapts one to it: finite points, poses at the stamp, scans in the plane."""
+"""The protocol of a baseline, and adapters to it: finite points, poses at the stamp, scans in the plane."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class AtStamp:
         self.last_stamp_ns, self.last_held_s = 0, 0.0
 
     def move(self, T_theirs_held: Pose, stamp_ns: int, held_s: float) -> Pose:
-        """T_odom_lidar at the stamp, of a pose in the baseline's own frame that holds ``held_s`` after it."""
+        """T_odom_lidar at the stamp, of a pose in the baseline's own frame that is valid ``held_s`` after it."""
         T_theirs_last, self.T_theirs_last = self.T_theirs_last, T_theirs_held
         interval_s = (stamp_ns - self.last_stamp_ns) * 1e-9 + held_s - self.last_held_s
         last_held_s = self.last_held_s
@@ -82,7 +82,7 @@ class InPlane:
     """Feeds a 3D baseline with planar scans and brings its poses back into the plane.
 
     Points lie at z = 0 or, where the method looks for surfaces, stand on top of each other: walls, whose normals
-    are horizontal. All levels are alike, so that nothing is said about the height.
+    are horizontal. All levels are alike, so that the height is unobservable.
     """
 
     def __init__(self, baseline: Baseline, *, is_raised: bool) -> None:

@@ -77,8 +77,8 @@ class SmallGicpModel:
         )
         if self.started:
             guess = self.T_odom_lidar @ self.T_previous_current
-            answer = self.library.align(self.map, cloud, guess, num_threads=self.threads)
-            T_odom_lidar = lie.normalize(np.array(answer.T_target_source))
+            result = self.library.align(self.map, cloud, guess, num_threads=self.threads)
+            T_odom_lidar = lie.normalize(np.array(result.T_target_source))
             self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
             self.T_odom_lidar = T_odom_lidar
         self.map.insert(cloud, self.T_odom_lidar)
@@ -118,7 +118,7 @@ class SmallGicpPairs:
         )
         if self.previous is not None:
             target, target_tree = self.previous
-            answer = self.library.align(
+            result = self.library.align(
                 target,
                 cloud,
                 target_tree,
@@ -126,7 +126,7 @@ class SmallGicpPairs:
                 max_correspondence_distance=self.settings.max_distance_m,
                 num_threads=self.threads,
             )
-            self.T_previous_current = np.array(answer.T_target_source)
+            self.T_previous_current = np.array(result.T_target_source)
             self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud, tree
         return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))

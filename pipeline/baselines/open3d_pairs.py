@@ -64,7 +64,7 @@ class Open3dPairs:
         frame, times = finite(points, times_s)
         cloud = self._cloud(frame)
         if self.previous is not None:
-            answer = self.register(
+            result = self.register(
                 cloud,
                 self.previous,
                 self.settings.max_distance_m,
@@ -72,7 +72,7 @@ class Open3dPairs:
                 self.estimation,
                 self.criteria,
             )
-            self.T_previous_current = np.array(answer.transformation)
+            self.T_previous_current = np.array(result.transformation)
             self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ self.T_previous_current)
         self.previous = cloud
         return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))

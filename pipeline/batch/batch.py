@@ -1,4 +1,4 @@
-"""Many logs: each that has no result yet is run in a process of its own, and all of them become one table."""
+"""A batch: every log without a result is run in a process of its own; all of them become one table."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class BatchProgress(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Logs to run, and how.
+    """Logs to run, with configuration and limits.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Batch:
     out : the batch's directory, created or resumed
     config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``
     workers : processes at a time on this machine
-    time_s : what a log may take; memory_mib : as well, None for a fair share of what is free
+    time_s : limit of a log; memory_mib : likewise, None for a fair share of the free memory
     retries : further tries of a log that crashed its process
     """
 
@@ -69,7 +69,7 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Batched:
-    """A batch that came to its end; ``kept`` of the rows are those of earlier calls."""
+    """A finished batch; ``kept`` of the rows are those of earlier calls."""
 
     rows: tuple[Row, ...]
     kept: int
@@ -86,10 +86,10 @@ class Batched:
 
 
 def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:
-    """Run what has no result yet and write the table; logs of the same contents are run once.
+    """Run the logs without a result and write the table; logs of the same contents are run once.
 
     work : where the tasks are run; None for processes on this machine
-    On Ctrl-C what runs is killed, and the table says what was not run. Raises InputError for a directory that
+    On Ctrl-C what runs is killed, and the table lists what was not run. Raises InputError for a directory that
     cannot be made or is another's, and a configuration that is wrong.
     """
     _check_out(batch)
@@ -159,7 +159,7 @@ def _tasks(batch: Batch) -> list[Task]:
 
 
 def _row_of(task: Task, rows: dict[str, Row]) -> Row:
-    """The row of a task: its own, that of a log with the same contents, or why there is none."""
+    """The row of a task: its own, that of a log with the same contents, or one with the reason for none."""
     if task.key in rows:
         row = rows[task.key]
         if row.log != task.name and not row.state.has_result:
@@ -171,7 +171,7 @@ def _row_of(task: Task, rows: dict[str, Row]) -> Row:
     if not task.sha256:
         if isinstance(source, Path) and not source.exists():
             return unfinished_row(task, State.FAILED, "no such file; check the path")
-        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} says why")
+        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} shows the reason")
     return unfinished_row(task, State.NOT_RUN, "stopped by the user")
 
 
@@ -196,7 +196,7 @@ _WILD = frozenset("*?[")
 
 
 def collect(named: Sequence[Source], manifests: Sequence[Path]) -> tuple[Source, ...]:
-    """Every log once, in the order named; patterns stand for what they match, by name.
+    """Every log once, in the order named; patterns are replaced by the paths they match, by name.
 
     manifests : text files with a path, address or pattern a line, paths relative to the file; # begins a comment
     Raises InputError for a pattern that matches nothing and a manifest that cannot be read.

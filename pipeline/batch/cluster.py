@@ -15,7 +15,7 @@ def on_cluster(address: str) -> Callable[[Sequence[Task]], Iterator[Row]]:
     """Worker that runs tasks on a Ray cluster, one core each; those of a machine that dies move to another.
 
     address : of the cluster's head, or "auto" for the one that this machine belongs to
-    Raises MissingExtraError without Ray, InputError where no cluster answers.
+    Raises MissingExtraError without Ray, InputError where no cluster responds.
     """
     try:
         import ray

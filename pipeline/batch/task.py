@@ -1,4 +1,4 @@
-"""A log of a batch: its task, the process that runs it (``scanchain run``), and the row that says how it ended."""
+"""A log of a batch: its task, the process that runs it (``scanchain run``), and the row of its result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 
-ROWS_FOLDER = "rows"  # of a batch's directory: what became of each log
+ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
 
 class State(StrEnum):
@@ -42,7 +42,7 @@ class State(StrEnum):
 
 
 class Task(Struct, frozen=True):
-    """A log and how it is run.
+    """A log to run, with arguments and limits.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Task(Struct, frozen=True):
     key : of its contents and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
-    time_s, memory_mib : what its process may take
+    time_s, memory_mib : limits of its process
     retries : further tries of one that crashed
     """
 
@@ -66,7 +66,7 @@ class Task(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The log as it is called in what is written: an address without the keys in it, spelled as text."""
+        """Name of the log in messages and tables: an address without the keys in it, spelled as text."""
         return spelled(str(source_of(self.log)))
 
     @property
@@ -151,7 +151,7 @@ _THREADS = tuple(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", 
 
 
 def attempt(task: Task, stop: Event | None = None) -> Row:
-    """Run a log, again where it crashed and has tries left; nothing it does is raised."""
+    """Run a log, again where it crashed and has tries left; raises nothing."""
     row = _tried(task, stop)
     while row.state is State.CRASHED and row.tries <= task.retries:
         row = msgspec.structs.replace(_tried(task, stop), tries=row.tries + 1)
@@ -166,7 +166,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
         [*command, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
         output=task.output_file,
-        look_s=_LOOK_S,
+        interval_s=_LOOK_S,
         is_own_session=True,
         stop=stop,
     )
@@ -200,8 +200,8 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
     """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    said = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
-    error = next((line for line in reversed(said) if line.startswith("error: ")), "")
+    output = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         unreliable = _metrics(task).unreliable
         if unreliable and error.endswith(unreliable):
@@ -210,5 +210,5 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:
         return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(said).split())[-_LAST_CHARACTERS:]
+    last = " ".join(" ".join(output).split())[-_LAST_CHARACTERS:]
     return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")

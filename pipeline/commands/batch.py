@@ -78,7 +78,7 @@ def batch(
     """Run many logs, each in its own process.
 
     LOG is a file, folder or address that scanchain run takes, or a quoted glob pattern. A log whose process
-    crashes, hangs or runs out of memory becomes a row that says so; the others finish, and the exit code is 1.
+    crashes, hangs or runs out of memory becomes a row with the reason; the others finish, and the exit code is 1.
     Called again, batch runs only the logs that have no result yet. A result belongs to the contents of the log (of
     a remote one: its address, size and version) and the effective configuration. DIR gets a run directory per log,
     batch.parquet with a row per log, report.html and summary.txt. Logs with different lidar topics need separate
@@ -125,7 +125,7 @@ def batch(
     files = "batch.parquet, report.html, summary.txt"
     click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")
     if batched.failures:
-        raise ScanchainError(f"{batched.failures}; {out}/summary.txt says why")
+        raise ScanchainError(f"{batched.failures}; {out}/summary.txt has the reason")
 
 
 def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:

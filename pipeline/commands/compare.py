@@ -1,4 +1,4 @@
-"""``scanchain compare``: which method is better on a log."""
+"""``scanchain compare``: comparison of methods on a log."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def compare(
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
     Writes tables, report.html and a rerun recording. Every method runs in its own process; one that crashes, hangs
-    or runs out of memory becomes a row that says so, and the exit code is 1. Our methods use no wheel odometry
+    or runs out of memory becomes a row with the reason, and the exit code is 1. Our methods use no wheel odometry
     unless --odometry.prior is auto, since the others have none.
 
     \b
@@ -127,4 +127,4 @@ def compare(
     if not as_json:
         click.echo(f"written {comparison.out}: report.html, compare.rrd, tables")
     if compared.failures:
-        raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; the table says why")
+        raise ScanchainError(f"did not finish: {', '.join(compared.failures)}; see the table for the reason")

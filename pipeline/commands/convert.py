@@ -73,8 +73,8 @@ def convert(
     for line in done.damage:
         click.echo(f"warning: {line}", err=True)
     if as_json:
-        told = {"path": str(done.path), "messages": done.messages, "notes": done.notes, "damage": done.damage}
-        click.echo(json.dumps(told, indent=2))
+        reported = {"path": str(done.path), "messages": done.messages, "notes": done.notes, "damage": done.damage}
+        click.echo(json.dumps(reported, indent=2))
         return
     for note in done.notes:
         click.echo(f"note: {note}", err=True)

@@ -1,4 +1,4 @@
-"""``scanchain doctor``: what is wrong with a log."""
+"""``scanchain doctor``: faults of a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scanchain evaluate``: a trajectory against the truth."""
+"""``scanchain evaluate``: metrics of a trajectory against ground truth."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class GraphReport:
             "dimension": graph.dimension,
             "poses": len(graph),
             "edges": len(graph.edges),
-            "suspected": int(graph.is_loop.sum()),
+            "robust_edges": int(graph.is_loop.sum()),
             "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
             "projected": None if self.file.projection is None else asdict(self.file.projection),
             "kept_lines": dict(self.file.other_tags),

@@ -1,4 +1,4 @@
-"""``scanchain info``: what is in a log."""
+"""``scanchain info``: contents of a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scanchain landmarks``: landmark problems solved, their linear solvers side by side where that is asked for."""
+"""``scanchain landmarks``: landmark problems solved, on request by several linear solvers side by side."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _check_names(studies: Sequence[Study]) -> None:
 
 
 def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree: dict[str, object]) -> None:
-    """The estimates, the figures, and how they came about."""
+    """Write the estimates and the figures of all solvers."""
     from msgspec.structs import replace
 
     from scanchain.landmarks.files.write import write_estimate

@@ -13,7 +13,7 @@ import click
 
 from scanchain.commands.graph_report import GraphReport
 from scanchain.commands.options import OverrideCommand, alias, check_output, overrides
-from scanchain.errors import InputError, told
+from scanchain.errors import InputError, remedy_of
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -93,8 +93,8 @@ def optimize(
     outputs.check(force)
     settings = overrides(ctx, _aliases(shortcuts))
     config = _config(settings)
-    is_suspicious = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
-    file = _read(source, cast("Indefinite", indefinite), is_suspicious)
+    is_robust = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
+    file = _read(source, cast("Indefinite", indefinite), is_robust)
     report = _solved(file, source.name, config, cast("Initialization", initialize))
     written = outputs.write(report)
     click.echo(report.json(written) if as_json else report.text(written))
@@ -177,7 +177,7 @@ def _written(path: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        if told(error):
+        if remedy_of(error):
             raise
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
 
@@ -188,20 +188,20 @@ def _aliases(options: dict[str, str | None]) -> list[Override]:
 
 
 def _config(settings: Sequence[Override]) -> GraphConfig:
-    """The graph's branch of the configuration; nothing else means anything here."""
+    """The graph's branch of the configuration; other keys are refused."""
     for setting in settings:
         if not setting.key.startswith("graph."):
             raise InputError(f"{setting.flag} has no meaning for optimize; its keys begin with --graph.")
     return load_settings(overrides=settings).config.graph
 
 
-def _read(source: Path, indefinite: Indefinite, is_suspicious: bool) -> G2oFile:
-    """The graph, with a warning where it is not taken as it stands."""
+def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
+    """The graph, with a warning where matrices were projected."""
     from scanchain.graph.files.g2o import read_g2o
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        file = read_g2o(source, loops="suspect" if is_suspicious else "trusted", indefinite=indefinite)
+        file = read_g2o(source, loops="robust" if is_robust else "quadratic", indefinite=indefinite)
     if file.projection is not None:
         remedy = "fix the program that wrote them, or stop here with --indefinite refuse"
         click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)

@@ -164,7 +164,7 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
 
 
 def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic or "none" as an override; what is neither a file nor looks like a topic is a file."""
+    """A file, or a topic or "none" as an override; any other word is a file."""
     if text is None:
         return None, ()
     path = Path(text)

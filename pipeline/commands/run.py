@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
-_GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to look through them often costs a twentieth
+_GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")

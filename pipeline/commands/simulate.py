@@ -46,8 +46,8 @@ def simulate(
     WORLD is one of
       office     rooms and corridors, 2D laser scanner
       town       streets on rolling ground
-      rounds     the town without parked cars, its streets driven again both ways
-      identical  corridors and rooms that all look alike, 2D laser scanner
+      rounds     the town without parked cars, its streets driven again in both directions
+      identical  identical corridors and rooms, 2D laser scanner
       highway    guard rails and signs at 25 m/s, from the first scan on
       corridor   80 m between bare walls: motion along it is unobservable but at its ends
       field      flat, a few poles far apart: between them only the ground is visible
@@ -56,7 +56,7 @@ def simulate(
       hall       flat floor, few pillars, from standstill to 5 m/s
       turns      turns on the spot at 120 deg/s and short moves in a yard
       gap        the town, but one second of scans is missing in a bend, and one on a straight
-    All but office and identical are driven with a 3D lidar unless --sensor says otherwise.
+    All but office and identical are driven with a 3D lidar by default.
 
     \b
     Examples:

@@ -18,7 +18,7 @@ _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if
 
 
 class Terminal:
-    """Shows how far a job is; a context manager.
+    """Progress of a job; a context manager.
 
     On the first Ctrl-C (or SIGTERM, or a closed terminal) while scans are tracked no more of them come, and the
     run finishes with what it has; at any other time, and on the second, it interrupts as usual.
@@ -47,12 +47,12 @@ class Terminal:
             signal.signal(number, handler)
 
     def say(self, line: str) -> None:
-        """Tell something that happens, to a person only."""
+        """Show a line on a terminal only."""
         if self.bar is not None:
             self.bar.say(line)
 
-    def tell(self, line: str) -> None:
-        """Tell something that must be known, also into a pipe."""
+    def announce(self, line: str) -> None:
+        """Show a line on a terminal or in a pipe."""
         if self.bar is None:
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
@@ -60,7 +60,7 @@ class Terminal:
             self.bar.say(line)
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
-        """Pass the scans on until they end or the user wants no more."""
+        """Pass the scans on until they end or the user stops."""
         self.is_tracking = True
         for done, scan in enumerate(scans, start=1):
             yield scan

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
-from scanchain.comparison.judging import judge
+from scanchain.comparison.assessment import assess
 from scanchain.comparison.methods import default_names, resolve
 from scanchain.comparison.processes import limits_for, run_all
 from scanchain.comparison.results import Reference, Results, write_results
@@ -93,7 +93,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         matcher=comparison.matcher,
     )
     for line in settings.without_effect:
-        progress.tell(line)
+        progress.announce(line)
     directory = RunDirectory(comparison.out, force=comparison.force)
     provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
     with directory, Hashing(comparison.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
@@ -108,11 +108,11 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
             methods, scans, Path(shared), repeat=comparison.repeat, limits=limits, progress=progress
         )
         progress.say("evaluating and drawing")
-        judged = {
-            name: judge(runs, scans.stamps_ns, reference.truth, reference.relations)
+        assessed = {
+            name: assess(runs, scans.stamps_ns, reference.truth, reference.relations)
             for name, runs in outcomes.items()
         }
-        results = Results(methods, scans, outcomes, judged, maps_of(scans, outcomes), reference)
+        results = Results(methods, scans, outcomes, assessed, maps_of(scans, outcomes), reference)
         write_results(directory.path, results)
         provenance = msgspec.structs.replace(
             provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=perf_counter() - began

@@ -1,4 +1,4 @@
-"""Figures of a method, and how tables show them: heads, units, digits, and which of a column is the best."""
+"""Figures of a method, and their columns in tables: heads, units, digits, best value."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Figures(Struct, frozen=True):
 
 
 class Shown(Struct, frozen=True):
-    """A figure as a table has it: – where there is none; whether it is the best of its column."""
+    """A figure as text, – where there is none; True if it is the best of its column."""
 
     text: str
     is_best: bool
@@ -60,7 +60,7 @@ class Column(Struct, frozen=True):
     digits : after the point, at most
     better : which values are marked as the best; "one" is whatever is nearest to 1
     table : the summary, which the short tables are, or one of the two that hold the rest
-    definition : what it says, in a sentence
+    definition : its meaning, in a sentence
     """
 
     key: str
@@ -83,7 +83,7 @@ class Column(Struct, frozen=True):
         return None if value is None else self.scale * value
 
     def cells(self, rows: Sequence[Figures]) -> list[Shown]:
-        """The figures of a table's rows; where all that are known look alike, none is the best."""
+        """The figures of a table's rows; none is the best where all that are known are equal as text."""
         values = [self.of(row) for row in rows]
         digits = self._digits([abs(value) for value in values if value])
         badness = [None if value is None else self._badness(round(value, digits)) for value in values]
@@ -228,7 +228,7 @@ COLUMNS = (
 
 
 def columns_of(rows: Sequence[Figures], table: str) -> list[Column]:
-    """The columns of a table that anyone has a figure for."""
+    """The columns of a table with a figure in at least one row."""
     return [
         column for column in COLUMNS if column.table == table and any(column.of(row) is not None for row in rows)
     ]

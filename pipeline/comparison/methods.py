@@ -28,7 +28,7 @@ _ON_REQUEST = (
     "genz-icp-indoor",
     "genz-icp-kitti",
 )
-_BASE = "method"  # the key of a table that says what it is a variant of
+_BASE = "method"  # the key of a table that names the method it is a variant of
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
 
@@ -74,7 +74,7 @@ def resolve(
 ) -> tuple[Method, ...]:
     """The methods of these names, settings checked.
 
-    file : TOML, one table a method; a table of another name is a variant and says of what by ``method``
+    file : TOML, one table a method; a table of another name is a variant of the one that its key ``method`` names
     overrides : keys of the configuration, for all of ours
     matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS and CLASS+loops
     Raises InputError for a name or a key that there is not.
@@ -99,7 +99,7 @@ def resolve(
     for override in overrides:
         if override.key in ("matching.matcher", "loops.enabled"):
             raise InputError(
-                f"{override.flag} is what tells plicp, svd and +loops apart; choose by --methods or --matcher"
+                f"{override.flag} distinguishes plicp, svd and +loops; choose by --methods or --matcher"
             )
     return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
 
@@ -138,7 +138,7 @@ def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int
 def _our_settings(
     base: str, own: Mapping[str, Any], dimension: int, where: str, overrides: Sequence[Override]
 ) -> dict[str, Any]:
-    """The configuration of one of ours; no wheels unless they are asked for, since nobody else has them."""
+    """The configuration of one of ours; no wheels unless requested, since nobody else has them."""
     wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")
     kind = {"loops.enabled": str("+" in base).lower()}
     if base.partition("+")[0] != _ANY:

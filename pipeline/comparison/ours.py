@@ -1,4 +1,4 @@
-"""Our own methods in a comparison, with all they know of themselves."""
+"""Our own methods in a comparison, with the tables that only they write."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class OurChain:
         """The final poses; tables go into the folder."""
         result = self.slam.finish()
         self.steps.write(folder / STEPS_FILE, result.trajectory)
-        judged = final_verdicts(result.closures, result.state)
-        write_closures(folder / CLOSURES_FILE, judged, result.keyframes, odometry.dimension)
+        final = final_verdicts(result.closures, result.state)
+        write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
         return result.trajectory
 
 

@@ -42,7 +42,7 @@ class EndReport(Struct, frozen=True):
     start_s : import, loading what is compiled, and a throwaway instance on the first scans
     finish_s : after the last scan, as for the last optimization
     peak_mib : of its resident memory, interpreter and packages included
-    has_compiled : whether kernels were compiled in between, so that its times say nothing
+    has_compiled : whether kernels were compiled in between, so that its times are not valid
     """
 
     status: Status

@@ -17,12 +17,12 @@ from scanchain.comparison.worker import METHOD_FILE
 from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # seconds of the default time limit: at least, and per scan
-_SHARE = 0.75  # of the memory that is free
+_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
+_SHARE = 0.75  # share of the free memory that is the default limit
 
 
 def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
-    """The limits asked for, else 300 s and one more a scan, and three quarters of the memory that is free."""
+    """The requested limits, else 300 s and one more a scan, and three quarters of the memory that is free."""
     return Limits(
         _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
         _SHARE * available_mib() if memory_mib is None else memory_mib,
@@ -50,7 +50,7 @@ def run_all(
                 progress.say(f"{method.name}: compiled its kernels, once after the installation; run again")
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
-            progress.say(_said(method.name, turn, repeat, outcome))
+            progress.say(_progress_line(method.name, turn, repeat, outcome))
     return outcomes
 
 
@@ -60,25 +60,25 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
     return read_outcome(folder, report, scans.stamps_ns, scans.dimension)
 
 
-def _said(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
+def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
     if outcome.report.status is Status.OK:
         return f"{name}{which}: {outcome.seconds.sum():.1f} s"
     return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
 
 
-_LOOK_S = 0.02
-_LAST_CHARACTERS = 300  # of the output of a process that crashed
+_INTERVAL_S = 0.02
+_LAST_CHARACTERS = 300  # last characters of the output of a process that crashed, which are reported
 _KILLED = -9
 
 
 def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> EndReport:
-    """Run a method over stored scans; its own folder takes what it writes and says."""
+    """Run a method over stored scans; its own folder takes what it writes and prints."""
     (folder / METHOD_FILE).write_bytes(msgspec.msgpack.encode(method))
     command = [sys.executable, "-P", "-m", "scanchain.comparison.worker", str(scans), str(folder)]
     # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
-    ending = run_within(limits, command, environment, output=folder / "output.txt", look_s=_LOOK_S)
+    ending = run_within(limits, command, environment, output=folder / "output.txt", interval_s=_INTERVAL_S)
     if ending.killed_for is KilledFor.TIME:
         return _ended(Status.TIMED_OUT, f"took longer than --time-limit ({limits.time_s:.3g} s)", ending, folder)
     if ending.killed_for is KilledFor.MEMORY:
@@ -88,8 +88,8 @@ def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> En
         return _own_report(folder)
     if ending.code == _KILLED:
         return _ended(Status.OUT_OF_MEMORY, "killed, as the system does when memory runs out", ending, folder)
-    said = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
-    return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {said}" if said else ""), ending, folder)
+    output = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
+    return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {output}" if output else ""), ending, folder)
 
 
 def _own_report(folder: Path) -> EndReport:

@@ -13,7 +13,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.comparison.judging import Judged, judge, observability, representative
+from scanchain.comparison.assessment import Assessed, assess, observability, representative
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
 from scanchain.comparison.scan_store import StoredScans
@@ -32,7 +32,7 @@ METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tu
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Reference of the errors: poses, relations, both or none; ``note`` says what is missing."""
+    """Reference of the errors: poses, relations, both or none; ``note`` names what is missing."""
 
     truth: Trajectory | None
     relations: Relations | None
@@ -42,12 +42,12 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """All runs of all methods by name, what was found of each, and the map (M, d) of each that came to its end."""
+    """All runs of all methods by name, the figures of each, and the map (M, d) of each finished one."""
 
     methods: Sequence[Method]
     scans: StoredScans
     outcomes: Mapping[str, list[Outcome]]
-    judged: Mapping[str, Judged]
+    assessed: Mapping[str, Assessed]
     maps: Mapping[str, Points]
     reference: Reference
 
@@ -55,7 +55,7 @@ class Results:
 def write_results(folder: Path, results: Results) -> None:
     """Everything scan by scan, and a folder a method with trajectory, map, tables, and what it printed."""
     write_scans(folder / SCANS_FILE, list(_runs(results)), results.scans.stamps_ns)
-    write_relations(folder / RELATIONS_FILE, results.judged)
+    write_relations(folder / RELATIONS_FILE, results.assessed)
     if results.reference.truth is not None:
         write_tum(folder / TRUTH_FILE, during(results.reference.truth, results.scans.stamps_ns))
     settings = {method.name: {"method": method.base} | method.settings for method in results.methods}
@@ -70,8 +70,8 @@ def _runs(results: Results) -> Iterator[RunOfMethod]:
     for name, outcomes in results.outcomes.items():
         for repeat, outcome in enumerate(outcomes):
             is_representative = outcome is representative(outcomes)
-            judged = results.judged[name] if is_representative else judge([outcome], stamps_ns, truth, None)
-            yield RunOfMethod(name, repeat, outcome, judged)
+            assessed = results.assessed[name] if is_representative else assess([outcome], stamps_ns, truth, None)
+            yield RunOfMethod(name, repeat, outcome, assessed)
 
 
 def method_folder(folder: Path, name: str) -> Path:
@@ -80,12 +80,12 @@ def method_folder(folder: Path, name: str) -> Path:
 
 
 def _write_method(own: Path, results: Results, name: str) -> None:
-    outcome, judged = representative(results.outcomes[name]), results.judged[name]
+    outcome, assessed = representative(results.outcomes[name]), results.assessed[name]
     own.mkdir(parents=True)
     if outcome.is_whole:
         write_tum(own / TRAJECTORY_FILE, outcome.trajectory)
     if name in results.maps:
-        write_ply(own / MAP_FILE, picture_points(results.maps[name], judged))
+        write_ply(own / MAP_FILE, picture_points(results.maps[name], assessed))
     for file in (STEPS_FILE, CLOSURES_FILE, "output.txt"):
         source = outcome.folder / file
         if source.exists() and source.stat().st_size:
@@ -98,18 +98,18 @@ _NOTES = {
     "seconds, cpu_seconds": "tracking the scan, on the clock and by all threads together",
     "distance_m": "traveled up to the scan, by the method itself",
     "error_m, error_rad": "against the true pose beside it, after alignment; null where there is none",
-    "nees": "of the motion up to the scan; null where the method does not tell its covariance",
+    "nees": "of the motion up to the scan; null where the method reports no covariance",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class RunOfMethod:
-    """A run of a method, and what was found of it."""
+    """A run of a method, and its figures."""
 
     name: str
     repeat: int
     outcome: Outcome
-    judged: Judged
+    assessed: Assessed
 
 
 def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.int64]) -> None:
@@ -121,12 +121,12 @@ def write_scans(path: Path, runs: Sequence[RunOfMethod], stamps_ns: NDArray[np.i
     pq.write_table(pa.concat_tables(tables).replace_schema_metadata(_NOTES), path, compression="zstd")
 
 
-def write_relations(path: Path, judged: Mapping[str, Judged]) -> None:
+def write_relations(path: Path, assessed: Mapping[str, Assessed]) -> None:
     """Write the errors over relations, where there are any."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    errors = {name: each.relations for name, each in judged.items() if each.relations is not None}
+    errors = {name: each.relations for name, each in assessed.items() if each.relations is not None}
     tables = [
         pa.table(
             {
@@ -143,7 +143,7 @@ def write_relations(path: Path, judged: Mapping[str, Judged]) -> None:
 
 
 def final_poses(outcome: Outcome) -> Matrix:
-    """(M, 4, 4) the last word, or what there is of a run that failed."""
+    """(M, 4, 4) the final poses, or what there is of a run that failed."""
     poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
     broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
     return lie.lift(poses[: broken[0]] if len(broken) else poses)
@@ -154,7 +154,7 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
 
     poses = final_poses(run.outcome)
     count = len(poses)
-    aligned = (run.judged.T_reference_estimate @ poses)[:, :3, 3]
+    aligned = (run.assessed.T_reference_estimate @ poses)[:, :3, 3]
     known = observability(run.outcome)
     known = known[:count] if len(known) else np.full(count, np.nan)
     traveled_m = path_length(poses) if count else np.empty(0)
@@ -164,9 +164,9 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
         **pose_columns(poses),
         **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
         "distance_m": traveled_m,
-        "error_m": run.judged.errors_m[:count],
-        "error_rad": run.judged.errors_rad[:count],
-        "nees": run.judged.nees[:count],
+        "error_m": run.assessed.errors_m[:count],
+        "error_rad": run.assessed.errors_rad[:count],
+        "nees": run.assessed.nees[:count],
         "observability": known,
     }
     return {
@@ -178,10 +178,10 @@ def _columns(run: RunOfMethod, stamps_ns: NDArray[np.int64]) -> dict[str, object
     }
 
 
-def picture_points(points: Points, judged: Judged) -> Points:
+def picture_points(points: Points, assessed: Assessed) -> Points:
     """Some of a map's points (M, 3), in the frame of the ground truth where there is one."""
     downsampled = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
-    T = judged.T_reference_estimate
+    T = assessed.T_reference_estimate
     if points.shape[1] == 2:
         T = lie.flatten(T)
     return lie.transform(T, downsampled)

@@ -1,4 +1,4 @@
-"""The table of a comparison: made of its results; as JSON, CSV, Markdown, and as text for a terminal."""
+"""The table of a comparison: made from its results; as JSON, CSV, Markdown, and as text for a terminal."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
+from scanchain.comparison.assessment import representative, unreliable_by_itself
 from scanchain.comparison.figures import COLUMNS, Figures, columns_of
-from scanchain.comparison.judging import representative, unreliable_by_itself
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import EndReport, Outcome, Status
 from scanchain.comparison.results import Results
@@ -29,13 +29,13 @@ TABLE_FILE = "table.json"
 
 
 class Row(Struct, frozen=True):
-    """A method: how its runs ended, what it did with which settings, and its figures.
+    """A method: end of its runs, settings, and figures.
 
     Attributes
     ----------
     status, reason : of the first run that did not end well, else ok
     settings : whole, as a TOML file for --settings would hold them
-    definitions : what its errors are, in words
+    definitions : of its errors, as text
     unreliable : reason, by its own account, not to use the result, as most of its scans are degenerate; else empty
     """
 
@@ -107,7 +107,7 @@ def read_table(folder: Path) -> Table:
 
 
 def markdown(table: Table) -> str:
-    """The summary for a README, the best of each column in bold, and below it what the columns say."""
+    """The summary for a README, the best of each column in bold, and below it the meaning of the columns."""
     columns = columns_of(table.figures, "summary")
     head = ["method", *(column.heading for column in columns)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
@@ -150,7 +150,7 @@ def _csv(table: Table) -> str:
 
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
-    """Every method's row, with what only all of them together tell: sharpness and disagreement."""
+    """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
     scans, sharp = results.scans, sharpness_of(results.maps)
     finals = [representative(results.outcomes[method.name]).trajectory.poses for method in results.methods]
     apart_m = disagreement(finals)
@@ -181,11 +181,11 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
 
 
 def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
-    outcomes, judged = results.outcomes[method.name], results.judged[method.name]
+    outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
     figures: Figures = msgspec.structs.replace(
-        judged.figures,
+        assessed.figures,
         thickness_m=sharp.thickness_m if sharp else None,
         entropy=sharp.mean_map_entropy if sharp else None,
         disagreement_m=float(np.median(known)) if len(known) else None,
@@ -199,7 +199,7 @@ def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.
         unreliable=unreliable_by_itself(representative(outcomes)),
         settings=method.settings,
         figures=figures,
-        definitions=list(judged.definitions),
+        definitions=list(assessed.definitions),
     )
 
 
@@ -226,5 +226,5 @@ def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[s
 
 def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
     """Sharpness of each map that has one."""
-    answers = sharpness(list(maps.values())) if maps else []
-    return {name: answer for name, answer in zip(maps, answers, strict=True) if answer is not None}
+    results = sharpness(list(maps.values())) if maps else []
+    return {name: result for name, result in zip(maps, results, strict=True) if result is not None}

@@ -51,7 +51,7 @@ class Runner(Protocol):
         ...
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The last word on all poses; what else is known goes into files of the folder."""
+        """The final trajectory; other results go into files of the folder."""
         ...
 
 
@@ -91,7 +91,7 @@ def _baseline(method: Method, dimension: int) -> Baseline:
 
 METHOD_FILE = "method.msgpack"
 _WARM_UP_SCANS = 4
-_MAX_CHARACTERS = 300  # of the message of an error raised by other code
+_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
@@ -106,9 +106,9 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     cpu_seconds = open_memmap(folder / CPU_FILE, "w+", np.float64, (len(scans),))
     poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
     for scan in scans.scans():
-        asked, cpu_asked = perf_counter(), process_time()
+        began_s, cpu_began_s = perf_counter(), process_time()
         pose = runner.track(scan)
-        took_s, cpu_took_s = perf_counter() - asked, process_time() - cpu_asked
+        took_s, cpu_took_s = perf_counter() - began_s, process_time() - cpu_began_s
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
         seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose

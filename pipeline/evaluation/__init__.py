@@ -1,10 +1,10 @@
-"""How good a trajectory is: ATE, RPE, the KITTI metric, relations, sharpness; each says what it measures."""
+"""Metrics of a trajectory: ATE, RPE, the KITTI metric, relations, sharpness; each with its definition."""
 
 from scanchain.evaluation.absolute import (
     AbsoluteError,
     Alignment,
     absolute_error,
-    absolute_error_on_any_course,
+    absolute_error_of_any_path,
     align,
     far_off,
     on_the_estimate,
@@ -26,7 +26,7 @@ from scanchain.evaluation.relative import (
     LengthError,
     RelativeError,
     kitti_error,
-    kitti_error_on_any_course,
+    kitti_error_of_any_path,
     relative_error_over_distance,
     relative_error_over_frames,
     relative_error_over_time,
@@ -49,14 +49,14 @@ __all__ = [
     "Statistics",
     "TruthFile",
     "absolute_error",
-    "absolute_error_on_any_course",
+    "absolute_error_of_any_path",
     "align",
     "check_overlap",
     "disagreement",
     "during",
     "far_off",
     "kitti_error",
-    "kitti_error_on_any_course",
+    "kitti_error_of_any_path",
     "motion_nees",
     "on_the_estimate",
     "pair",

@@ -16,12 +16,12 @@ from scanchain.registration.svd import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 
-_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # of the path; ATE above both: odometry that holds stays below a hundredth
-_SHORTEST_PATH_M = 1.0  # an error has no meaning as a share of less
+_FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
+_SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 
 
 class Alignment(StrEnum):
-    """How the two frames are brought together. None of them changes the scale."""
+    """Alignment of the estimate to the reference before comparison. None changes the scale."""
 
     NONE = "none"
     FIRST = "first"
@@ -29,7 +29,7 @@ class Alignment(StrEnum):
 
     @property
     def description(self) -> str:
-        """What is done, in words."""
+        """Definition of the alignment as text."""
         return {
             Alignment.NONE: "frames taken as they are",
             Alignment.FIRST: "first paired poses made equal",
@@ -41,7 +41,7 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
     """T_reference_estimate (4, 4), to be put in front of each estimated pose.
 
     estimate, reference : (N, 4, 4) paired poses. Planar ones are aligned within the plane, where a mirrored
-    course cannot be met by turning the plane over. Raises InputError where the positions leave a rotation free.
+    trajectory cannot be aligned by turning the plane over. Raises InputError where a rotation is unobservable.
     """
     if alignment is Alignment.NONE:
         return np.eye(4)
@@ -67,13 +67,13 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
 
 
 def _is_planar(poses: Matrix) -> bool:
-    """Whether all poses have one height and turn about the vertical only."""
+    """True if all poses have one height and turn about the vertical only."""
     level = np.ptp(poses[:, 2, 3]) < _PLANAR
     return bool(level and np.abs(poses[:, :2, 2]).max() < _PLANAR and (poses[:, 2, 2] > 0.0).all())
 
 
 def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str:
-    """That an ATE is too large for odometry that works, in words; empty where it is not."""
+    """Warning that an ATE is too large for odometry that works; empty where it is not."""
     if share is None or share <= _FAR_OFF_SHARE or ate_rmse_m <= _FAR_OFF_M:
         return ""
     return (
@@ -89,7 +89,7 @@ class AbsoluteError:
 
     Attributes
     ----------
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
@@ -115,7 +115,7 @@ class AbsoluteError:
 
     @property
     def complaint(self) -> str:
-        """That the estimate is far from the reference, in words; empty where it is not."""
+        """Warning that the estimate is far from the reference; empty where it is not."""
         return far_off(self.translation_m.rmse, self.share_of_path, self.path_length_m)
 
     @property
@@ -155,8 +155,8 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
     )
 
 
-def absolute_error_on_any_course(pairs: Pairs) -> AbsoluteError:
-    """After rigid alignment or, where a straight course leaves that a free rotation, by the first pose."""
+def absolute_error_of_any_path(pairs: Pairs) -> AbsoluteError:
+    """ATE after rigid alignment or, where a straight trajectory leaves a rotation free, by the first pose."""
     try:
         return absolute_error(pairs)
     except InputError:
@@ -169,14 +169,14 @@ def on_the_estimate(estimate: Trajectory, reference: Trajectory, *, gap_s: float
     Raises InputError where they have no pairs.
     """
     pairs = pair(estimate, reference, gap_s=gap_s)
-    T_reference_estimate = absolute_error_on_any_course(pairs).T_reference_estimate
+    T_reference_estimate = absolute_error_of_any_path(pairs).T_reference_estimate
     return Trajectory(pairs.stamps_ns, lie.inverse(T_reference_estimate) @ pairs.reference)
 
 
 def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
     """The estimate (N, 4, 4) turned by the one rotation R that minimizes Σ ‖R_ref − R R_est‖² (Umeyama 1991).
 
-    Positions alone leave the roll about a straight course to the noise; a rotation error must not inherit that.
+    Positions alone leave the roll about a straight path to the noise; a rotation error must not inherit that.
     """
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3]))
     T = np.eye(4)

@@ -18,7 +18,7 @@ from scanchain.evaluation.relations import RelationError
 from scanchain.evaluation.relative import (
     KittiError,
     RelativeError,
-    kitti_error_on_any_course,
+    kitti_error_of_any_path,
     relative_error_over_distance,
     relative_error_over_frames,
     relative_error_over_time,
@@ -93,7 +93,7 @@ def evaluate(
     pairs = pair(trajectory, truth, gap_s=max_gap_s)
     metrics: dict[str, Callable[[], Result]] = {
         **{interval.name: partial(interval.error, pairs) for interval in intervals},
-        "kitti": partial(kitti_error_on_any_course, pairs),
+        "kitti": partial(kitti_error_of_any_path, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))
     results = Results({"ate": ate}, {}, pairs.description, [*filter(None, [ate.complaint]), *pairs.warnings])

@@ -13,13 +13,13 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.words import counted
 
-_WIDEST_GAP_S = 0.6  # by default: truth at 2 Hz; at 1 m/s² a straight line is up to 5 cm off within it
-_SHORTEST_GAP_S = 0.1  # by default: at 1 m/s² a straight line is up to 1.3 mm off within it
-_INTERVALS = 5.0  # of the reference, as usual, that a gap may be wide by default
-_SAME_S = 1e-6  # what a stamp that was a floating-point number of seconds is off
-_ROUNDED_S = 5e-4  # what one written in milliseconds is off
-_FEW = 10  # poses, whose error says little
-_ROUNDING_SHARE = 0.1  # of the reference's usual interval, that either is at most
+_WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
+_SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it
+_INTERVALS = 5.0  # median intervals of the reference that the default widest gap has at least
+_SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of seconds
+_ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
+_FEW = 10  # number of poses below which their error has little meaning
+_ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +60,13 @@ class Pairs:
 
     @property
     def missing(self) -> str:
-        """How many estimated poses have no reference pose and why; empty where all have one."""
+        """Number of estimated poses without a reference pose, with the reason; empty where all have one."""
         reasons = ", ".join(self._reasons())
         return f"{self.estimate_count - len(self):,} without a true pose: {reasons}" if reasons else ""
 
     @property
     def description(self) -> str:
-        """What was paired and how, in words."""
+        """Description of the pairs and of the interpolation."""
         exact = len(self) - self.interpolated
         how = ""
         if self.interpolated:
@@ -82,7 +82,7 @@ class Pairs:
 
     @property
     def warnings(self) -> list[str]:
-        """Why figures over these pairs may mislead, a line each."""
+        """Reasons for which figures over these pairs may mislead, a line each."""
         lines = []
         if 2 * len(self) < self.estimate_count:
             lines.append(
@@ -183,7 +183,7 @@ def nearest(
 
 
 def span(stamps_ns: NDArray[np.int64]) -> str:
-    """From the earliest stamp to the latest, in words."""
+    """From the earliest stamp to the latest, as text."""
     return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
 
 

@@ -1,4 +1,4 @@
-"""Ground truth from a file, in either of the formats that it comes in."""
+"""Ground truth from a TUM or KITTI file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scanchain.trajectory import read_kitti, read_tum, text_lines
 from scanchain.words import counted
 
 _KITTI_FIELDS = 12
-_SLACK_NS = 1_000_000_000  # by which the stamps to expect of a log's scans may be wrong
+_SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def check_overlap(source: str, truth_ns: NDArray[np.int64], scans_ns: NDArray[np
 
 
 def read_truth(path: Path) -> TruthFile:
-    """Read a TUM or a KITTI file: the first line's number of words tells which."""
+    """Ground truth of a TUM or a KITTI file, by the number of words in its first line."""
     first = next(iter(text_lines(path)), None)
     is_kitti = first is not None and len(first[1]) == _KITTI_FIELDS
     return TruthFile(path, read_kitti(path) if is_kitti else read_tum(path), not is_kitti)

@@ -1,4 +1,4 @@
-"""The metric of relations: relative poses checked by hand, each compared with what the trajectory says."""
+"""The metric of relations: relative poses checked by hand, each compared with those of the trajectory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RelationError:
 
     Attributes
     ----------
-    definition : what was computed, in words
+    definition : of the figures, as text
     translation_m, translation_squared_m2 : of ‖trans(δ*⁻¹ δ)‖ and of its square
     rotation_rad, rotation_squared_rad2 : of |rot(δ*⁻¹ δ)| and of its square
     missing : relations left out because the trajectory has no pose at one of their stamps

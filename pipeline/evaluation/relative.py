@@ -15,11 +15,11 @@ from scanchain.evaluation.absolute import path_length
 from scanchain.evaluation.pairing import Pairs, Statistics
 from scanchain.words import counted
 
-_LARGEST = 2.0  # times the size asked for: a stretch that is longer is one of another size
+_LARGEST = 2.0  # largest length of a stretch over the requested one
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
-_LONG_PATH_M = 200.0  # from here on the published lengths leave a choice of starts
+_LONG_PATH_M = 200.0  # length of the path from which on the published lengths leave a choice of starts
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class RelativeError:
     Attributes
     ----------
     size : of the stretches, in words
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
     stretches : (M, 2) int64 places i, j among the pairs
     errors_m, errors_rad : (M,) stretch by stretch
@@ -145,7 +145,7 @@ class KittiError:
 
     Attributes
     ----------
-    definition : what was computed, in words; pairing : over which poses
+    definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
     stretches : how many there were
@@ -204,7 +204,7 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     )
 
 
-def kitti_error_on_any_course(pairs: Pairs) -> KittiError:
+def kitti_error_of_any_path(pairs: Pairs) -> KittiError:
     """The published lengths where the path is long enough for them, else 10, 20 and 40 m from every pose."""
     if path_length(pairs.reference)[-1] >= _LONG_PATH_M:
         return kitti_error(pairs)

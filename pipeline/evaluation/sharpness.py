@@ -1,4 +1,4 @@
-"""How sharp the map is that a trajectory makes of a log, where there is no ground truth (Razlaw et al. 2015).
+"""Sharpness of the map by a trajectory of a log, where there is no ground truth (Razlaw et al. 2015).
 
 The same points of the same scans are put where a trajectory has the lidar at their instants (between two stamps
 along the screw that joins the poses). Around the same query points, all neighbors within a radius make a
@@ -25,11 +25,11 @@ from scanchain import lie
 from scanchain.data import Points, Scan, Trajectory
 
 RADIUS_M = {2: 0.2, 3: 0.5}
-REACH_M = 40.0  # points further off are too sparse to judge by
+REACH_M = 40.0  # largest range of the points that are compared: those farther off are too sparse
 MIN_NEIGHBORS = 10
 MAX_POINTS, MAX_QUERIES = 600_000, 15_000
-_AT_ONCE = 64  # queries whose neighbors are held in memory
-_HELD = 0.5  # share of the query points of the best map, below which a map has fallen apart
+_AT_ONCE = 64  # number of queries whose neighbors are in memory at a time
+_MIN_COVERAGE = 0.5  # least share of the query points of the best map that another must cover to be compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +41,18 @@ class Sharpness:
 
 
 def sharpness(maps: Sequence[Points]) -> list[Sharpness | None]:
-    """One answer a map of ``sampled_map``, all over the same query points.
+    """Sharpness of each map of ``sampled_map``, all over the same query points.
 
-    None for a map that has fallen apart: it would leave too few points to judge the others by.
+    None for a fragmented map: it would leave too few points to compare the others at.
     """
     eigenvalues = np.array([_eigenvalues(points) for points in maps])
     good: NDArray[np.bool_] = np.all(np.isfinite(eigenvalues) & (eigenvalues > 0.0), axis=2)
-    held = good.sum(axis=1) >= _HELD * good.sum(axis=1).max(initial=0)
-    counts = good[held].all(axis=0)
+    covered = good.sum(axis=1) >= _MIN_COVERAGE * good.sum(axis=1).max(initial=0)
+    counts = good[covered].all(axis=0)
     if not counts.any():
         return [None] * len(maps)
     chosen = eigenvalues[:, counts]
-    return [_sharpness(each) if is_held else None for each, is_held in zip(chosen, held, strict=True)]
+    return [_sharpness(each) if is_covered else None for each, is_covered in zip(chosen, covered, strict=True)]
 
 
 def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Points:

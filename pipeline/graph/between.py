@@ -34,7 +34,7 @@ class BetweenProblem:
     fixed poses out of the system: ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,)
     the pose of each block, ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
 
-    Edges whose Ω says nothing about the rotation are ``sightings`` of a position: e is
+    Edges whose Ω has no information about the rotation are ``sightings`` of a position: e is
     (R_zᵀ(R_iᵀ(t_j − t_i) − t_z), 0), as g2o has it, whatever the rotation of j. In the plane, j may be a point: a
     pose without a heading, its rotation the identity, of whose block only the translation is kept.
     """
@@ -146,7 +146,7 @@ def _turns(positions: Matrix) -> Matrix:
 
 
 def _kept(array: NDArray[Any]) -> NDArray[Any]:
-    """A view that nobody writes into: for one kind of array a kernel is compiled once."""
+    """A read-only view: for one kind of array a kernel is compiled once."""
     view = array.view()
     view.flags.writeable = False
     return view

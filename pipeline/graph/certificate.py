@@ -1,4 +1,4 @@
-"""Whether a minimum of a pose graph is the global one: a lower bound of χ² by Lagrangian duality."""
+"""Certificate that a minimum of a pose graph is global: a lower bound of χ² by Lagrangian duality."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from scanchain.kernels.graph.dual import scatter_dual
 from scanchain.words import counted
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
-_GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # of χ² that the bound may be given away for, one after the other
-_SLOPE = 0.9311  # of V(φ)⁻¹, at most, for rotations up to π: (π²/16 + 1/4)^½
-_BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, in θ*², up to 1 rad
-_FARTHEST = 1.0  # θ*, rad, up to which edges are bounded
-_STRETCH = 0.25 * np.pi**2  # ‖ρ − ρ*‖² over ‖z‖², at most
-_ROUNDING = 1e-9  # by which the isotropic information is kept below the smallest eigenvalue
+_GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowered, tried one after the other
+_SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
+_BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
+_FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
+_STRETCH = 0.25 * np.pi**2  # largest ratio of ‖ρ − ρ*‖² to ‖z‖²
+_ROUNDING = 1e-9  # share by which the isotropic information stays below the smallest eigenvalue
 _TINY = 1e-30  # in place of no information at all, so that nothing is divided by zero
-_PAID_FROM_TAU = (1.0, 2.0, 4.0)  # of what is paid from τ, tried one after the other
+_PAID_FROM_TAU = (1.0, 2.0, 4.0)  # factors on the part paid from τ, tried one after the other
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What is known of the distance to the global minimum.
+    """Bound of the distance to the global minimum.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Certificate:
 
     @property
     def verdict(self) -> str:
-        """One line for people."""
+        """The certificate as one line of text."""
         if self.certified and self.is_zero:
             return "globally optimal: χ² is zero"
         if self.certified:
@@ -110,7 +110,7 @@ def certify(
         if borrowing.any():
             i, j = names[problem.edges[borrowing][0]]
             edges = counted(int(borrowing.sum()), "edge")
-            reason += f", or where Ω says little of some direction, first at {i}-{j} of {edges}"
+            reason += f", or where Ω has little information about some direction, first at {i}-{j} of {edges}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 
@@ -193,7 +193,7 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
 
 @dataclass(frozen=True, slots=True)
 class _Costs:
-    """What the bounds of the edges cost: isotropic information, residuals ‖ρ*‖ and θ*, and ‖y_t‖; each (E,)."""
+    """Terms of the edges' bounds: isotropic information, residuals ‖ρ*‖ and θ*, and ‖y_t‖; each (E,)."""
 
     tau: NDArray[np.float64]
     kappa: NDArray[np.float64]
@@ -204,7 +204,7 @@ class _Costs:
     def paid(
         self, force: NDArray[np.float64], excess: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What is left of τ and κ; ``force`` is ‖V⁻ᵀy_t‖, ``excess`` the rotational slope beside 2κφ*."""
+        """τ and κ less their cost; ``force`` is ‖V⁻ᵀy_t‖, ``excess`` the rotational slope beside 2κφ*."""
         best_tau, best_kappa = self._left(_PAID_FROM_TAU[0], force, excess)
         for share in _PAID_FROM_TAU[1:]:
             tau, kappa = self._left(share, force, excess)
@@ -266,7 +266,7 @@ def _isotropic_of_singular(information: Matrix, d: int) -> tuple[NDArray[np.floa
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω: the smallest eigenvalues, lowered as far as the coupling asks."""
+    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω: the smallest eigenvalues, lowered for the coupling."""
     tau = np.linalg.eigvalsh(information[:, :d, :d])[:, 0]
     kappa = np.linalg.eigvalsh(information[:, d:, d:])[:, 0]
     k = information.shape[-1]

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.kernels.graph.semidefinite import judge_matrices
+from scanchain.kernels.graph.semidefinite import find_semidefinite
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
@@ -41,9 +41,9 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
 
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
-    """Which of the matrices (E, k, k) are finite, symmetric and without negative eigenvalues, (E,)."""
+    """True for each of the matrices (E, k, k) that is finite, symmetric and positive semidefinite, (E,)."""
     result = np.empty(len(information), np.bool_)
-    judge_matrices(np.ascontiguousarray(information), _ROUNDING, result)
+    find_semidefinite(np.ascontiguousarray(information), _ROUNDING, result)
     return result
 
 
@@ -61,7 +61,7 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     correlation = scale[:, :, None] * information * scale[:, None, :]
     is_full = np.empty(len(information), np.bool_)
-    judge_matrices(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
+    find_semidefinite(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
     result = np.full(len(information), k, np.int64)
     result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
     return result
@@ -80,7 +80,7 @@ def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: N
 
 
 def is_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> bool:
-    """Whether a chain of these edges joins every pose to a fixed one."""
+    """True if a chain of these edges joins every pose to a fixed one."""
     return not len(loose(edges, fixed))
 
 
@@ -91,18 +91,18 @@ def loose(edges: NDArray[np.int64], fixed: NDArray[np.bool_]) -> NDArray[np.int6
 
 
 def has_loop(edges: NDArray[np.int64], pose_count: int) -> bool:
-    """Whether the edges are more than it takes to join what they join."""
+    """True if there are more edges than a spanning forest of them has."""
     return len(edges) > pose_count - _parts(edges, pose_count)[0]
 
 
 def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.int32]]:
-    """How many parts the edges leave the poses in, and the part of each pose."""
+    """Number of connected components of the poses, and the component of each pose."""
     links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(pose_count, pose_count))
     return connected_components(links, directed=False)
 
 
 def listed(names: NDArray[np.int64]) -> str:
-    """These names, ascending, for people: "3, 5 to 9"; the first eight where they are scattered."""
+    """These names, ascending, as text: "3, 5 to 9"; the first eight where they are scattered."""
     runs = np.split(names, 1 + np.flatnonzero(np.diff(names) != 1))
     shown = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run.tolist())) for run in runs[:8]]
     return ", ".join(shown) + (", ..." if len(runs) > 8 else "")

@@ -16,19 +16,19 @@ from scanchain.kernels.graph.tree import follow_tree
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 
-_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the poses at hand need no better guess
+_GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the given poses need no other initialization
 
 
 def first_guess(
-    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
+    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, outlier_free: bool
 ) -> tuple[Matrix, Initialization]:
-    """Poses to start from, and which of the ways they come from.
+    """Initial poses, and the method that they come from.
 
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
-    not every edge is trusted it keeps them in any case: no other guess is safe from a false loop.
+    there may be outliers it keeps them in any case: no other guess is safe from a false loop.
     """
     if problem.is_point.any():
-        return _with_points(problem, poses, initialize, trusted=trusted)
+        return _with_points(problem, poses, initialize, outlier_free=outlier_free)
     fixed = problem.variable < 0
     if initialize == "odometry":
         return follow_odometry(poses, fixed, problem.edges, problem.measurements), initialize
@@ -38,7 +38,7 @@ def first_guess(
         return relax_chordally(problem, poses), initialize
     chi2 = problem.chi2(problem.errors(poses)).sum()
     redundancy = problem.freedom * max(len(problem.edges) - len(problem.free), 1)
-    if initialize == "auto" and trusted and chi2 > _GOOD_GUESS * redundancy:
+    if initialize == "auto" and outlier_free and chi2 > _GOOD_GUESS * redundancy:
         try:
             relaxed = relax_chordally(problem, poses)
         except SingularMatrixError:
@@ -62,24 +62,24 @@ def place_points(problem: BetweenProblem, poses: Matrix) -> Matrix:
 
 
 def _with_points(
-    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, trusted: bool
+    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, outlier_free: bool
 ) -> tuple[Matrix, Initialization]:
-    """The guess for the poses alone, and the points as they are seen from there, if that fits better."""
-    ways = np.flatnonzero(~problem.is_point)
+    """The initial poses, with the points as observed from there, if that fits better."""
+    headed = np.flatnonzero(~problem.is_point)
     place = np.cumsum(~problem.is_point) - 1
     between = np.setdiff1d(np.arange(len(problem.edges)), problem.sightings)
     alone = BetweenProblem(
         place[problem.edges[between]],
         problem.measurements[between],
         problem.information[between],
-        problem.variable[ways] < 0,
+        problem.variable[headed] < 0,
     )
     try:
-        guess, source = first_guess(alone, poses[ways], initialize, trusted=trusted)
+        guess, source = first_guess(alone, poses[headed], initialize, outlier_free=outlier_free)
     except SingularMatrixError:
         return poses.copy(), "given"
     result = poses.copy()
-    result[ways] = guess
+    result[headed] = guess
     placed = place_points(problem, result)
     if source != "given" or initialize == "auto":
         chi2 = [problem.chi2(problem.errors(candidate)).sum() for candidate in (poses, placed)]

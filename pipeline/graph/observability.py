@@ -1,4 +1,4 @@
-"""Which poses the edges in force leave free, and in which directions: the null space of the normal equations."""
+"""Poses that the edges in force leave free, with their directions: the null space of the normal equations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
-_MOST = 100  # directions of the null space that are looked for
+_MOST = 100  # largest number of directions of the null space that are computed
 _MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
 _NAMED = 1e-2  # component of a direction from which its axis is named
 _NOTHING = 1e-20  # share of the largest entry of its kind up to which a diagonal entry is rounding noise
@@ -46,7 +46,7 @@ class FreePose:
 
 
 def free_text(free: Sequence[FreePose]) -> str:
-    """One line for people: how many poses are free, and which in what."""
+    """Number of free poses, and the directions of the first, as one line of text."""
     shown = ", ".join(map(str, free[:8])) + (", ..." if len(free) > 8 else "")
     count = sum(1 + len(pose.followers) for pose in free)
     return f"the edges leave {counted(count, 'pose')} free: {shown}"
@@ -59,7 +59,7 @@ def free_poses(
     ranks: NDArray[np.int64],
     names: NDArray[np.int64],
 ) -> tuple[FreePose, ...]:
-    """Poses with directions of their own frames in which no edge holds them, at these poses and weights (E,).
+    """Poses with directions of their own frames that no edge constrains, at these poses and weights (E,).
 
     ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
     to a fixed one, nothing is free. Else the normal equations, without the axes along which an edge says next to
@@ -110,17 +110,17 @@ def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[
 
 
 def lost(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Those of them whose edges say so little that nothing can be computed of where they are."""
+    """Those of them whose edges have too little information to compute a position."""
     return _hanging(edges, information, fixed, _LOST)
 
 
 def weak_text(names: NDArray[np.int64]) -> str:
-    """One line for people."""
+    """The weakly joined poses as one line of text."""
     return f"{_group(names)} by edges of less than a millionth of the usual information"
 
 
 def lost_text(names: NDArray[np.int64]) -> str:
-    """One line for people."""
+    """The lost poses as one line of text."""
     hang = "hangs" if len(names) == 1 else "hang"
     return f"{_group(names)} {hang} on edges of next to no information, {_LOST:.0e} of the usual or less"
 
@@ -132,12 +132,12 @@ def _group(names: NDArray[np.int64]) -> str:
 def _hanging(
     edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
 ) -> NDArray[np.int64]:
-    """Poses that no edges of more than this share of the usual information join to a fixed one."""
+    """Poses joined to a fixed one only by edges of at most this share of the usual information."""
     return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
 
 
 def _shares(information: Matrix) -> Matrix:
-    """Diagonals of information matrices (E, k), over the medians of what is known of positions and rotations."""
+    """Diagonals of information matrices (E, k), over the medians for positions and rotations."""
     d = 2 if information.shape[-1] == 3 else 3
     result = np.einsum("eaa->ea", information).copy()
     for part in (result[:, :d], result[:, d:]):
@@ -147,7 +147,7 @@ def _shares(information: Matrix) -> Matrix:
 
 
 def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
-    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are held."""
+    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are fixed."""
     pattern, k = problem.pattern, problem.freedom
     values = own_equations(problem, poses, information)
     is_turn = (np.arange(k) >= poses.shape[-1] - 1).astype(np.float64)

@@ -20,7 +20,7 @@ from scanchain.words import counted
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
-    """A graph before and after, for those who show it, each with the edges that were in force then."""
+    """A graph before and after, for pictures and recordings, each with the edges that were in force then."""
 
     name: str
     before: GraphState
@@ -28,20 +28,20 @@ class GraphChange:
 
 
 def fit(state: GraphState) -> str:
-    """How well its edges in force agree, in words."""
+    """Fit of the edges in force as text."""
     count = int(state.is_rejected.sum())
     rejected = f"{counted(count, 'edge')} rejected" if count else ""
     return fit_text(state.chi2, state.degrees_of_freedom, rejected, has_loops=has_loops(state))
 
 
 def has_loops(state: GraphState) -> bool:
-    """Whether an edge in force joins poses that the others join already."""
+    """True if an edge in force joins poses that the others join already."""
     return has_loop(state.edges[~state.is_rejected], len(state.poses))
 
 
 @dataclass(frozen=True, slots=True)
 class Optimization:
-    """The answer of ``PoseGraph.optimize``.
+    """Result of ``PoseGraph.optimize``.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Optimization:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and whence it began."""
+    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and its initialization."""
 
     poses: Matrix
     minimum: Minimum
@@ -91,8 +91,8 @@ def solve(
 
     Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
     """
-    trusted = config.robust == "none" or not is_loop.any()
-    guess, source = first_guess(problem, poses, initialize, trusted=trusted)
+    outlier_free = config.robust == "none" or not is_loop.any()
+    guess, source = first_guess(problem, poses, initialize, outlier_free=outlier_free)
     shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)

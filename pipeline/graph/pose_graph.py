@@ -43,7 +43,7 @@ class PoseGraph:
     """
 
     def __init__(self, dimension: int, names: NDArray[np.int64] | None = None) -> None:
-        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses, called by these names in what is said."""
+        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses with these names in messages."""
         dimension = self.dimension = checks.dimension(dimension)
         self._names = names
         self.freedom = 3 if dimension == 2 else 6
@@ -67,7 +67,7 @@ class PoseGraph:
 
     @property
     def names(self) -> NDArray[np.int64]:
-        """What every pose is called in what is said, (K,); without names given, its index."""
+        """Name of every pose in messages, (K,); without names given, its index."""
         if self._names is None:
             return np.arange(len(self))
         more = len(self) - len(self._names)
@@ -95,7 +95,7 @@ class PoseGraph:
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
-        """Whether the robust loss applies to the edge, (E,)."""
+        """True for every edge with a robust loss, (E,)."""
         return self._is_loop.rows
 
     @property
@@ -105,24 +105,24 @@ class PoseGraph:
 
     @property
     def is_rejected(self) -> NDArray[np.bool_]:
-        """Which edges the last optimization put out of force, (E,)."""
+        """True for every edge that the last optimization rejected, (E,)."""
         return self.weight < REJECTED_WEIGHT
 
     @property
     def is_point(self) -> NDArray[np.bool_]:
-        """Which poses are points, without a heading, (K,)."""
+        """True for every pose that is a point, without a heading, (K,)."""
         return self._is_point.rows
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """Which poses are held, (K,); pose 0 where none was named."""
+        """True for every fixed pose, (K,); pose 0 where none was named."""
         held = np.zeros(len(self), np.bool_)
         held[sorted(self._fixed) or slice(0, 1)] = True
         return held
 
     @property
     def held(self) -> list[int]:
-        """Poses held by name through ``fix``, ascending."""
+        """Poses fixed by name through ``fix``, ascending."""
         return sorted(self._fixed)
 
     def add_pose(self, T_world: Pose, stamp_ns: int) -> int:
@@ -176,7 +176,7 @@ class PoseGraph:
         self._weight.extend(np.ones(len(edges)))
 
     def add_sightings(self, edges: NDArray[np.int64], positions: NDArray[np.float64], information: Matrix) -> None:
-        """Add points as poses see them: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
+        """Add points as observed from poses: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
         edges = checks.indices(edges, "edges")
         measurements = np.tile(lie.identity(2), (len(edges), 1, 1))
         measurements[:, :2, 2] = checks.matrices(positions, "positions", (len(edges), 2))
@@ -185,7 +185,7 @@ class PoseGraph:
         self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
 
     def fix(self, index: int) -> None:
-        """Hold this pose where it is, instead of pose 0."""
+        """Fix this pose instead of pose 0."""
         index = checks.integer(index, "index", "the index of a pose")
         if not 0 <= index < len(self):
             raise InputError(
@@ -199,7 +199,7 @@ class PoseGraph:
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        rejection : of loop edges under the truncated loss; "gnc" is good enough on the way and cheaper
+        rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
@@ -228,7 +228,7 @@ class PoseGraph:
         )
 
     def certify(self) -> Certificate:
-        """Whether the poses are the global minimum of χ², edges weighed as the last optimization left them."""
+        """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
         return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
 
     def free_poses(self) -> tuple[FreePose, ...]:
@@ -241,7 +241,7 @@ class PoseGraph:
         return self.names[weakly_joined(*self._edges_in_force, self.fixed)]
 
     def state(self) -> GraphState:
-        """The graph as it is, for those who show or write it; odometry edges first."""
+        """The graph as it is, for files and recordings; odometry edges first."""
         order, problem = self._order(), self._prepared()
         chi2 = problem.chi2(problem.errors(self.poses))
         return GraphState(
@@ -298,7 +298,7 @@ class PoseGraph:
         return problem
 
     def _prepared(self) -> BetweenProblem:
-        """The least-squares problem; built anew after the graph has grown."""
+        """The least-squares problem; rebuilt after the graph has grown."""
         if self._problem is None:
             fixed = self.fixed
             check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
@@ -306,7 +306,7 @@ class PoseGraph:
         return self._problem
 
     def _undetermined(self) -> str:
-        """What the edges in force leave open, of which nothing can be computed; empty where they leave nothing."""
+        """Unobservable directions, with which nothing can be computed, as text; empty without any."""
         names = self.names[lost(*self._edges_in_force, self.fixed)]
         free = () if len(names) else self.free_poses()
         return lost_text(names) if len(names) else free_text(free) if free else ""

@@ -1,4 +1,4 @@
-"""How far an estimate of poses and landmarks is from the truth."""
+"""Distance of an estimate of poses and landmarks from the truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Root mean squared distances from the truth; NaN where there is none. ``definition`` says what was done."""
+    """Root mean squared distances from the truth; NaN without truth. ``definition`` defines them as text."""
 
     poses_m: float
     landmarks_m: float
@@ -42,7 +42,7 @@ class Truth:
 
 
 def of_positions(state: Values, data: LandmarkData) -> Accuracy:
-    """Against the positions of a course file; both lie in one frame."""
+    """Against the positions of an npz file; both lie in one frame."""
     return Accuracy(
         _rms(state.poses - data.true_poses),
         _rms(state.landmarks - data.true_landmarks),
@@ -95,6 +95,6 @@ def pose_matrices(poses: Matrix) -> Matrix:
 
 
 def _rms(differences: Matrix) -> float:
-    """Over the rows that are known; NaN if none is."""
+    """Root mean square over the rows that are known; NaN if none is."""
     known = differences[np.isfinite(differences).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else float("nan")

@@ -13,7 +13,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.problem import LandmarkData, Values
 from scanchain.landmarks.system import Layout, LinearSystem, landmark_columns, pattern_of, pose_columns, whitening
 
-_ANCHOR = 0.01  # noise of the first pose, in shares of a step's
+_ANCHOR = 0.01  # noise of the first pose as a share of a step's
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Linearization:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Unknowns of the robot that its motions depend on, all of them alike.
+    """Unknowns common to all motions of the robot.
 
     Attributes
     ----------
@@ -59,20 +59,20 @@ class Calibration:
 
 
 def no_calibration(motion: Matrix) -> Calibration:
-    """Of motions (K − 1, p) that are what they are."""
+    """Calibration without parameters, of motions (K − 1, p)."""
     return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """What a bearing-range problem is made of.
+    """Measurements of a bearing-range problem.
 
     Attributes
     ----------
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's
-    calibration : what the motions may all be off by
+    calibration : errors common to all motions
     observed : (N, 2) pose, landmark
     measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; of every one alike
     landmarks : (L,) their names, as numbers
@@ -172,7 +172,7 @@ class BearingRangeProblem:
 
 
 def world_referenced(data: LandmarkData) -> Measurements:
-    """The problem of a course file: headings are known, so that bearings are those of the world's axes."""
+    """The problem of an npz file: headings are known, so that bearings are those of the world's axes."""
     return Measurements(
         first_pose=np.zeros(2),
         first_covariance=_ANCHOR**2 * data.odometry_covariance,

@@ -14,7 +14,7 @@ from scanchain.landmarks.problem import Values
 from scanchain.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
-_SLOW_S = 1.0  # what takes longer is not repeated
+_SLOW_S = 1.0  # seconds of a solution above which it is not repeated
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class MethodResult:
     ----------
     method : its name
     build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
-    again_s : the whole once more with the same solver, which keeps what it found out about the pattern
+    again_s : the whole once more with the same solver, which reuses its analysis of the pattern
     iterations : linear solves
     factor : of the last one
     x : (n,) the unknowns
@@ -44,7 +44,7 @@ class MethodResult:
 
     @property
     def total_s(self) -> float:
-        """Of one solution, nothing known beforehand."""
+        """Seconds of one solution from scratch."""
         return self.build_s + self.factor_s + self.solve_s
 
 
@@ -103,7 +103,7 @@ class _Round:
 
 
 class _Tally:
-    """A linear solver that keeps all it has answered."""
+    """A linear solver that stores all its solutions."""
 
     def __init__(self, solver: LinearSolver) -> None:
         self._solver = solver
@@ -115,7 +115,7 @@ class _Tally:
         return solution
 
     def taken(self) -> list[Solution]:
-        """All since this was last asked."""
+        """Solutions since the last call."""
         solutions, self._solutions = self._solutions, []
         return solutions
 

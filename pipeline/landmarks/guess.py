@@ -1,4 +1,4 @@
-"""First guesses: poses by odometry, landmarks where they were first seen; for a long log, part by part."""
+"""Initialization: poses by odometry, landmarks by their first observation; for a long log, part by part."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from scanchain.landmarks.problem import LandmarkData, Values
 from scanchain.landmarks.ranges.dead_reckoning import chain
 from scanchain.landmarks.solvers import LinearSolver
 
-_FIRST, _GROWTH = 16, 2  # poses to begin with, and how much further each part reaches
+_FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one
 _STEPS = 2
 _CONVEX = RobustLoss("huber", 1.345, 1.0)
 
 
 def from_odometry(measurements: Measurements) -> Values:
-    """Poses chained by the motions, every landmark where its first observation puts it."""
+    """Poses chained by the motions, every landmark by its first observation."""
     if measurements.motion.shape[1] == 3:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
@@ -48,7 +48,7 @@ def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
 
 
 def growing(measurements: Measurements, solver: LinearSolver) -> Values:
-    """Follow the log: add a part, guessed from what is known, settle all so far, and so on to its end.
+    """Initialize part by part: extend the solution of the log so far, optimize, and so on to its end.
 
     Dead reckoning over the whole log may be meters off, where a robust loss finds but a local minimum; over a
     half of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
@@ -74,7 +74,7 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
 
 
 def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
-    """The problem of the first so many poses, and which landmarks they saw."""
+    """The problem of the first so many poses, and the landmarks observed from them."""
     kept = measurements.observed[:, 0] < poses
     known, landmark = np.unique(measurements.observed[kept, 1], return_inverse=True)
     part = replace(
@@ -90,7 +90,7 @@ def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, ND
 
 
 def _first_seen(measurements: Measurements, poses: Matrix) -> tuple[Matrix, NDArray[np.int64]]:
-    """Where the first observation of every landmark puts it, (L, 2), and which observation that is, (L,)."""
+    """Position (L, 2) of every landmark by its first observation, and the index of that observation, (L,)."""
     _, first = np.unique(measurements.observed[:, 1], return_index=True)
     pose = poses[measurements.observed[first, 0]]
     bearing, reach = measurements.measured[first].T

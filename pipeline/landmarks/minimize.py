@@ -21,7 +21,7 @@ Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-d
 
 
 class Loss(Protocol):
-    """What an observation costs."""
+    """Robust loss of observations."""
 
     def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
         """dρ/dχ², (N,)."""
@@ -37,7 +37,7 @@ QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a minimization ended.
+    """End of a minimization.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ def minimize(
 ) -> Minimum:
     """Follow the residuals downhill from the guess; a linearized step at a time, each solved by ``solver``.
 
-    It ends where ``descend`` says. The first damping is for a guess that may be poor; near the minimum 1e-10
+    It ends as ``descend`` does. The first damping is for a guess that may be poor; near the minimum 1e-10
     serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
     start = problem.linearize(guess)
@@ -133,5 +133,5 @@ class _Model:
 
 
 def _cost(at: Linearization, loss: Loss) -> float:
-    trusted = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
-    return trusted + float(loss.loss(at.observation_chi2).sum())
+    quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
+    return quadratic + float(loss.loss(at.observation_chi2).sum())

@@ -1,4 +1,4 @@
-"""What the landmark problems of a file hold: odometry, observations, their noise, and the truth."""
+"""The landmark problems of a file: odometry, observations, their noise, and the truth."""
 
 from __future__ import annotations
 

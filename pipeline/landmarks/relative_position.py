@@ -16,7 +16,7 @@ from scanchain.landmarks.system import (
     whitening,
 )
 
-_ANCHOR = 100.0  # times the weight of a step
+_ANCHOR = 100.0  # weight of the first pose over that of a step
 
 
 def linear_system(data: LandmarkData) -> LinearSystem:

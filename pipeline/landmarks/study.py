@@ -1,4 +1,4 @@
-"""What ``scanchain landmarks`` finds out about a problem: before and after, every method, accuracy."""
+"""Study of a landmark problem by ``scanchain landmarks``: before and after, every method, accuracy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Guess = Literal["odometry", "disturbed", "origin"]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to study a problem.
+    """Options of a study.
 
     ``methods`` are the linear solvers by name, or "all"; the first one estimates what a file holds.
     ``robot`` and ``noise`` are for MRCLAM folders, where a noise of None is to be estimated; ``guess`` and
@@ -37,7 +37,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A line about a problem: what, and its value in words."""
+    """A line about a problem: label, and value as text."""
 
     label: str
     value: str
@@ -50,7 +50,7 @@ def left_out_fact(what: str) -> list[Fact]:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Poses and landmarks, how far off they are, and T_truth_estimate (3, 3) that carries them to the truth."""
+    """Poses and landmarks, their accuracy, and T_truth_estimate (3, 3) that aligns them to the truth."""
 
     state: Values
     accuracy: Accuracy
@@ -59,7 +59,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What was found out about a problem.
+    """Results of a study.
 
     Attributes
     ----------

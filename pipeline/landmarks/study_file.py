@@ -25,7 +25,7 @@ _SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
 
 
 def study_file(data: LandmarkData, options: Options) -> Study:
-    """Solve the problem of a file by every method that is asked for, compare with the truth in the file."""
+    """Solve the problem of a file by every requested method, compare with the truth in the file."""
     return _write_up(data, _linear(data, options) if data.kind == "linear" else _nonlinear(data, options))
 
 
@@ -83,7 +83,7 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
 
 
 def chi2_fact(chi2: float, rows: int, unknowns: int) -> Fact:
-    """χ² over its degrees of freedom, and what that means."""
+    """χ² over its degrees of freedom, and its meaning."""
     freedom = max(rows - unknowns, 1)
     verdict = (
         "the noise model fits"

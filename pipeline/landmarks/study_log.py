@@ -1,4 +1,4 @@
-"""Studies what one robot of an MRCLAM folder logged."""
+"""Studies the log of one robot of an MRCLAM folder."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from scanchain.landmarks.solvers import methods_for
 from scanchain.landmarks.study import Estimate, Fact, Options, Study, left_out_fact
 from scanchain.words import counted
 
-_DOUBTED = 0.25  # of the weight of an observation as expected
-_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model is said to fit
+_DOWNWEIGHTED = 0.25  # share of its expected weight below which an observation is reported as downweighted
+_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model fits
 
 
 def study_log(folder: Path, options: Options) -> Study:
     """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
 
-    The linear solvers that are asked for run on the first step from where the estimate began, with the noise that
+    The requested linear solvers run on the first step from where the estimate began, with the noise that
     it found; ``ESTIMATOR`` makes the estimate.
     """
     log = read_mrclam(folder, options.robot)
@@ -81,7 +81,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     own = zip(OWN, solution.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {solution.bearing_sigma_rad:.4f} rad, range {solution.range_sigma_m:.4f} m (Student's t)"
     after = f"{ended} after {counted(solution.iterations, 'step')}: {solution.reason}"
-    doubted = int(np.count_nonzero(solution.weights < _DOUBTED * solution.loss.share))
+    downweighted = int(np.count_nonzero(solution.weights < _DOWNWEIGHTED * solution.loss.share))
     return (
         Fact("observations", seen),
         Fact("left out", left),
@@ -92,12 +92,15 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
             f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(solution.motion_chi2)}",
         ),
         Fact("sensor noise", f"estimated: {found}; {_verdict(solution.observation_chi2)}"),
-        Fact("doubted", f"{counted(doubted, 'observation')} with less than {_DOUBTED:g} of the weight of others"),
+        Fact(
+            "downweighted",
+            f"{counted(downweighted, 'observation')} with less than {_DOWNWEIGHTED:g} of the weight of others",
+        ),
     )
 
 
 def _verdict(chi2: float) -> str:
-    """χ² per degree of freedom in words."""
+    """χ² per degree of freedom as text."""
     low, high = _FITS
     verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
     return f"χ² per degree of freedom {chi2:.2f}: {verdict}"

@@ -15,7 +15,7 @@ _COMPONENTS = ("x", "y", "heading")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What the columns of A stand for: pose after pose, the robot's calibration, landmark after landmark.
+    """Columns of A: pose after pose, the robot's calibration, landmark after landmark.
 
     Attributes
     ----------
@@ -58,9 +58,9 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pattern:
-    """Where A may be nonzero, row by row: the columns of row r are columns[row_start[r] : row_start[r + 1]].
+    """Entries of A that may be nonzero, row by row: columns of row r are columns[row_start[r] : row_start[r + 1]].
 
-    One object is one pattern: solvers keep what they found out about it as long as they are given the same one.
+    One object is one pattern: solvers reuse their analysis of it as long as they are given the same one.
     """
 
     row_start: NDArray[np.int64]
@@ -69,11 +69,11 @@ class Pattern:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of A."""
+        """Number of rows and columns of A."""
         return len(self.row_start) - 1, self.layout.columns
 
     def by_column(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Where each column's rows begin (n + 1,), and the rows."""
+        """Start of each column's rows (n + 1,), and the rows."""
         counts = csr_matrix(
             (np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape
         ).tocsc()

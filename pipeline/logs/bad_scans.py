@@ -1,4 +1,4 @@
-"""Scans of a log that cannot be used: what is wrong with them, how many are allowed, and the counts reported."""
+"""Unusable scans of a log: their defects, the number allowed, and the counts reported."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 from scanchain.words import counted
 
-_SAMPLE = 64  # every so-many-th point is looked at first: as a rule one of them is in range
+_SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
 def most_bad_scans(scans: int, config: LogConfig) -> float:
-    """Number of scans that may be left out; unlimited at 100 %, as damaged logs may hold more than they say."""
+    """Largest number of scans that may be left out; unlimited at 100 %, as a damaged log may hold more scans."""
     share = 0.01 * config.max_bad_scans_percent
     return math.ceil(share * scans) if share < 1.0 else math.inf
 
@@ -34,7 +34,7 @@ def check_count(bad: int, scans: int, config: LogConfig, complaint: str) -> None
 
 
 def defect(message: Decoded, where: str, preprocess: PreprocessConfig | None) -> str:
-    """What makes a scan unusable, empty where it is usable; ``where`` names the scan."""
+    """Defect that makes a scan unusable, empty where it is usable; ``where`` names the scan."""
     returns = message.value
     if not isinstance(returns, Returns):
         return f"{where} is malformed: {returns}"
@@ -50,7 +50,7 @@ def defect(message: Decoded, where: str, preprocess: PreprocessConfig | None) ->
 
 
 def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
-    """What is wrong with points (N, d) of which preprocessing retains none; empty where it retains one."""
+    """Reason for which preprocessing retains none of the points (N, d); empty where it retains one."""
     low_m, high_m = config.min_range_m, config.max_range_m
     squares = np.empty(0)
     for part in (points[::_SAMPLE], points):

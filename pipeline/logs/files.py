@@ -18,11 +18,11 @@ from scanchain.source import Address, Source
 
 T = TypeVar("T")
 _ATTEMPTS = 4
-_PAUSE_S = 0.5  # after the first failure; twice as long after each further one
-_CONNECT_S, _SILENCE_S = 10.0, 30.0  # before a server counts as gone
+_PAUSE_S = 0.5  # pause after the first failure; twice as long after each further one
+_CONNECT_S, _SILENCE_S = 10.0, 30.0  # timeouts after which a server counts as gone
 _ABSENT, _REFUSED, _PASSING = {404, 410}, {401, 403}, {408, 425, 429}  # HTTP statuses
 
-_PIECE_BYTES = 8_000_000
+_BLOCK_BYTES = 8_000_000
 
 
 class RemoteFile:
@@ -30,12 +30,12 @@ class RemoteFile:
 
     Attributes
     ----------
-    size : bytes, 0 where the server does not say
-    version : its ETag or when it was last changed, empty where the server does not say
+    size : bytes, 0 where the server does not state it
+    version : its ETag or when it was last changed, empty where the server does not state it
     """
 
     def __init__(self, address: Address) -> None:
-        """Ask for it. Raises InputError where it is not there, or not for us; MissingExtraError without fsspec."""
+        """Open it. Raises InputError where it is absent or access is refused; MissingExtraError without fsspec."""
         self.address = address
         self._system, self._path = _system_of(address)
         facts = _patient(lambda: self._system.info(self._path), str(address))
@@ -44,17 +44,17 @@ class RemoteFile:
         if facts.get("size") == 0:
             raise InputError(f"{address}: is empty (0 bytes); record or copy it again")
         self.size = int(facts.get("size") or 0)
-        told = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
-        self.version = str(next(filter(None, told), ""))
+        stated = (facts.get(name) for name in ("ETag", "etag", "Last-Modified", "LastModified", "mtime"))
+        self.version = str(next(filter(None, stated), ""))
         self._may_have_ranges = self.size > 0 and facts.get("partial", True)
 
     @cached_property
     def has_ranges(self) -> bool:
-        """Whether parts of it can be asked for."""
+        """True if parts of it can be requested."""
         return self._may_have_ranges and self._tries_range()
 
     def read(self, offset: int, size: int) -> bytes:
-        """So many bytes from the offset on. Raises InputError where they do not come, asked several times."""
+        """So many bytes from the offset on. Raises InputError where they do not come after several requests."""
 
         def ask() -> bytes:
             data: bytes = self._system.cat_file(self._path, start=offset, end=offset + size)
@@ -65,7 +65,7 @@ class RemoteFile:
         return _patient(ask, f"{self.address}: byte {offset}") if size else b""
 
     def _tries_range(self) -> bool:
-        """Whether the last byte comes alone; a web server that knows no ranges would send everything."""
+        """True if the last byte comes alone; a web server without range requests would send everything."""
 
         def ask() -> bool:
             try:
@@ -79,14 +79,14 @@ class RemoteFile:
 
 
 def matching(pattern: Address) -> list[Address]:
-    """The addresses that a pattern with * stands for, in the order of their names."""
+    """The addresses that match a pattern with *, in the order of their names."""
     system, path = _system_of(pattern)
     found = _patient(lambda: system.glob(path), str(pattern))
     return [Address(system.unstrip_protocol(each)) for each in sorted(found)]
 
 
 def _system_of(address: Address) -> tuple[Any, str]:
-    """What fsspec reads the address with, and the path in it."""
+    """The fsspec file system of an address, and the path in it."""
     try:
         from fsspec.core import url_to_fs
     except ImportError:
@@ -103,7 +103,7 @@ def _system_of(address: Address) -> tuple[Any, str]:
 
 
 def _web_timeout() -> Any:
-    """Not on the whole answer, which may be large, but on silence."""
+    """Timeout on silence, not on the whole response, which may be large."""
     try:
         from aiohttp import ClientTimeout
     except ImportError:
@@ -112,7 +112,7 @@ def _web_timeout() -> Any:
 
 
 def _patient(ask: Callable[[], T], what: str) -> T:
-    """The answer, asked for again where that may help."""
+    """Result of a request, repeated after errors that may pass."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             return ask()
@@ -121,13 +121,13 @@ def _patient(ask: Callable[[], T], what: str) -> T:
             if hopeless := _hopeless(error):
                 raise InputError(f"{what}: {hopeless} ({reason})") from error
             if attempt == _ATTEMPTS:
-                raise InputError(f"{what}: cannot be read ({reason}); asked {_ATTEMPTS} times") from error
+                raise InputError(f"{what}: cannot be read ({reason}); requested {_ATTEMPTS} times") from error
             sleep(_PAUSE_S * 2 ** (attempt - 1))
     raise AssertionError
 
 
 def _hopeless(error: Exception) -> str:
-    """What to do instead of asking again, empty where asking again may help."""
+    """Remedy for an error that repeating does not mend, empty for one that may pass."""
     status = _status(error)
     if status in _ABSENT or (isinstance(error, FileNotFoundError) and error.__cause__ is None):
         return "no such file; check the address"
@@ -140,7 +140,7 @@ def _hopeless(error: Exception) -> str:
 
 
 def _status(error: Exception) -> int:
-    """The HTTP status that an error stands for, 0 without one."""
+    """The HTTP status of an error, 0 without one."""
     return int(getattr(error.__cause__ or error, "status", 0) or 0)
 
 
@@ -168,10 +168,10 @@ def fetch_whole(file: RemoteFile) -> Path:
 
 
 def _copy(file: RemoteFile, destination: Path) -> None:
-    """Piece by piece, so that a broken line costs one piece only."""
+    """Copy block by block, so that a broken connection costs one block only."""
     with destination.open("wb") as copy:
-        for offset in range(0, file.size, _PIECE_BYTES):
-            copy.write(file.read(offset, min(_PIECE_BYTES, file.size - offset)))
+        for offset in range(0, file.size, _BLOCK_BYTES):
+            copy.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
 
 
 def files_of(path: Path) -> list[Path]:
@@ -180,7 +180,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def misspelled(source: Source) -> str:
-    """What is wrong with a name that is no text, which nothing could be written about; empty where it is text."""
+    """Reason why a name is no text, which could not be printed; empty where it is text."""
     name = os.path.realpath(source) if isinstance(source, Path) else str(source)
     return "" if spelled(name) == name else f"{spelled(name)}: the name is not UTF-8; rename it"
 

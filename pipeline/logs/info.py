@@ -1,4 +1,4 @@
-"""What is in a log, before anything is read of it."""
+"""Contents of a log, from its index alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scanchain.words import grouped
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic: its message type, how it is encoded, how many messages there are, and their mean rate.
+    """A topic: message type, encoding, number of messages, mean rate.
 
     The rate is that between the first and the last of them, 0 where there is one alone.
     """
@@ -34,12 +34,12 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """A log: its files and topics, what a run would take of it, and what is wrong with it.
+    """A log: files, topics, those that a run would use, and problems.
 
     ``sensors`` are those beside lidar and wheels.
-    ``lidar`` is empty where a run could not tell which topic to take; ``problem`` says why. Meters, radians,
-    nanoseconds; ``T_base_lidar`` row by row, the first one seen where ``mount_motion`` says that the lidar moves;
-    ``base_frame`` is empty where the log does not tell it. ``idle_keys`` are the settings that have no effect on
+    ``lidar`` is empty where a run could not choose a topic, for the reason in ``problem``. Meters, radians,
+    nanoseconds; ``T_base_lidar`` row by row, the first one where the lidar moves (``mount_motion``);
+    ``base_frame`` is empty where the log does not state it. ``idle_keys`` are the settings that have no effect on
     it, and why.
     """
 
@@ -64,7 +64,7 @@ class LogInfo:
 
 
 def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogInfo:
-    """What the files hold as one log. Raises InputError only for what is no MCAP file."""
+    """Contents of the files as one log. Raises InputError only for a file that is no MCAP file."""
     config = config or LogConfig()
     indexes = index_files(sources, config)
     whole = whole_span(indexes)

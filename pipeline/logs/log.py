@@ -99,7 +99,7 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        is_untimed = config.point_times == "none"  # told from scans that have no times at all
+        is_untimed = config.point_times == "none"  # distinguished from scans without any times
         self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
@@ -128,23 +128,23 @@ class Log:
 
     @property
     def damage(self) -> list[str]:
-        """What could not be read; complete once ``scans`` is through or closed."""
+        """Damage that was met; complete once ``scans`` is through or closed."""
         return grouped(self._damage)
 
     @property
     def has_odometry(self) -> bool:
-        """Whether scans carry the wheels' pose."""
+        """True if scans carry the wheels' pose."""
         return self.odometry_topic != ""
 
     def idle_keys(self) -> dict[str, str]:
-        """Settings that have no effect on this log, and why."""
+        """Settings without an effect on this log, with the reason."""
         idle: dict[str, str] = {}
         if not self._has_point_times():
             idle |= dict.fromkeys(
                 ("log.point_times", "preprocess.deskew"), "the scans have no times of their points"
             )
         if is_scan(self.lidar):
-            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan tells the times of its beams itself")
+            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan states the times of its beams")
         if not any(index.takes_rate for index in self.indexes):
             idle["log.rate_hz"] = HAS_STAMPS
         if not self.has_odometry:
@@ -152,7 +152,7 @@ class Log:
         return idle
 
     def _has_point_times(self) -> bool:
-        """Whether the first scan has times of its points; a laser scan of a remote log is taken to have."""
+        """True if the first scan has per-point times; assumed of a laser scan of a remote log."""
         if not is_scan(self.lidar):
             return self._sampled_times.are_found
         if not all(isinstance(path, Path) for path in self.paths):
@@ -173,7 +173,7 @@ class Log:
         counts = ScanCounts(self.topic, self.odometry_topic)
         times = PointTimes(self.config)
         self.scans_with_wheels = 0
-        count, index, asked = 0, 0, working_s()
+        count, index, requested_s = 0, 0, working_s()
         try:
             for message, recorded in self._with_poses(poses, times):
                 count += 1
@@ -185,12 +185,12 @@ class Log:
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, recorded, waited_s=working_s() - asked)
+                scan = self._scan(index, message, recorded, waited_s=working_s() - requested_s)
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
                 index += 1
-                asked = working_s()
+                requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             self._damage += [*counts.losses(), *poses.complaints()]
@@ -216,7 +216,7 @@ class Log:
         )
 
     def _mounting_notes(self) -> list[str]:
-        """What is assumed of the mounting. Raises InputError where a planar lidar moves out of its plane."""
+        """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
         mounting = self.mounting
         if mounting.motion is None:
             return [mounting.note] if mounting.note else []
@@ -247,7 +247,7 @@ class Log:
         return poses.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
 
     def assumed_point_times(self) -> str:
-        """What a run assumes about per-point times, by the first scan that has returns; empty for laser scans."""
+        """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
         if is_scan(self.lidar):
             return ""
         is_untimed = self.config.point_times == "none"
@@ -291,7 +291,7 @@ class Log:
             yield waiting[0], poses.at_scan(waiting.popleft())
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
-        """What makes points of the lidar's messages; ``times`` learns what it assumes about theirs."""
+        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
             return LaserScanDecoder(limits, scan_reader(self.lidar))
@@ -300,7 +300,7 @@ class Log:
         return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
-        """The height of all points of the first clouds, None where it is not one; learns of their point times."""
+        """Height of all points of the first clouds, None where they differ; samples their point times, too."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         decoder = PointCloudDecoder(limits, self._sampled_times, cloud_reader(self.lidar))
         height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))

@@ -28,16 +28,16 @@ from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
-_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # by more than this a mount moves
-_TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # by more than this a planar lidar leaves its plane
+_TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
+_TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
 _FULL_TURN_DEG = 360.0
-_MOUNT_M = 1.0  # a sensor moves by less on a robot; a frame above which it moves by more is no part of it
+_MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
 
 Edge = tuple[str, str]  # parent and child
 
 
 class Motion(NamedTuple):
-    """How far a lidar moves on its mount, from the first pose seen on: the joint, and the lidar's axis of turn."""
+    """Extent of a lidar's motion on its mount since its first pose: the joint, and the lidar's axis of turn."""
 
     joint: Edge
     least_rad: float
@@ -55,12 +55,12 @@ class Motion(NamedTuple):
 
 
 class Mounting(NamedTuple):
-    """The place of a lidar on its robot.
+    """The pose of a lidar on its robot.
 
     Attributes
     ----------
-    base, lidar : frames; the base's is empty where the log does not tell it
-    T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not tell it
+    base, lidar : frames; the base's is empty where the log does not state it
+    T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     fixed : the static transforms; joints : those of /tf between base and lidar, none where all are static
     motion : None where the lidar stays where it is
     note : what was assumed, empty where nothing was
@@ -76,12 +76,12 @@ class Mounting(NamedTuple):
 
     @property
     def base_name(self) -> str:
-        """The base as it is called in print: by its frame where that is another than usual."""
+        """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
     @property
     def source(self) -> str:
-        """Where it comes from."""
+        """Source of the mounting as text."""
         if self.motion is not None:
             return "by transforms of /tf that change"
         return "by transforms of /tf, which do not change" if self.joints else "by static transforms"
@@ -106,15 +106,15 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     if not fixed and not topics and wheels is None:
         return Mounting("", "", np.eye(4))
     frame = _frame_of(indexes, lidar)
-    told = None
+    stated = None
     if wheels is not None and is_odometry(wheels):
-        told = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
-    bases = [name.lstrip("/") for name in ("" if told is None else told.child, *_BASE_FRAMES) if name]
+        stated = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+    bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, frame, T_base_lidar)
-    worlds = {"" if told is None else told.parent.lstrip("/")}
+    worlds = {"" if stated is None else stated.parent.lstrip("/")}
     seen = _moving_transforms(indexes, topics, span)
     worlds |= {name for each in (*seen, *map(edge, fixed)) for name in each if _is_of_the_world(name)}
     moving = {joint: poses for joint, poses in seen.items() if not worlds & set(joint)}
@@ -159,7 +159,7 @@ def joint_topics(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
 def _moving_transforms(
     indexes: Sequence[FileIndex], topics: dict[str, Channel], span: Span
 ) -> dict[Edge, list[StampedPose]]:
-    """What parts of the log, spread over it, hold of each transform that may change."""
+    """Messages of each transform that may change, from parts of the log spread over it."""
     found: dict[Edge, list[StampedPose]] = {}
     for topic, channel in topics.items():
         for transforms in spread_messages(indexes, topic, transforms_reader(channel), span):
@@ -169,7 +169,7 @@ def _moving_transforms(
 
 
 def _is_of_the_world(frame: str) -> bool:
-    """Whether a frame is called as those are in which robots move: map, robot_1/odom, camera_init."""
+    """True if a frame has a name of those in which robots move: map, robot_1/odom, camera_init."""
     return bool(_WORLD_WORDS & set(re.split(r"[/_]", frame.lower())))
 
 
@@ -210,7 +210,7 @@ def _seen(
 
 
 def _motion(joint: Edge, T_base_lidar: Matrix) -> Motion | None:
-    """How a lidar moves whose poses (N, 4, 4) one joint changes; None where it does not."""
+    """Motion of a lidar whose poses (N, 4, 4) one joint changes; None where it does not move."""
     turns = lie.log(lie.between(np.broadcast_to(T_base_lidar[0], T_base_lidar.shape), T_base_lidar))[:, 3:]
     axis = np.linalg.svd(turns)[2][0] if len(turns) > 1 else np.eye(3)[2]
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
@@ -229,13 +229,13 @@ def edge(transform: StampedPose) -> Edge:
 
 
 def is_moved(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """Whether a lidar no longer sits where it did."""
+    """True if a lidar's pose on the robot has changed."""
     shift_m, turn_rad = lie.apart(T_base_first, T_base_lidar)
     return turn_rad > _TURN_RAD or shift_m > _SHIFT_M
 
 
 def leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """Whether a planar lidar that was in a plane has tilted or risen out of it."""
+    """True if a planar lidar that was in a plane has tilted or risen out of it."""
     cosine = float(T_base_first[:3, 2] @ T_base_lidar[:3, 2])
     return cosine < np.cos(_TILT_RAD) or abs(T_base_first[2, 3] - T_base_lidar[2, 3]) > _LIFT_M
 
@@ -251,7 +251,7 @@ def root_frame(transforms: Sequence[StampedPose], frame: str) -> str:
 
 
 def is_upside_down(T_base_lidar: Pose) -> bool:
-    """Whether the lidar's z axis points downwards."""
+    """True if the lidar's z axis points downwards."""
     return bool(T_base_lidar[2, 2] < 0.0)
 
 
@@ -267,7 +267,7 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 
 
 def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
-    """Every transform of the topics that tell fixed ones."""
+    """Every transform of the topics of fixed ones."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):
@@ -277,6 +277,6 @@ def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
 
 
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
-    """The frame that the first messages of a lidar are in, empty where they name none."""
+    """The frame of a lidar's first messages, empty where they name none."""
     read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
     return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

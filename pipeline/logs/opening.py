@@ -1,4 +1,4 @@
-"""The registry of log formats, and the index of what lies at a path or address."""
+"""The registry of log formats, and the index of a path or address."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.
 
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
-_HEAD_BYTES = 64  # of a file, by which formats claim it
+_HEAD_BYTES = 64  # number of bytes of a file's head by which formats claim it
 _DEFAULTS = LogConfig()
 
 
@@ -104,16 +104,18 @@ def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
 
 
 def _index_copy(file: RemoteFile, number: int, config: LogConfig) -> FileIndex:
-    """That of a copy of a remote file which has no index to read it by."""
+    """Index of a copy of a remote file which has no index of its own."""
     copy = fetch_whole(file)
     index = _index_path(copy, number, config, file.address)
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
-    index.notes.insert(0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were fetched")
+    index.notes.insert(
+        0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded"
+    )
     return index
 
 
 def _index_path(path: Path, number: int, config: LogConfig, address: Source | None = None) -> FileIndex:
-    """Index of a path, which may be the copy of what lies at an address."""
+    """Index of a path, which may be the copy of a remote file."""
     if config.format != AUTO and config.format not in FORMATS:
         return index_scans(path, number, config.format, address)
     head = _head(path) if path.is_file() else b""
@@ -165,7 +167,7 @@ def _parts(source: Source) -> Sequence[Source]:
 
 
 def _other_parts(source: Source) -> list[str]:
-    """A note on what lies beside the parts of a log and is none."""
+    """A note on files beside the parts of a log that are no part."""
     parts = _parts(source)
     if not isinstance(source, Path) or source in parts or (source / "metadata.yaml").is_file():
         return []

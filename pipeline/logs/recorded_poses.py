@@ -16,7 +16,7 @@ from scanchain.logs.messages.returns import Returns
 from scanchain.logs.mounting import Mounting, edge
 from scanchain.words import counted
 
-_REMEMBERED = 512  # readings
+_REMEMBERED = 512  # largest number of readings in memory
 _NEAREST_NS = 500_000_000
 
 
@@ -56,7 +56,7 @@ class RecordedPoses:
             self.truth.append(pose)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether all poses that a scan at the instant needs have been read."""
+        """True if all poses that a scan at the instant needs have been read."""
         needed = [self.wheels] if self.odometry_topic else []
         return all(track.covers(stamp_ns) for track in (*needed, *self.joints.values()))
 
@@ -101,7 +101,7 @@ class PoseTrack:
         self.poses: dict[int, Pose] = {}
 
     def add(self, stamp_ns: int, T_odom_base: Pose) -> None:
-        """Remember a reading; the oldest are forgotten."""
+        """Add a reading; the oldest are dropped."""
         if stamp_ns not in self.poses:
             insort(self.stamps_ns, stamp_ns)
         self.poses[stamp_ns] = T_odom_base
@@ -109,7 +109,7 @@ class PoseTrack:
             del self.poses[self.stamps_ns.pop(0)]
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether there is a reading at the instant, or one after it."""
+        """True if there is a reading at the instant, or one after it."""
         return stamp_ns in self.poses or bool(self.stamps_ns and self.stamps_ns[-1] >= stamp_ns)
 
     def at(self, stamp_ns: int) -> Pose | None:

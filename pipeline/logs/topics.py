@@ -1,4 +1,4 @@
-"""Which topic of a log is the lidar, which the wheels, and what other sensors there are."""
+"""Choice of a log's topics of lidar and wheels, and its other sensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
 
 
 def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
-    """The lidar's channel: the topic asked for, else the only one that fits. Raises InputError."""
+    """The lidar's channel: the configured topic, else the only one that fits. Raises InputError."""
     channels = topics_of(indexes)
     name = name_of(indexes)
     lidars = [channel for channel in channels.values() if is_lidar(channel)]
@@ -56,7 +56,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 def find_odometry(
     indexes: Sequence[FileIndex], wanted: str, no_wheels: Container[str], notes: list[str]
 ) -> Channel | None:
-    """The wheel odometry's channel: the topic asked for, else the only one apart from those of true poses."""
+    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses."""
     if wanted:
         return _chosen(indexes, wanted, "log.odometry_topic")
     channels = topics_of(indexes).values()
@@ -69,7 +69,7 @@ def find_odometry(
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -> Channel | None:
-    """The ground truth's channel; only a topic that is not the default one must be there.
+    """The ground truth's channel; only a topic that is not the default one must exist.
 
     None for ``NO_TRUTH``.
     """
@@ -82,7 +82,7 @@ def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -
 
 @dataclass(frozen=True, slots=True)
 class OtherSensor:
-    """A topic beside lidar and wheels: which sensor, and what a run makes of it."""
+    """A topic beside lidar and wheels: its sensor, and its use by a run."""
 
     sensor: str
     topic: str
@@ -94,7 +94,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
     found = []
     for topic, channel in topics_of(indexes).items():
         if topic == truth:
-            found.append(OtherSensor("ground truth", topic, "judges the result, is not used for it"))
+            found.append(OtherSensor("ground truth", topic, "evaluates the result, is not used for it"))
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
@@ -118,12 +118,12 @@ def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
 
 
 def is_lidar(channel: Channel) -> bool:
-    """Whether its messages are scans or clouds that are understood."""
+    """True if its messages are scans or clouds of a supported type."""
     return is_scan(channel) or is_cloud(channel)
 
 
 def _damage(indexes: Sequence[FileIndex]) -> str:
-    """What may be why a topic is not there."""
+    """Damage that may be the reason for a missing topic."""
     damage = [line for index in indexes for line in index.damage]
     return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
 

@@ -34,11 +34,11 @@ class LoopCloser:
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
     def start_segment(self, keyframe: int) -> None:
-        """Say that the motion from the keyframe before to this one is unknown."""
+        """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe, and of places whose submaps are complete by now; accepted or not.
+        """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
@@ -50,7 +50,7 @@ class LoopCloser:
         return closures + self.places.close(keyframes, graph.poses, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the places whose submaps the end of the log leaves incomplete."""
+        """Closures of the submaps that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
         return self.places.close(keyframes, graph.poses, components == components[-1], finish=True)
 

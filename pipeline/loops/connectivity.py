@@ -12,7 +12,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph.shortest_paths import shortest_paths
 
 _MIN_WEIGHT = 0.5  # robust weight of a loop edge, from which on it connects its keyframes
-_LOOP_LENGTH_M = 1e-3  # of a loop edge in the shortest path: it adds next to no drift
+_LOOP_LENGTH_M = 1e-3  # length of a loop edge in the shortest path: it adds next to no drift
 
 
 class Segments:

@@ -18,14 +18,14 @@ from scanchain.loops.submaps import Submap
 from scanchain.registration import VoxelMap
 
 SIZE = 128  # cells along each side of the image
-_ANGLES = 64  # steps of half a turn
+_ANGLES = 64  # directions of the spectrum over half a turn
 _FREQUENCIES = np.arange(2.0, 34.0)  # periods in an image
-_BANDS, _HARMONICS = 16, 5  # of the key
-_WEIGHT_OF_MEAN = 0.3  # of the harmonic 0 in the key
-_BLUR = 0.7  # cells
-_STEPS = 16.0  # of an image in 8 bits, per unit
+_BANDS, _HARMONICS = 16, 5  # size of the key: bands of frequencies, harmonics over the direction
+_WEIGHT_OF_MEAN = 0.3  # weight of harmonic 0 in the key
+_BLUR = 0.7  # standard deviation, cells, of the filter that blurs the image
+_STEPS = 16.0  # steps of an 8-bit image for each unit of a cell
 _CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
-_MIN_GROUND_VOXELS = 10  # with such a normal, below which the lidar is assumed upright
+_MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer the lidar is assumed upright
 
 
 def _polar_grid() -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ def _key_of(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
 def _heading(
     source: NDArray[np.float32], target: NDArray[np.float32], expected_rad: float, within_rad: float
 ) -> tuple[float, bool]:
-    """Turn of the source that makes its spectrum the target's, and whether the opposite one is as good.
+    """Heading of the source that makes its spectrum the target's; True if the opposite one fits as well.
 
     A parabola refines the best of the steps.
     """

@@ -1,4 +1,4 @@
-"""The recognizer for 3D logs: a database of descriptors, asked by appearance and near the expected pose."""
+"""The recognizer for 3D logs: a database of descriptors, searched by similarity and near the expected pose."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from scanchain.loops.descriptor import Alignment, Descriptor, compare, describe,
 from scanchain.loops.recognizer import Candidate, Query
 from scanchain.loops.submaps import Submap
 
-_MAX_COMPARED = 10  # compared in full, of the descriptors with the most similar keys
-_MAX_NEAREST = 3  # compared in full, of those nearest to the expected pose
-_MAX_HEADING_ERROR_RAD = 0.5  # of odometry, in the search near the expected pose
-_MIN_SIMILARITY = 0.45  # from which on a place is verified by matching
-_RIVAL = 0.9  # of the best similarity, from which on a candidate elsewhere makes it ambiguous
-_MIN_APART = 0.25  # radii between two poses that are not the same
-_GROWTH = 1.25  # of the database between two builds of its tree
-_SLACK = 16  # descriptors that may wait outside the tree in any case
+_MAX_COMPARED = 10  # number of descriptors with the most similar keys that are compared in full
+_MAX_NEAREST = 3  # number of descriptors nearest to the expected pose that are compared in full
+_MAX_HEADING_ERROR_RAD = 0.5  # largest error of odometry's heading in the search near the expected pose
+_MIN_SIMILARITY = 0.45  # least similarity of a candidate that is verified by matching
+_RIVAL = 0.9  # share of the best similarity, from which on a candidate elsewhere makes it ambiguous
+_MIN_APART = 0.25  # least distance in radii of a submap between two poses that are not the same
+_GROWTH = 1.25  # factor by which the database grows between two builds of its tree
+_SLACK = 16  # number of descriptors that may lie outside the tree however small it is
 
 
 class DescriptorRecognizer:
@@ -59,9 +59,9 @@ class DescriptorRecognizer:
         return candidates + self._best_nearby(descriptor, near, query)
 
     def _best(self, descriptor: Descriptor, similar: Sequence[Descriptor], query: Query) -> Candidate:
-        """The most similar of several descriptors, and whether another one contradicts it.
+        """The most similar of several descriptors, ambiguous where another one contradicts it.
 
-        Two that are the same place, but for what the map may have drifted between them, do not contradict.
+        Two at the same position, up to the possible drift of the map between them, do not contradict.
         """
         ranked = sorted(
             ((compare(descriptor, other), other.anchor) for other in similar), key=lambda each: -each[0].similarity

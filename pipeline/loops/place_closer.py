@@ -16,12 +16,12 @@ from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_reco
 from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier, Verification
 
-_PLACE_DRIFT = 0.1  # share of the path between, that a recognized place may be off the prediction
-_SPACING = 1.0 / 3.0  # radii of the path between two submaps
+_PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
+_SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 
 
 class PlaceCloser:
-    """Asks the recognizer of every few keyframes whether their surroundings were seen before.
+    """Loop closures by the recognizer, queried for one keyframe of every few.
 
     A submap is complete once the lidar has gone on by its radius.
     """
@@ -123,7 +123,7 @@ class PlaceCloser:
         return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
 
     def _check(self, candidate: Candidate, query: Query) -> None:
-        """Refuse what a recognizer must not answer."""
+        """Refuse a candidate that is out of range."""
         name, target = self.config.loops.recognizer, candidate.target
         is_old = 0 <= target < len(query.keyframes) and query.keyframes[target].traveled_m <= query.max_traveled_m
         if not is_old:
@@ -149,7 +149,7 @@ class PlaceCloser:
         return self.submap_verifier.verify(source, target, T_first)
 
     def _problem(self, candidate: Candidate, verified: Verification, query: Query, is_connected: bool) -> str:
-        """Why a candidate is no closure though it aligns, empty if it is one.
+        """Reason why an aligned candidate is no closure, empty if it is one.
 
         Between unconnected keyframes the distance that odometry has them apart means nothing.
         """

@@ -1,4 +1,4 @@
-"""The seam of place recognition: what a recognizer is given, what it answers, and those there are."""
+"""The interface of place recognition: query and candidate, the protocol of recognizers, and the built-in ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RECOGNIZERS = {
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """The keyframe to recognize, and what is known of it.
+    """The keyframe to recognize, with its submap and its expected pose.
 
     Attributes
     ----------
@@ -60,10 +60,10 @@ class Candidate:
 
 
 class Recognizer(Protocol):
-    """Remembers submaps and proposes which of them a new one revisits.
+    """Database of submaps that proposes which of them a new one revisits.
 
-    A checkpoint does not hold it: a resumed run makes it anew from its name and adds the same submaps again, in
-    the same order. It goes on to the same result if ``query`` changes nothing that a later answer depends on.
+    A checkpoint does not hold it: a resumed run makes a new one from its name and adds the same submaps again, in
+    the same order. It goes on to the same result if ``query`` changes nothing that a later result depends on.
     """
 
     def __init__(self, config: Config, dimension: int) -> None:
@@ -71,7 +71,7 @@ class Recognizer(Protocol):
         ...
 
     def add(self, submap: Submap) -> None:
-        """Remember a submap by its anchor; called once each, in the order of the log."""
+        """Store a submap by its anchor; called once each, in the order of the log."""
         ...
 
     def query(self, query: Query) -> Sequence[Candidate]:
@@ -80,7 +80,7 @@ class Recognizer(Protocol):
 
 
 def create_recognizer(config: Config, dimension: int) -> Recognizer | None:
-    """The recognizer that ``loops.recognizer`` names; None where places are not recognized.
+    """The recognizer that ``loops.recognizer`` names; None where place recognition is off.
 
     Raises InputError for a name that is neither in the registry nor a class that can be loaded.
     """

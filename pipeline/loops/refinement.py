@@ -18,9 +18,9 @@ from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
 
-_TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # of a step after which another would change little
+_TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # step below which another iteration would change little
 _THREADS = 2
-_MAX_SCANS = 2048  # of a thread, in memory
+_MAX_SCANS = 2048  # largest number of scans of a thread in memory
 
 
 def spread(T_world_keyframes: Matrix, scan_indices: NDArray[np.int64], odometry: Matrix) -> Matrix:

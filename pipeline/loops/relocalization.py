@@ -17,21 +17,21 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
 
-_BASIN_M = 0.5  # of uncertainty, up to which matching needs no search
-_INTERVAL = 0.2  # of the uncertainty, traveled between two searches: wide windows cost most
-_RADIANS_A_METER = 0.2  # of uncertainty: half width of the window in heading
-_MIN_RAD = 0.1  # of that half width
-_SPACING_M = 4.0  # between the submaps that are searched
-_MAX_SUBMAPS = 6  # searched near the expected pose
-_MAX_SUBMAPS_ANYWHERE = 400  # searched without one
-_KEYFRAMES_ANYWHERE = 12  # whose points are searched for together
-_MIN_SHARE = 0.55  # of the highest score possible, below which nothing was found
-_SAME_POSE_M = 2.0  # within which the results of two submaps are the same
-_RIVAL = 0.9  # of the best score, from which on a result elsewhere makes it ambiguous
-_FIRST_M = 3.0  # traveled in a new segment before the first search anywhere
-_BACKOFF = 0.2  # of what was traveled since then, between two searches: the longer in vain, the rarer
-_APART_M = 1.0  # traveled between two results that may confirm each other
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # by which these may differ
+_BASIN_M = 0.5  # largest uncertainty that matching corrects without a search
+_INTERVAL = 0.2  # share of the uncertainty that is traveled between two searches: wide windows cost most
+_RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
+_MIN_RAD = 0.1  # least half width of the window in heading
+_SPACING_M = 4.0  # least distance between the anchors of submaps that are searched
+_MAX_SUBMAPS = 6  # largest number of submaps searched near the expected pose
+_MAX_SUBMAPS_ANYWHERE = 400  # largest number of submaps searched without an expected pose
+_KEYFRAMES_ANYWHERE = 12  # number of keyframes whose points are searched for together, without an expected pose
+_MIN_SHARE = 0.55  # least share of the highest possible score at which something was found
+_SAME_POSE_M = 2.0  # distance within which the results of two submaps are the same pose
+_RIVAL = 0.9  # share of the best score, from which on a result elsewhere makes it ambiguous
+_FIRST_M = 3.0  # distance traveled in a new segment before the first search anywhere
+_BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
+_APART_M = 1.0  # least distance traveled between two results that may confirm each other
+_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Found:
 
 
 class PlanarSearch:
-    """Tries every pose in the windows that the graph leaves open."""
+    """Correlative search over all windows that the uncertainty of the graph allows."""
 
     def __init__(self, submaps: VoxelSubmaps) -> None:
         self.submaps = submaps
@@ -111,14 +111,14 @@ class PlanarSearch:
         return chosen
 
     def _points(self, keyframes: Sequence[Keyframe], count: int) -> Points:
-        """Points of the last keyframes in the newest one's frame: one scan alone may fit in many places."""
+        """Points of the last keyframes in the newest one's frame: one scan alone may fit at many poses."""
         T_source_odom = lie.inverse(keyframes[-1].T_odom_lidar)
         members = keyframes[-count:]
         return np.vstack([lie.transform(T_source_odom @ member.T_odom_lidar, member.points) for member in members])
 
 
 class Relocalizer:
-    """Searches the older segments from a new one, as long as no loop joins it to them."""
+    """Search for a new segment in the older ones, as long as no loop joins it to them."""
 
     def __init__(self, search: PlanarSearch, verifier: ScanVerifier, segments: Segments) -> None:
         self.search = search
@@ -156,7 +156,7 @@ class Relocalizer:
         return self._confirmed(closure, keyframes, graph.poses)
 
     def _next_component(self, unknown: NDArray[np.int64], components: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Keyframes of one component, each in its turn: two may show the same place."""
+        """Keyframes of the next component, in rotation: two may show the same location."""
         numbers = np.unique(components[unknown])
         self.turn += 1
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
@@ -191,7 +191,7 @@ def _best(anchors: Sequence[int], seeds: Sequence[Seed], T_world: Matrix) -> Fou
 
 
 def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-    """Whether two closures imply the same pose of the newest keyframe."""
+    """True if two closures imply the same pose of the newest keyframe."""
     off_m, off_rad = lie.apart(
         _implied_pose(a, a.source, keyframes, T_world), _implied_pose(b, a.source, keyframes, T_world)
     )

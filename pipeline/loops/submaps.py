@@ -15,10 +15,10 @@ from scanchain.data import Keyframe, Points, Pose
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
-RADII_AHEAD = 1.0  # of the trajectory after the anchor
-RADII_BEHIND = 2.0  # and before it: a lidar that looks ahead sees a place from far off
-_MAX_POINTS = 80_000  # gathered, of keyframes evenly spread over the submap
-_MAX_CACHED = 64  # voxel submaps in memory; the least recently used one is dropped first
+RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap takes in
+RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
+_MAX_POINTS = 80_000  # largest number of points of a submap, of keyframes evenly spread over it
+_MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ def _traveled_m(keyframe: Keyframe) -> float:
 
 
 class VoxelSubmaps:
-    """Voxel maps of 2n + 1 keyframes around every n-th one, built when first asked for.
+    """Voxel maps of 2n + 1 keyframes around every n-th one, built when first used.
 
     They lie in that keyframe's frame, with voxels of the size that odometry used there; keyframes of another
     segment are left out.

@@ -1,4 +1,4 @@
-"""Verification of a proposed loop closure: alignment from the initial pose, and whether the result is one.
+"""Verification of a proposed loop closure: alignment from the initial pose, and tests of the result.
 
 A scan is aligned to a voxel submap or, in 3D, a submap to a submap, which are then checked for free space, too.
 """
@@ -19,13 +19,13 @@ from scanchain.loops.submaps import Submap, VoxelSubmaps
 from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
 
-_MIN_OVERLAP_ALONE = 0.8  # asked of a match for which no expected pose speaks
-_MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # of a recognized place, as loops.min_… of the others
-_MIN_AGREEMENT = 0.87  # about free space of a recognized place, relative to that of each submap with itself
-_COARSE = 2.0  # times the usual voxels, for the first alignment of two submaps
-_VIEWS = 8  # of each submap that are compared with the other
-_BINS = (90, 180)  # of elevation and azimuth: 2°
-_MARGIN_SHARE = 0.05  # of a range, by which it may differ in any case
+_MIN_OVERLAP_ALONE = 0.8  # least overlap of a match that no expected pose supports
+_MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized place, as loops.min_… of others
+_MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of each submap with itself
+_COARSE = 2.0  # voxel size, in usual ones, of the first alignment of two submaps
+_VIEWS = 8  # number of views of each submap that are compared with the other
+_BINS = (90, 180)  # bins of elevation and azimuth: 2° each
+_MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each other, as a share of the range
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class ScanVerifier:
         """The source's scan in the submap of an anchor, from an initial pose.
 
         newest : keyframe that may be in the submap
-        alone : whether nothing but the match speaks for the closure, of which more is asked then
+        alone : whether nothing but the match supports the closure, which must overlap more then
         """
         submap = self.submaps.around(target, keyframes, newest)
         points = downsample(keyframes[source].points, submap.scale * self.match_voxel_m)
@@ -102,7 +102,7 @@ class ScanVerifier:
 
 
 class SubmapVerifier:
-    """Aligns 3D submaps from coarse to fine and compares what they saw as free."""
+    """Aligns 3D submaps from coarse to fine and compares their free space."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -149,7 +149,7 @@ class SubmapVerifier:
 
 
 def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, margin_m: float) -> float:
-    """Share, of the source's points that the target's lidar could see, that lie where it did see a surface.
+    """Share, of the source's points in view of the target's lidar, that lie where it saw a surface.
 
     points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
     """

@@ -1,4 +1,4 @@
-"""What moved while a log was recorded, told by free space: later or earlier, the lidar looked through it."""
+"""Moving objects in a map by free space: points that later or earlier scans saw through."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from scanchain.kernels.raycast.free_space import nearest_ranges, weigh_points
 
 _THREADS = 2
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
-_REACH_BINS = 1.5  # width of a bin in voxels, up to which a scan is a witness
-_CUBES_TO_REACH = 8.0  # that points are sorted by
-_WINDOW = 0.6  # of a scan's spacing, within which a surface has a point
-_RANGE_MARGIN_SHARE = 0.03  # beside one voxel
-_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # how level the ground is, and how exact an elevation
-_LEAST_THROUGH = 2  # scans that looked through what moved, at least
-_MAJORITY = 1.5  # times as many as saw a surface there
-_ENOUGH = 12  # scans that saw a surface, for which it stays
+_REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
+_CUBES_TO_REACH = 8.0  # cubes that points are sorted by, along the reach
+_WINDOW = 0.6  # share of a scan's spacing, within which a surface has a point
+_RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, beside one voxel
+_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # flatness assumed of the ground in voxels, error of an elevation
+_LEAST_THROUGH = 2  # least number of scans that saw through what moved
+_MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
+_ENOUGH = 12  # number of scans that saw a surface, for which it stays
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A scan as evidence.
+    """A scan with the ranges of its free space.
 
     Attributes
     ----------
     T_world_lidar : (d+1, d+1)
     points : (M, d) meters, lidar frame
-    spacing_m : edge of the voxels that the scan was thinned out with; a surface has a point in each
+    spacing_m : edge of the voxels that the scan was downsampled with; a surface has a point in each
     """
 
     T_world_lidar: Pose
@@ -42,12 +42,12 @@ class View:
 
 
 def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray[np.bool_]:
-    """Which points (N, d) of a map, one a voxel, clearly more scans looked through than saw a surface there.
+    """True for points (N, d) of a map, one a voxel, that clearly more scans saw through than saw a surface there.
 
     A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
     """
     index = _Cells(_in_space(voxels), _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi))
-    seen, looked_through = np.zeros((2, len(voxels)), np.int32)
+    seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
         for view in views:
@@ -61,14 +61,14 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
             parts = [
                 pool.submit(
                     weigh_points, index.points, np.ascontiguousarray(spans[k::_THREADS]), T_lidar_world, ranges_m,
-                    limits, _ENOUGH, seen, looked_through,
+                    limits, _ENOUGH, seen, seen_through,
                 )
                 for k in range(_THREADS)
             ]  # fmt: skip
             for part in parts:
                 part.result()
     result = np.zeros(len(voxels), bool)
-    clearly = (looked_through >= _LEAST_THROUGH) & (looked_through > _MAJORITY * seen)
+    clearly = (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
     result[index.order] = clearly & (seen < _ENOUGH)
     return result
 
@@ -79,7 +79,7 @@ def _in_space(points: Points) -> Points:
 
 
 class _Cells:
-    """Points sorted by cubes, so that a scan looks at those within reach alone, and at neighbors in turn."""
+    """Points sorted by cubes, so that a scan tests those within reach alone, and neighbors in turn."""
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m
@@ -93,6 +93,6 @@ class _Cells:
         self.spans = np.column_stack([first, np.append(first, len(points))[1:]])
 
     def within_reach(self, place_m: NDArray[np.float64]) -> NDArray[np.int64]:
-        """(S, 2) spans of the points in cubes that are, in part, within reach of a place."""
+        """(S, 2) spans of the points in cubes that are, in part, within reach of a position."""
         outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.edge_m, 0.0)
         return self.spans[np.einsum("ij,ij->i", outside_m, outside_m) <= self.reach_m**2]

@@ -14,12 +14,12 @@ from scanchain.kernels.raycast import grid
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
-MAX_CELLS = 64_000_000  # half a gigabyte
+MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 
 _HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, . 5.1
 _LOW, _HIGH = -2.0, 3.5
 _MARGIN = 2  # cells around everything that is drawn; rounding may put a beam one cell aside
-_GROWTH = 0.25  # of the extent, added where the grid has to grow
+_GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
 
 class OccupancyGrid:
@@ -133,7 +133,7 @@ class OccupancyGrid:
 def draw_grid(
     scans: Iterable[tuple[Pose, NDArray[np.floating]]], config: MapsConfig, *, max_range_m: float = 80.0
 ) -> OccupancyGrid:
-    """The grid of (T_world_lidar, points) pairs; only one scan is held at a time."""
+    """The grid of (T_world_lidar, points) pairs; only one scan is in memory at a time."""
     grid = OccupancyGrid(config, max_range_m=max_range_m)
     for T_world_lidar, points in scans:
         grid.insert(T_world_lidar, points)

@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.voxels import point_map as kernels
 from scanchain.kernels.voxels.hashing import EMPTY
 
-MAX_VOXELS = 16_000_000  # a gigabyte
+MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
 _FIRST_VOXELS = 1 << 14
 
 
@@ -62,7 +62,7 @@ class PointMap:
         return self.sums[: self.used] / self.counts[: self.used, None]
 
     def _make_room(self) -> None:
-        """Twice the rows, or, where that is too many, voxels of twice the size."""
+        """Double the rows or, where that is too many, the size of the voxels."""
         sums, counts = self.sums[: self.used], self.counts[: self.used]
         if len(self.counts) < self.max_voxels:
             self._allocate(min(2 * len(self.counts), self.max_voxels))
@@ -88,7 +88,7 @@ def build_point_map(
     voxel_size_m: float,
     max_range_m: float = float("inf"),
 ) -> PointMap:
-    """The map of (T_world_lidar, points) pairs; only one scan is held at a time."""
+    """The map of (T_world_lidar, points) pairs; only one scan is in memory at a time."""
     result = PointMap(dimension, voxel_size_m, max_range_m=max_range_m)
     for T_world_lidar, points in scans:
         result.insert(T_world_lidar, points)

@@ -1,4 +1,4 @@
-"""Prediction error statistics: how far off the next prediction may be, from the errors of those before."""
+"""Prediction error statistics: expected error of the next prediction, from the errors of those before."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scanchain import lie
 
 _MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
-_KNOWN = 5  # errors needed before the mean is used
+_KNOWN = 5  # number of errors needed before the mean is used
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
 

@@ -1,4 +1,4 @@
-"""The half of the chain that knows nothing of the graph: odometry, and which of its scans become keyframes."""
+"""Front end: odometry and the choice of keyframes, independent of the pose graph."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from scanchain.odometry.tracked import Tracked
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A scan as odometry placed it, and what the back end has to know of the odometry at that moment.
+    """A scan as odometry placed it, with the state of odometry that the back end needs.
 
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
-    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed anew.
+    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
     """
 
     tracked: Tracked
@@ -29,7 +29,7 @@ class Located:
 
 
 class FrontEnd:
-    """Feeds on scans, one by one; shares nothing with the back end."""
+    """Odometry and keyframe selection, fed scan by scan; shares nothing with the back end."""
 
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
         self.config = config.odometry

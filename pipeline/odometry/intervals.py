@@ -1,17 +1,17 @@
-"""How much time passes from scan to scan, by stamps that need not make sense."""
+"""Seconds between successive scans, by stamps that need not be plausible."""
 
 from __future__ import annotations
 
 from scanchain.data import Scan
 
-_GAP = 5.0  # times the usual interval, from which on scans are missing
-_ALIKE = 1.4  # ratio up to which two intervals agree
-_LONGEST = 100.0  # times the usual interval, beyond which stamps make no sense
-_MEMORY = 0.9  # of the usual interval, per scan
+_GAP = 5.0  # times the usual interval: a longer one means that scans are missing
+_ALIKE = 1.4  # largest ratio of two intervals that agree
+_LONGEST = 100.0  # times the usual interval: a longer one is no plausible interval of stamps
+_MEMORY = 0.9  # weight of the usual interval so far against the next one
 
 
 class Intervals:
-    """Remembers the last scan, the interval before it, and the usual one, in seconds; 0 while they are unknown."""
+    """The last scan, the interval before it and the usual one, in seconds; 0 while they are unknown."""
 
     def __init__(self) -> None:
         self.last_scan: Scan | None = None
@@ -37,8 +37,8 @@ class Intervals:
         stamped_s, logged_s = _since(self.last_scan, scan)
         if not self.usual_s or _are_alike(stamped_s, self.usual_s):
             return stamped_s
-        is_sound = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
-        return stamped_s if is_sound else self.usual_s
+        is_plausible = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
+        return stamped_s if is_plausible else self.usual_s
 
     def silence_s(self, scan: Scan) -> float:
         """Seconds since the last scan, however many; 0 where the stamps and the log disagree."""
@@ -48,7 +48,7 @@ class Intervals:
         return stamped_s if _are_alike(stamped_s, logged_s) else 0.0
 
     def has_gap_before(self, scan: Scan) -> bool:
-        """Whether scans are missing."""
+        """True if scans are missing before this one."""
         return self.usual_s > 0.0 and self.to(scan) > _GAP * self.usual_s
 
 
@@ -58,5 +58,5 @@ def _since(last: Scan, scan: Scan) -> tuple[float, float]:
 
 
 def _are_alike(a: float, b: float) -> bool:
-    """Whether two intervals are positive and of about the same length."""
+    """True if two intervals are positive and of about the same length."""
     return 0.0 < b <= _ALIKE * a <= _ALIKE**2 * b

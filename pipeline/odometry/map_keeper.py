@@ -1,4 +1,4 @@
-"""The local map of odometry as scans come in: extended where they bring something new, remade, forgotten."""
+"""The local map of odometry: extended where scans add something new, rebuilt, cleared."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from scanchain.config import LocalMapConfig
 from scanchain.data import Points, Pose
 from scanchain.registration import VoxelMap
 
-_RECENT = 20  # scans that a map with other voxels is made of
+_RECENT = 20  # number of last scans from which a map with other voxels is built
 
 
 class MapKeeper:
-    """Keeps the voxel map ``surfaces``, and the last scans in it, of which it can be made anew."""
+    """The voxel map ``surfaces``, and the last scans in it, from which it can be rebuilt."""
 
     def __init__(self, dimension: int, config: LocalMapConfig) -> None:
         self.config = config
@@ -35,12 +35,12 @@ class MapKeeper:
         self.T_odom_inserted = T_odom_lidar
 
     def resize(self, scale: float) -> None:
-        """Make the map anew of the last scans, with voxels of this scale, where it is another one."""
+        """Rebuild the map from the last scans where the scale of its voxels changes."""
         if scale != self.surfaces.scale:
             self._remake(scale)
 
     def restart(self, points: Points) -> None:
-        """Make the map anew of a single scan (N, d), odom frame."""
+        """Rebuild the map from a single scan (N, d), odom frame."""
         self.recent.clear()
         self.recent.append((points, lie.identity(self.surfaces.dimension)))
         self._remake(self.surfaces.scale)

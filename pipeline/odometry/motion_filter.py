@@ -1,4 +1,4 @@
-"""The motion from one scan to the next: a Kalman filter that knows the pose and the motion, and how surely."""
+"""Kalman filter of the pose and of the motion from one scan to the next."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class MotionFilter:
     """Constant velocity: the pose moves on by the motion, the motion stays but for its noise.
 
     A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
-    are known to go together: the next match, which is right again, does not throw the motion the other way.
+    are known to go together: the next match, which is right again, does not reverse the motion.
 
     Attributes
     ----------
@@ -23,13 +23,13 @@ class MotionFilter:
     """
 
     def __init__(self, any_motion: Matrix) -> None:
-        """any_motion : (k, k) covariance of the motion as long as nothing is known of it."""
+        """any_motion : (k, k) covariance of the motion before the first correction."""
         self.any_motion = any_motion
         self.nothing = np.zeros_like(any_motion)
         self.begin(lie.identity(2 if len(any_motion) == 3 else 3))
 
     def begin(self, motion: Pose) -> None:
-        """Start from a pose that is given, and a motion of which next to nothing is known."""
+        """Start from a given pose and a motion of covariance ``any_motion``."""
         self.motion = motion
         self.motion_covariance = self.any_motion
         self.pose_covariance = self.covariance = self.nothing

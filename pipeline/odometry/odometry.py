@@ -40,7 +40,7 @@ class _Registered:
 
 
 class Odometry:
-    """Scan-to-map odometry: one scan after another in, the pose of each out; keeps the local map."""
+    """Scan-to-map odometry: one scan after another in, the pose of each out."""
 
     def __init__(
         self, config: Config | None = None, T_base_lidar: Pose | None = None, *, dimension: int | None = None
@@ -94,7 +94,7 @@ class Odometry:
         self._check_dimension(scan)
         self.scans += 1
         started = working_s()
-        sweep, sparse = self.resolution.look(scan)
+        sweep, sparse = self.resolution.downsampled(scan)
         self.map.resize(self.resolution.scale)
         if not len(self.local_map):
             self._check_range(scan, sparse)
@@ -136,7 +136,7 @@ class Odometry:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
-            return self._begin_anew(points, prediction)
+            return self._reset_map(points, prediction)
         return _Registered(points, match, state, match.reason, prediction)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
@@ -157,14 +157,14 @@ class Odometry:
         return points, blurred(match, error), prediction
 
     def _restart(self, velocity: NDArray[np.float64]) -> Pose:
-        """Make the map anew of the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
+        """Rebuild the map from the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
         T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
         self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
         self.map.restart(self.first_points)
         return T_odom_middle
 
-    def _begin_anew(self, points: Points, prediction: Prediction) -> _Registered:
-        """Forget the map, to which the scan does not belong; a new one begins where the last scan was."""
+    def _reset_map(self, points: Points, prediction: Prediction) -> _Registered:
+        """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()
         match = first_match(prediction.T_odom_last, points, self.config.matching)
@@ -180,7 +180,7 @@ class Odometry:
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 
     def _extend(self, points: Points, state: State) -> None:
-        """Insert the scan where its pose is known, or where none was known for so long that the map goes on."""
+        """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
         self.recovery.take(state)
         if state is not State.LOST:
             self.map.extend(points, self.predictor.T_odom_lidar)

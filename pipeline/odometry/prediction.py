@@ -17,14 +17,14 @@ from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import MotionFilter
 
-_EVEN = 2.0  # ratio of two intervals, below which an acceleration is computed from them
-_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # half width of the search window where stamps lie too close
-_LARGEST_WINDOW_M = 5.0  # half width of the search window
+_EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
+_LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
+_LARGEST_WINDOW_M = 5.0  # largest half width of the search window
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The predicted pose of a scan, and the motion before it that other guesses and deskewing follow from.
+    """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Prediction:
 
     @property
     def is_second(self) -> bool:
-        """Whether no motion is known yet: one scan at most has been corrected."""
+        """True if no motion is known yet: one scan at most has been corrected."""
         return self.last_s == 0.0
 
     @property
@@ -70,7 +70,7 @@ class Prediction:
 
     @property
     def is_out_of_reach(self) -> bool:
-        """Whether the scan may be further off than any search window, after so long a silence."""
+        """True if the scan may be outside any search window, after so long a gap."""
         return self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
     def window(self) -> tuple[float, float]:
@@ -125,7 +125,7 @@ class Prediction:
 
 
 class Predictor:
-    """Holds the last pose, the last motion and the last wheel reading, with their uncertainties.
+    """The last pose, the last motion and the last wheel reading, with their uncertainties.
 
     Without wheels the motion goes on as it was, by a filter whose noise is that of the errors of its predictions.
     Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.

@@ -1,4 +1,4 @@
-"""Recovery: other initial poses where a match is doubtful, wide searches after a loss, and when to give up."""
+"""Recovery: other initial poses where a match fits badly, wide searches after a loss, and a limit on them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from scanchain.data import Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import CorrelativeMap, Matcher, VoxelMap
 
-_WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
-_PATIENCE = 5  # lost scans in a row, from which on the map is extended at the predicted pose
-_DOUBTFUL = 2.0  # cost per point over its running mean, from which on other initial poses are tried
-_ELSEWHERE = 3.0  # the same, from which on a scan after a long silence does not belong to the map
-_ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is doubtful
+_WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
+_PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
+_UNCERTAIN = 2.0  # cost per point over its running mean, from which on other initial poses are tried
+_ELSEWHERE = 3.0  # cost per point over its running mean, from which on a scan after a gap does not fit the map
+_ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is uncertain
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
 
 class Recovery:
-    """Aligns scans, also such as are not where they are predicted; knows the usual cost of a point."""
+    """Alignment of scans, also of those far from the predicted pose, by the usual cost of a point."""
 
     def __init__(self, config: MatchingConfig) -> None:
         self.config = config
@@ -30,10 +30,10 @@ class Recovery:
         self.lost_scans = 0
 
     def align(self, matcher: Matcher, points: Points, surfaces: VoxelMap, prediction: Prediction) -> Match:
-        """The alignment from the predicted pose or, where that one is doubtful, the best of several."""
+        """The alignment from the predicted pose or, where that one is uncertain, the best of several."""
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        if self._is_doubtful(best.cost / len(points), prediction):
+        if self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
                 if self._cost(other, prediction) < self._cost(best, prediction):
@@ -43,7 +43,7 @@ class Recovery:
         return best
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
-        """Whether a scan that may be anywhere is not where it was found.
+        """True if a scan without a reliable prediction does not fit the map at the pose that was found.
 
         usual_cost : before this scan
         """
@@ -62,16 +62,16 @@ class Recovery:
 
     @property
     def has_given_up(self) -> bool:
-        """Whether so many scans were lost that the map has to go on from the prediction."""
+        """True if so many scans were lost that the map has to be extended at the prediction."""
         return self.lost_scans >= _PATIENCE
 
-    def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
-        """Whether the cost per point is far above the usual one, and a share of the most it could be."""
+    def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
+        """True if the cost per point is far above the usual one, and above a share of the greatest possible."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
             return cost > self.usual_cost
-        return cost > max(_DOUBTFUL * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+        return cost > max(_UNCERTAIN * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""

@@ -1,4 +1,4 @@
-"""A scan with its pose, and the matches that stand where there was nothing to align with."""
+"""A scan with its pose, and matches for scans without a registration."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Tracked:
     """A scan with its pose in the odometry frame.
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
-    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds tell where the time went.
-    ``elsewhere_m`` is how far away it may be where nothing says how it came there, 0 as a rule.
+    from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
+    ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
     """
 
     scan: Scan
@@ -37,7 +37,7 @@ class Tracked:
 
 
 def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> Match:
-    """What stands for a match where there is no map yet: the frame starts at this scan."""
+    """Match of the first scan, where there is no map yet: the frame starts at this scan."""
     k = lie.twist_size(T_odom_lidar)
     return Match(
         T_target_source=T_odom_lidar,
@@ -58,7 +58,7 @@ def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> M
 
 
 def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
-    """What stands for a match where no point is left: the prediction."""
+    """Match of a scan without a point left: the prediction."""
     return Match(
         T_target_source=prediction.T_odom_lidar,
         information=prediction.prior.information,
@@ -81,7 +81,7 @@ def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
 
 
 def blurred(match: Match, error: NDArray[np.float64]) -> Match:
-    """The same match with an error (k,), one standard deviation, that the points do not show."""
+    """The same match with an additional error (k,), one standard deviation, that the residuals do not show."""
     blur = np.diag(error**2)
     return replace(
         match, information=match.information @ np.linalg.inv(np.eye(len(blur)) + blur @ match.information)

@@ -1,4 +1,4 @@
-"""A raw scan made ready for matching: cropped, thinned out, freed of the lidar's own motion."""
+"""Preprocessing of a raw scan: cropping, downsampling, deskewing."""
 
 from scanchain.preprocess.resolution import Resolution
 from scanchain.preprocess.sweep import Sweep, downsample, sweep_of

@@ -1,4 +1,4 @@
-"""What is left of a scan to be matched, as measured: each point from where the lidar was at its own instant."""
+"""A cropped and downsampled scan as measured: each point from the lidar's pose at its own instant."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scanchain.kernels.voxels import downsample as kernels
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Points of a scan, one a voxel, and when each was measured.
+    """Points of a scan, one a voxel, with their times.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Sweep:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the lidar's motion is in the points."""
+        """True if the points are distorted by the lidar's motion."""
         return len(self.times_s) > 0
 
     @property
@@ -37,7 +37,7 @@ class Sweep:
         """Seconds from the first point to the last."""
         return float(np.ptp(self.times_s)) if self.is_distorted else 0.0
 
-    def thinned(self, voxel_m: float) -> Sweep:
+    def downsampled(self, voxel_m: float) -> Sweep:
         """The first point of every voxel of this size."""
         chosen = _first_per_voxel(self.points, voxel_m, 0.0, np.inf)
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s
@@ -49,7 +49,7 @@ class Sweep:
         velocity : (k,) twist per second in the lidar frame, constant through the scan
         Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
         alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
-        the other way, and so on for ever.
+        in the other direction, and so on.
         """
         if not self.is_distorted:
             return self.points
@@ -59,7 +59,7 @@ class Sweep:
 
 
 def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
-    """The scan cropped to the range that is used and thinned out, times left out where deskewing is off.
+    """The scan cropped to the range that is used and downsampled, times left out where deskewing is off.
 
     scale : of the voxels, 1 for ``preprocess.map_voxel_m``
     """

@@ -16,8 +16,8 @@ VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closu
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedClosure:
-    """A closure with its final verdict: by the matcher, or by the graph that it contradicts.
+class FinalClosure:
+    """A closure with its final verdict, by the matcher or by the graph.
 
     ``weight`` and ``chi2_after`` are what the optimizer left to its edge: 0 and NaN if it never became one, 1 and
     NaN until it is optimized.
@@ -31,19 +31,19 @@ class JudgedClosure:
 
     @property
     def rejected_by(self) -> str:
-        """Verification by matching, or the back end, which found it to contradict the graph; empty if accepted."""
+        """Verification by matching, or the back end where it contradicts the graph; empty if accepted."""
         if self.verdict is Verdict.ACCEPTED:
             return ""
         return BACK_END if self.closure.verdict is Verdict.ACCEPTED else VERIFICATION
 
 
-def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[JudgedClosure, ...]:
-    """Every closure with what became of its edge; those the graph contradicts are rejected after all.
+def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[FinalClosure, ...]:
+    """Every closure with its final verdict; those the graph contradicts are rejected.
 
     A closure accepted since the optimization that ``state`` comes from stays accepted.
     """
     edges = _loop_edges(state)
-    judged = []
+    final = []
     for closure in closures:
         verdict, reason, weight, chi2 = closure.verdict, closure.reason, 0.0, float("nan")
         if verdict is Verdict.ACCEPTED:
@@ -52,8 +52,8 @@ def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Judg
             if weight < REJECTED_WEIGHT:
                 verdict = Verdict.REJECTED
                 reason = f"contradicts the rest of the graph, χ² {chi2:.4g}"
-        judged.append(JudgedClosure(closure, verdict, reason, weight, chi2))
-    return tuple(judged)
+        final.append(FinalClosure(closure, verdict, reason, weight, chi2))
+    return tuple(final)
 
 
 def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[float, float]]]:
@@ -66,14 +66,14 @@ def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[f
 
 
 def write_closures(
-    path: Path, judged: Sequence[JudgedClosure], keyframes: Sequence[Keyframe], dimension: int
+    path: Path, final: Sequence[FinalClosure], keyframes: Sequence[Keyframe], dimension: int
 ) -> None:
     """Write every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     k = 3 if dimension == 2 else 6
-    closures = [item.closure for item in judged]
+    closures = [item.closure for item in final]
     matches = [closure.match for closure in closures]
     relative = np.array([match.T_target_source for match in matches])
     columns: dict[str, object] = {
@@ -84,12 +84,12 @@ def write_closures(
         "target_stamp_ns": pa.array([keyframes[closure.target].stamp_ns for closure in closures], pa.int64()),
         "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
         "proposed_by": pa.array([str(closure.proposed_by) for closure in closures], pa.string()),
-        "verdict": pa.array([str(item.verdict) for item in judged], pa.string()),
-        "rejected_by": pa.array([item.rejected_by for item in judged], pa.string()),
-        "reason": pa.array([item.reason for item in judged], pa.string()),
-        "weight": pa.array([item.weight for item in judged], pa.float64()),
+        "verdict": pa.array([str(item.verdict) for item in final], pa.string()),
+        "rejected_by": pa.array([item.rejected_by for item in final], pa.string()),
+        "reason": pa.array([item.reason for item in final], pa.string()),
+        "weight": pa.array([item.weight for item in final], pa.float64()),
         "chi2_before": pa.array([closure.chi2_before for closure in closures], pa.float64(), from_pandas=True),
-        "chi2_after": pa.array([item.chi2_after for item in judged], pa.float64(), from_pandas=True),
+        "chi2_after": pa.array([item.chi2_after for item in final], pa.float64(), from_pandas=True),
         **{
             name: pa.array(values, pa.float64())
             for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()

@@ -80,12 +80,12 @@ class RunDirectory:
             shutil.rmtree(self.path, ignore_errors=True)
 
     def worth_keeping(self) -> None:
-        """Let what there is stay, marked partial, even if the run fails."""
+        """Retain the directory, marked partial, even if the run fails."""
         self.is_worth_keeping = True
 
     @contextmanager
     def results(self) -> Iterator[Path]:
-        """A folder for files that are in the directory only once all of them are whole."""
+        """A folder for files that are moved into the directory once all of them are complete."""
         folder = self.path / _UNFINISHED
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()

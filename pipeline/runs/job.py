@@ -1,4 +1,4 @@
-"""A run's order: what to process, and the protocols of whoever watches it (progress) and records it (rerun)."""
+"""A run's job: log, configuration, and the protocols of its progress and its recorder."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from scanchain.settings import Override
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.closures import JudgedClosure
+    from scanchain.runs.closures import FinalClosure
     from scanchain.runs.step_table import StepRow
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A log to process, and how.
+    """A log to process, with configuration and outputs.
 
     Attributes
     ----------
@@ -69,15 +69,15 @@ class Progress(Protocol):
         ...
 
     def say(self, line: str) -> None:
-        """Show a line to a person who watches."""
+        """Show a line on a terminal only."""
         ...
 
-    def tell(self, line: str) -> None:
-        """Show a line to everyone, also into a pipe."""
+    def announce(self, line: str) -> None:
+        """Show a line on a terminal or in a pipe."""
         ...
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
-        """Pass the scans on, of which there should be ``count``, until they end or the user wants no more."""
+        """Pass the scans on, of which there should be ``count``, until they end or the user stops."""
         ...
 
 
@@ -89,7 +89,7 @@ class Unwatched:
     def say(self, line: str) -> None:
         """Show nothing."""
 
-    def tell(self, line: str) -> None:
+    def announce(self, line: str) -> None:
         """Show nothing."""
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
@@ -142,8 +142,8 @@ class Recorder(Protocol):
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         ...
 
-    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
-        """Record the final graph and the final verdict on every closure."""
+    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
+        """Record the closures graph and the closures verdict on every closure."""
         ...
 
     def log_ground_truth(self, poses: Matrix) -> None:
@@ -159,7 +159,7 @@ class Recorder(Protocol):
         ...
 
     def hold(self) -> None:
-        """Stay until the user is done looking, where the viewer lives in this process."""
+        """Keep the viewer served where it lives in this process, until the user closes it."""
         ...
 
 

@@ -13,23 +13,23 @@ from msgspec import Struct
 
 from scanchain.data import LEAST_FIT, State, Trajectory, fit_text
 from scanchain.errors import InputError
-from scanchain.evaluation import Pairs, absolute_error_on_any_course, kitti_error_on_any_course, pair
+from scanchain.evaluation import Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.absolute import far_off, path_length
-from scanchain.runs.closures import BACK_END, VERIFICATION, JudgedClosure
+from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
 from scanchain.runs.results import Cloud
 from scanchain.runs.step_table import STAGES, StepTable
 from scanchain.slam import SlamResult
 from scanchain.words import counted
 
-MOST_CONTRADICTED = 0.1  # share of the scans; on real logs that went well at most 0.025
-_FEW_POINTS = 100  # points; scans of lidars, planar ones included, have more
-_NOTICEABLE_S = 0.5  # compilation time below this is not reported
+MOST_CONTRADICTED = 0.1  # largest share of contradicted scans of a reliable run; good real runs have up to 0.025
+_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
 class Accuracy(Struct, frozen=True):
     """A trajectory against the ground truth; what the path is too short for is null.
 
-    Of the scans, ``pairs`` have a true pose; ``missing`` says how many have none and why, empty if all have.
+    Of the scans, ``pairs`` have a true pose; ``missing`` counts the others, with the reason, empty if all have.
     """
 
     pairs: int
@@ -47,7 +47,7 @@ class Accuracy(Struct, frozen=True):
 class GroundTruth(Struct, frozen=True):
     """Accuracy of a run against the ground truth, after and before optimization.
 
-    ``max_gap_s`` : between true poses to interpolate over, as it was asked for; null for the default
+    ``max_gap_s`` : between true poses to interpolate over, as requested; null for the default
     """
 
     source: str
@@ -69,7 +69,7 @@ class Metrics(Struct, frozen=True):
     No time but ``compile_s`` counts the compilation of kernels, which happens once after an installation.
     Closures tried = rejected by verification + verified; verified = rejected by the back end + accepted.
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
-    ``stopped`` says why the run did not see the whole log, of which these are the numbers up to there; else empty.
+    ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
     ``unreliable`` is the reason not to use the result as a whole, empty if there is none.
     ``warnings`` : data lost, skipped or wrong, a line each
@@ -147,7 +147,7 @@ def measure(
     steps: StepTable,
     result: SlamResult,
     cloud: Cloud,
-    judged: Sequence[JudgedClosure],
+    final: Sequence[FinalClosure],
     *,
     run_s: float,
     compile_s: float,
@@ -163,7 +163,7 @@ def measure(
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
-    rejected = Counter(item.rejected_by for item in judged)
+    rejected = Counter(item.rejected_by for item in final)
     return Metrics(
         scans=len(steps),
         dimension=result.trajectory.dimension,
@@ -179,9 +179,9 @@ def measure(
         degenerate=states[State.DEGENERATE],
         lost=states[State.LOST],
         keyframes=len(result.keyframes),
-        closures_tried=len(judged),
+        closures_tried=len(final),
         closures_rejected_by_verification=rejected[VERIFICATION],
-        closures_verified=len(judged) - rejected[VERIFICATION],
+        closures_verified=len(final) - rejected[VERIFICATION],
         closures_rejected_by_back_end=rejected[BACK_END],
         closures_accepted=rejected[""],
         map_points=len(cloud.points),
@@ -227,7 +227,7 @@ def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[
     return f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
 
 
-def judge(
+def compare_with_truth(
     result: SlamResult, reference: Trajectory, source: str, gap_s: float | None
 ) -> tuple[GroundTruth, list[str]]:
     """Accuracy of both trajectories of a result, and a line for each reason why it may mislead."""
@@ -266,9 +266,9 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
 
 
 def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
-    ate = absolute_error_on_any_course(pairs)
+    ate = absolute_error_of_any_path(pairs)
     try:
-        kitti = kitti_error_on_any_course(pairs)
+        kitti = kitti_error_of_any_path(pairs)
     except InputError:
         kitti = None
     accuracy = Accuracy(

@@ -16,7 +16,7 @@ from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.logs import Log
-from scanchain.runs.closures import JudgedClosure, final_verdicts
+from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.results import Cloud, record_results, results_of, write_results
@@ -35,7 +35,7 @@ class Processed:
 
     result: SlamResult
     cloud: Cloud
-    judged: tuple[JudgedClosure, ...]
+    final: tuple[FinalClosure, ...]
     warnings: tuple[str, ...]
     held_s: float
 
@@ -66,7 +66,7 @@ def process(
         closing(scans),  # what it left out is counted then, also if the run was stopped
     ):
         if recording.web_address:
-            progress.tell(f"viewer: {recording.web_address}")
+            progress.announce(f"viewer: {recording.web_address}")
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
         for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
             recording.log(step)
@@ -76,17 +76,17 @@ def process(
         if progress.stopped:
             checkpoints.write(slam, recording.secure())
         result = slam.finish(progress.say)
-        judged = final_verdicts(result.closures, result.state)
+        final = final_verdicts(result.closures, result.state)
         progress.say("building the maps and writing the results")
         with directory.results() as folder:
-            results = results_of(log, config, steps, result, judged)
+            results = results_of(log, config, steps, result, final)
             write_results(folder, results)
             record_results(recording, results)
             _record_truth(true_poses, job.max_gap_s, result, recording)
         slam.points.close()
         held_s = _hold(recording, progress)
         progress.say("writing the rest of the recording")
-    return Processed(result, results.cloud, judged, (*notes, *recording.warnings), held_s)
+    return Processed(result, results.cloud, final, (*notes, *recording.warnings), held_s)
 
 
 def _begin(
@@ -118,6 +118,6 @@ def _hold(recording: Recorder, progress: Progress) -> float:
     if not recording.web_address:
         return 0.0
     began = perf_counter()
-    progress.tell(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
+    progress.announce(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
     recording.hold()
     return perf_counter() - began

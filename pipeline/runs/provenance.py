@@ -37,7 +37,7 @@ class LogFile(Struct, frozen=True):
 
 
 class Provenance(Struct, frozen=True):
-    """Who made a run directory. ``complete`` is False while it is written and in one marked partial."""
+    """Origin of a run directory. ``complete`` is False while it is written and in one marked partial."""
 
     complete: bool
     stopped: str

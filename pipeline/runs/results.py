@@ -27,7 +27,7 @@ from scanchain.maps import (
     write_pcd,
     write_ply,
 )
-from scanchain.runs.closures import JudgedClosure, write_closures
+from scanchain.runs.closures import FinalClosure, write_closures
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
@@ -47,19 +47,19 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """Everything known after the last scan of a log: what the files of a run directory are written from."""
+    """Everything known after the last scan of a log: the input of the files of a run directory."""
 
     log: Log
     config: Config
     steps: StepTable
     result: SlamResult
-    judged: tuple[JudgedClosure, ...]
+    final: tuple[FinalClosure, ...]
     cloud: Cloud
     grid: OccupancyGrid
 
 
 class Output(NamedTuple):
-    """A file of a run directory: its name, its writer, and whether the configuration asks for it."""
+    """A file of a run directory: name, writer, and the condition on the configuration."""
 
     file: str
     write: Callable[[Path, Results], None]
@@ -84,7 +84,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
     Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
     Output(
         "loops.parquet",
-        lambda path, r: write_closures(path, r.judged, r.result.keyframes, r.result.trajectory.dimension),
+        lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
     ),
     Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory)),
     Output(  # after the maps, which it reads
@@ -96,14 +96,14 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
 
 
 def results_of(
-    log: Log, config: Config, steps: StepTable, result: SlamResult, judged: tuple[JudgedClosure, ...]
+    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[FinalClosure, ...]
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
-    return Results(log, config, steps, result, judged, cloud_of(result, config), grid_of(result, config.maps))
+    return Results(log, config, steps, result, final, cloud_of(result, config), grid_of(result, config.maps))
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write every output that is asked for into a run directory."""
+    """Write every requested output into a run directory."""
     for output in OUTPUTS:
         if output.is_wanted(results.config):
             output.write(folder / output.file, results)
@@ -114,7 +114,7 @@ def record_results(recording: Recorder, results: Results) -> None:
     trajectory, grid = results.result.trajectory, results.grid
     indices = np.arange(len(trajectory), dtype=np.int64)
     recording.log_trajectory(trajectory.stamps_ns, trajectory.poses, indices)
-    recording.log_closures(results.judged, results.result.state)
+    recording.log_closures(results.final, results.result.state)
     recording.log_map(results.cloud.points)
     if trajectory.dimension == 2:
         x_m, y_m = grid.origin_m.tolist()
@@ -127,7 +127,7 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
 
 
 def cloud_of(result: SlamResult, config: Config) -> Cloud:
-    """The cloud of all keyframes, without moving objects if the configuration says so."""
+    """The cloud of all keyframes, without moving objects if so configured."""
     dimension = result.trajectory.dimension
     built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
@@ -142,7 +142,7 @@ def cloud_of(result: SlamResult, config: Config) -> Cloud:
 
 
 def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
-    """The grid of all keyframes, coarser than asked for where the world is too large."""
+    """The grid of all keyframes, coarser than configured where the world is too large."""
     resolution_m = fitting_resolution(
         result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
     )

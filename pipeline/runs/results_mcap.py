@@ -52,7 +52,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
 
 
 def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
-    """A covariance (6, 6) as nav_msgs/Odometry tells it: x, y, z, and turns about the fixed axes of its frame.
+    """A covariance (6, 6) as in nav_msgs/Odometry: x, y, z, and turns about the fixed axes of its frame.
 
     covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); None, where a
         direction is undetermined, becomes zeros, which stand for unknown
@@ -77,8 +77,8 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, pose
         links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
         data = pack_transforms(row.stamp_ns, *links)
         writer.append("/tf", "tf2_msgs/msg/TFMessage", data, row.stamp_ns, row.log_time_ns)
-        told = None if covariance is None else adjoint @ covariance @ adjoint.T
-        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(told, T_odom_frame))
+        in_ros = None if covariance is None else adjoint @ covariance @ adjoint.T
+        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(in_ros, T_odom_frame))
         writer.append("/odometry", "nav_msgs/msg/Odometry", data, row.stamp_ns, row.log_time_ns)
 
 

@@ -28,7 +28,7 @@ from scanchain.runs.directory import (
     resumable,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress
-from scanchain.runs.metrics import GroundTruth, Metrics, judge, measure, summary
+from scanchain.runs.metrics import GroundTruth, Metrics, compare_with_truth, measure, summary
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
 from scanchain.runs.resume.journal import JOURNAL_FILE
@@ -51,7 +51,7 @@ def _no_report(folder: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A finished run; ``stopped`` is the reason why it did not see the whole log, empty if it did."""
+    """A finished run; ``stopped`` is the reason why it did not process the whole log, empty if it did."""
 
     path: Path
     metrics: Metrics
@@ -100,7 +100,7 @@ def run(
                 truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
                 warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
                 metrics = measure(
-                    steps, done.result, done.cloud, done.judged,
+                    steps, done.result, done.cloud, done.final,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
@@ -117,13 +117,13 @@ def run(
 def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
     """Announce that an earlier run is resumed, or that one exists and is not."""
     if left is not None:
-        progress.tell(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")
+        progress.announce(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")
     elif (idle := resumable(job.out)) is not None:
-        progress.tell(
+        progress.announce(
             f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over"
         )
     elif job.resume and (partial_names := left_without_checkpoint(job.out)):
-        progress.tell(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
+        progress.announce(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
 
 
 def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> None:
@@ -132,7 +132,7 @@ def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> N
 
 
 def _idle_keys(job: Job, log: Log) -> dict[str, str]:
-    """Keys without an effect on this job, and why."""
+    """Keys without an effect on this job, with the reason."""
     recording = {} if job.sinks else {f"recording.{name}": "no recording is made" for name in _RECORDING_KEYS}
     truth = {} if job.ground_truth is None else {"log.ground_truth_topic": "--gt names a file"}
     return log.idle_keys() | recording | truth
@@ -178,7 +178,7 @@ def _judge(
         reference = true_poses(result.trajectory.stamps_ns)
         if reference is None:
             return None, ()
-        truth, misleading = judge(result, reference, source, gap_s)
+        truth, misleading = compare_with_truth(result, reference, source, gap_s)
         write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)

@@ -18,7 +18,7 @@ from scanchain.evaluation import motion_nees, pair
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix that is not inverted
+_SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix below which it is not inverted
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A drive before it is recorded: the place, the motion, the lidar, and which scans there will be."""
+"""A drive before it is recorded: world, motion, lidar, and stamps of its scans."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds.registry import World, find_world
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
-PLACE, WANDER, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
-_HOLE_S = 1.0
+PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
+_DROPOUT_S = 1.0
 _LONGEST_S = 36_000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What a log is recorded from.
+    """A drive to record.
 
     Attributes
     ----------
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
-    scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into holes
+    scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
     """
 
     solids: Solids
@@ -62,7 +62,9 @@ def plan(
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
     solids = place.build(random_numbers(seed, PLACE))
-    motion = place.motion(solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, WANDER))
+    motion = place.motion(
+        solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, DEVIATION)
+    )
     return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, _recorded(place, motion, lidar, count))
 
 
@@ -80,17 +82,17 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
-    """All scans but those in the holes: one second each, centered on the first moment nearest to its place."""
+    """All scans outside the dropouts: one second each, centered on the first moment nearest to its location."""
     scans = np.arange(count)
-    lacking = round(_HOLE_S * 1e9 / sensor.period_ns)
+    lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
     kept = np.ones(count, dtype=bool)
-    for first in _passed(world.holes, motion, scans * (sensor.period_ns * 1e-9)):
+    for first in _passed(world.dropouts, motion, scans * (sensor.period_ns * 1e-9)):
         kept[max(first - lacking // 2, 0) :][:lacking] = False
     return scans[kept]
 
 
 def _passed(places: Sequence[tuple[float, float]], motion: Motion, times_s: NDArray[np.floating]) -> list[int]:
-    """Index of the instant at which each place is first passed, for those that are."""
+    """Index of the instant at which each location is first passed, for those that are."""
     if not places:
         return []
     path = motion.base(times_s)[:, :2, 3]

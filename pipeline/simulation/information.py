@@ -29,11 +29,11 @@ def information(solids: Solids, T_world_lidar: Pose, sensor: Sensor, *, index: i
 
 
 def spectrum(information: Matrix) -> tuple[NDArray[np.float64], Matrix]:
-    """Shares (6,) of the returns that speak about each direction, least first, and the directions (6, 6) as rows.
+    """Shares (6,) of the returns that constrain each direction, least first, and the directions (6, 6) as rows.
 
     Rotations are measured by what they do to the returns: H is scaled by L = √(Σ|p × n|² / N), N = Σ|n|², so that
     the twist of every row, in meters and radians, moves the returns by about a meter. Shares do not depend on the
-    number of returns nor on units; a share of 1e-4 means that H knows the direction as well as it would if one
+    number of returns nor on units; a share of 1e-4 means that H constrains the direction as well as if one
     return in ten thousand faced it squarely.
     """
     count, levers = np.trace(information[:3, :3]), np.trace(information[3:, 3:])
@@ -45,13 +45,13 @@ def spectrum(information: Matrix) -> tuple[NDArray[np.float64], Matrix]:
 
 
 def undetermined(information: Matrix, *, share: float = 1e-6) -> Matrix:
-    """Twists (K, 6) in the lidar's frame along which fewer than that ``share`` of the returns say anything."""
+    """Twists (K, 6) in the lidar's frame that less than that ``share`` of the returns constrains."""
     shares, twists = spectrum(information)
     return twists[shares < share]
 
 
 def surface_normals(places: Matrix, solid_of_place: NDArray[np.int32], solids: Solids) -> Matrix:
-    """Outward unit normals (N, 3), world frame, at places (N, 3) on the solids they lie on.
+    """Outward unit normals (N, 3), world frame, at points (N, 3) on the solids they lie on.
 
     solid_of_place : (N,) as from ``Solids.strike``: counted through boxes, cylinders, ellipsoids, the ground last
     """

@@ -37,9 +37,9 @@ def simulate(
 
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
-    of every scan, exact) and /tf_static (T_base_lidar); in the holes of a world, /odom alone goes on. ``drift``
+    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
-    ``progress`` is told scans done and scans in all.
+    ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
@@ -57,7 +57,7 @@ def simulate(
         wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
         for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
             stamp_ns = int(truth.stamps_ns[done])
-            wheels.write_until(stamp_ns - 1)  # in a hole
+            wheels.write_until(stamp_ns - 1)  # in a dropout
             log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
             wheels.write_until(stamp_ns + period_ns)
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
@@ -84,7 +84,7 @@ def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
 
 
 class _Wheels:
-    """Writes the wheel odometry as the log's clock goes on."""
+    """Writer of the wheel odometry up to the log's present time."""
 
     def __init__(
         self, log: LogWriter, motion: Motion, end_ns: int, drift: float, rng: np.random.Generator

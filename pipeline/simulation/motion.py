@@ -14,22 +14,22 @@ from scanchain.simulation.solids import Solids
 
 _HERTZ = {2: 1.3, 3: 0.9, 4: 1.1, 1: 0.8, 5: 0.6}  # of the sway, by twist axis
 
-_SCALE_SHARE = 0.01  # of the distance: wheels are not as large as believed
-_TURN_SHARE = 0.02  # of the angle: nor as far apart
-_BIAS_RAD_PER_M = 0.0005  # one wheel is larger than the other
-_NOISE_M = 0.01  # slip along the way, per √m
+_SCALE_SHARE = 0.01  # error of the distance as a share: wheels are not as large as assumed
+_TURN_SHARE = 0.02  # error of the angle as a share: nor as far apart
+_BIAS_RAD_PER_M = 0.0005  # turn for each meter, as one wheel is larger than the other
+_NOISE_M = 0.01  # slip along the path, per √m
 _NOISE_RAD = 0.004  # slip in heading, per √m
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """How a robot, a car or a walking person moves, and where the lidar sits.
+    """Kinematics of a robot, a car or a walking person, and the mounting of the lidar.
 
     Attributes
     ----------
-    speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the way and in bends
+    speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the path and in bends
     corner_m : standard deviation of the smoothing that rounds the route; a right angle gets 0.9 of it as radius
-    wander_m : how far it strays from the route, differently on every lap
+    deviation_m : how far it strays from the route, differently on every lap
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
     radius_m : half its width
     T_base_lidar : (4, 4)
@@ -42,7 +42,7 @@ class Vehicle:
     acceleration_m_s2: float
     lateral_acceleration_m_s2: float
     corner_m: float
-    wander_m: float
+    deviation_m: float
     sway_rad: float
     heave_m: float
     radius_m: float

@@ -44,7 +44,7 @@ class Laps:
         self._solids = solids
         phases = rng.uniform(0.0, 2.0 * np.pi, 3)
         reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
-        line = _wander(_densify(route, reach_m, 0.02 * vehicle.corner_m), vehicle, rng)
+        line = _deviate(_densify(route, reach_m, 0.02 * vehicle.corner_m), vehicle, rng)
         self._phases = np.concatenate([phases, rng.uniform(0.0, 2.0 * np.pi, 2)])
         smooth = gaussian_filter1d(line, 50.0, axis=0, mode="nearest")
         arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
@@ -83,14 +83,14 @@ def _densify(route: Matrix, reach_m: float, step_m: float) -> Matrix:
     return np.stack([np.interp(along_m, corners_m, column) for column in lap.T], axis=1)
 
 
-def _wander(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix:
-    """The line shifted by slow waves, at most ``wander_m`` in x and in y."""
+def _deviate(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix:
+    """The line shifted by slow waves, at most ``deviation_m`` in x and in y."""
     place = np.arange(len(line)) / 50.0  # in units of corner_m
     shift = np.zeros_like(line)
     for axis in (0, 1):
         for wavelength in rng.uniform(8.0, 30.0, 3):
             shift[:, axis] += np.sin(2.0 * np.pi * (place / wavelength + rng.uniform())) / 3.0
-    return line + vehicle.wander_m * shift
+    return line + vehicle.deviation_m * shift
 
 
 def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, duration_s: float) -> BSpline:
@@ -119,7 +119,7 @@ class Pivot(NamedTuple):
 
 
 class Pivots:
-    """A dance from the origin, heading along x: ``steps`` that end as they began, over and over again."""
+    """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
 
     def __init__(
         self,

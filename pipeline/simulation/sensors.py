@@ -122,7 +122,7 @@ class Sweep:
 
     @property
     def returned(self) -> NDArray[np.bool_]:
-        """(N,) whether a ray came back."""
+        """(N,) True for every ray that came back."""
         return np.isfinite(self.ranges_m)
 
     def points(self) -> RawPoints:

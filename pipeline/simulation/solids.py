@@ -1,4 +1,4 @@
-"""What a world is made of, and the scenery it is built up in."""
+"""Solids of a simulated world, and its construction."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Solids:
     ground: NDArray[np.float64]
 
     def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
-        """Height of the ground at (..., 2) places."""
+        """Height of the ground at (..., 2) positions."""
         return _height(self.ground, xy)
 
     def ground_slope(self, xy: Matrix) -> Matrix:
-        """Gradient of the ground at (..., 2) places."""
+        """Gradient of the ground at (..., 2) positions."""
         g = self.ground
         along_x = g[1] * g[2] * np.cos(g[2] * xy[..., 0] + g[3])
         along_y = g[4] * g[5] * np.cos(g[5] * xy[..., 1] + g[6])
@@ -53,7 +53,7 @@ class Solids:
     def strike(
         self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Range along each ray as in ``cast``, and which solid it hit, −1 where none.
+        """Range along each ray as in ``cast``, and the index of the solid it hit, −1 where none.
 
         Solids are counted through boxes, cylinders, ellipsoids, the ground last.
         """
@@ -68,7 +68,7 @@ class Solids:
         return ranges_m, solid_of_ray
 
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
-        """Distance in the plane from (N, 2) places to the nearest solid that begins less than ``below_m`` up."""
+        """Distance in the plane from (N, 2) positions to the nearest solid that begins below ``below_m``."""
         nearest = np.full(len(xy), np.inf)
         for cx, cy, half_x, half_y, _, _, c, s in self._low(self.boxes, 4, below_m):
             dx, dy = xy[:, 0] - cx, xy[:, 1] - cy

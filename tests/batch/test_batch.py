@@ -88,7 +88,7 @@ def test_of_8_logs_two_are_poison_and_6_have_results_and_a_second_call_runs_only
         assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
         assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
     assert "8: 6 done, 1 crashed, 1 out of memory" in output
-    assert errors == f"error: 2 of 8 logs have no result; {out}/summary.txt says why\n"
+    assert errors == f"error: 2 of 8 logs have no result; {out}/summary.txt has the reason\n"
 
     assert main(words) == 1  # only the two are tried again
     assert made(out) == first and "6 results from before" in capfd.readouterr()[0]
@@ -134,7 +134,7 @@ def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run
     assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("unreliable", "done")
     assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
     assert len(first) == 2 and "2: 1 done, 1 unreliable" in output
-    assert errors == f"error: 1 of 2 logs are unreliable; {out}/summary.txt says why\n"
+    assert errors == f"error: 1 of 2 logs are unreliable; {out}/summary.txt has the reason\n"
     assert f"{radar} is unreliable" in (out / "report.html").read_text()
     assert main(words) == 1
     assert made(out) == first and "2 results from before" in capfd.readouterr()[0]

@@ -30,7 +30,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
-from scanchain.runs.closures import JudgedClosure, final_verdicts
+from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
@@ -109,7 +109,7 @@ def revisits(poses: Matrix, traveled_m: NDArray[np.float64]) -> tuple[NDArray[np
     return revisit, opposite
 
 
-def is_true(item: JudgedClosure, poses: Matrix) -> bool:
+def is_true(item: FinalClosure, poses: Matrix) -> bool:
     """Whether a closure says what the truth says."""
     closure = item.closure
     truth = lie.inverse(poses[closure.target]) @ poses[closure.source]
@@ -117,7 +117,7 @@ def is_true(item: JudgedClosure, poses: Matrix) -> bool:
     return bool(np.linalg.norm(error[:3, 3]) <= TRUE_M) and float(lie.rotation_angle(error)) <= TRUE_RAD
 
 
-def _found(accepted: list[JudgedClosure], traveled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _found(accepted: list[FinalClosure], traveled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     sources = traveled_m[[item.closure.source for item in accepted]]
     return np.any(np.abs(traveled_m[:, None] - sources) <= ALONG_M, axis=1)
 

@@ -75,9 +75,9 @@ def try_wrong_loops(path, share, kind, seed, robust="truncated"):
     """Optimize with and without them."""
     clean = read_g2o(path).graph
     clean.optimize(GraphConfig())
-    alone = read_g2o(path, loops="suspect").graph
+    alone = read_g2o(path, loops="robust").graph
     alone.optimize(GraphConfig(robust=robust))
-    graph = read_g2o(path, loops="suspect").graph
+    graph = read_g2o(path, loops="robust").graph
     is_wrong = add_wrong_loops(graph, share, kind, np.random.default_rng(seed))
     answer = graph.optimize(GraphConfig(robust=robust))
     rejected = np.empty(len(is_wrong), bool)

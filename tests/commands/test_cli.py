@@ -1035,7 +1035,7 @@ def test_optimize_prints_what_it_did_and_writes_the_graph(call, tmp_path, ring):
 def test_optimize_rejects_a_false_edge_when_told_to_be_suspicious(call, tmp_path, ring):
     ring.write_text(ring.read_text() + "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n")
     trusting = json.loads(call("optimize", ring, "--json")[1])
-    assert trusting["suspected"] == 0 and trusting["rejected"] == [] and trusting["chi2_after"] > 1000.0
+    assert trusting["robust_edges"] == 0 and trusting["rejected"] == [] and trusting["chi2_after"] > 1000.0
     code, output, _ = call("optimize", ring, "--robust", "truncated")
     assert code == 0
     says(output, "rejected       1 of 3 loop edges")

@@ -11,9 +11,9 @@ import pytest
 
 from scanchain import lie
 from scanchain.__main__ import main
+from scanchain.comparison.assessment import unreliable_by_itself
 from scanchain.comparison.compare import Comparison, compare
 from scanchain.comparison.figures import COLUMNS, Figures
-from scanchain.comparison.judging import unreliable_by_itself
 from scanchain.comparison.methods import OURS, default_names, resolve
 from scanchain.comparison.outcome import EndReport, Outcome, Status
 from scanchain.comparison.processes import run_all

@@ -13,7 +13,7 @@ from scanchain.evaluation import (
     Alignment,
     absolute_error,
     kitti_error,
-    kitti_error_on_any_course,
+    kitti_error_of_any_path,
     on_the_estimate,
     pair,
     read_relations,
@@ -193,8 +193,8 @@ def test_the_kitti_metric_of_a_real_drive_is_that_of_the_development_kit(publish
 
 def test_short_paths_are_judged_over_short_lengths(pairs):
     short = pair(disturbed(drive(65)), drive(65))
-    assert kitti_error_on_any_course(short) == kitti_error(short, (10.0, 20.0, 40.0), every=1)
-    error = kitti_error_on_any_course(pairs)
+    assert kitti_error_of_any_path(short) == kitti_error(short, (10.0, 20.0, 40.0), every=1)
+    error = kitti_error_of_any_path(pairs)
     assert error == kitti_error(pairs)
     assert [part.length_m for part in error.by_length] == [100.0 * k for k in range(1, 9)]
     assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6

@@ -16,7 +16,7 @@ def with_false_loops(name, share, seed=0):
     path = shared_data(f"graphs/{name}.g2o")
     true = read_g2o(path).graph
     true.optimize(GraphConfig())
-    graph = read_g2o(path, loops="suspect").graph
+    graph = read_g2o(path, loops="robust").graph
     rng = np.random.default_rng(seed)
     count = int(share * graph.is_loop.sum())
     pairs = rng.integers(0, len(graph), (count, 2))

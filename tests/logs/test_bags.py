@@ -159,7 +159,7 @@ def test_a_chunk_of_a_bag_that_claims_to_be_huge_is_not_believed(tmp_path):
     content[place : place + 4] = struct.pack("<I", 2**32 - 1)
     path.write_bytes(content)
     log = open_log(path)
-    assert 50 <= len(list(log.scans())) < 60 and "4294967295 bytes, more than is believed" in log.damage[0]
+    assert 50 <= len(list(log.scans())) < 60 and "4294967295 bytes, more than is accepted" in log.damage[0]
 
 
 def test_an_encrypted_bag_says_so(tmp_path):

@@ -207,7 +207,7 @@ def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_p
 
     path = saved(tmp_path, drive(ranges=ranges))
     finding = diagnose(path)["no return"]
-    assert finding.severity == "warning" and "15 % of the beams tell exactly 29.99 m" in finding.found
+    assert finding.severity == "warning" and "15 % of the beams have exactly 29.99 m" in finding.found
     flag, value = finding.remedy.split()
     assert flag == "--log.max_range_m" and 29.98 < float(value) < np.float32(29.99)
     assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"
@@ -427,7 +427,7 @@ def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd)
     finding = diagnose(path)["sensors"]
     assert finding.severity == "ok"
     assert finding.found.split("; ") == [
-        "GNSS /fix: not used", "ground truth /ground_truth: judges the result, is not used for it",
+        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
     ]  # fmt: skip
     assert main(["info", str(path)]) == 0
@@ -450,7 +450,7 @@ def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, cap
     assert main(["info", str(path)]) == 0
     text = capfd.readouterr().out
     assert "several lidar topics" in text and "wheels    /odom\n" in text
-    assert "sensor    ground truth /ground_truth: judges the result, is not used for it\n" in text
+    assert "sensor    ground truth /ground_truth: evaluates the result, is not used for it\n" in text
 
 
 # The whole

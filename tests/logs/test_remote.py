@@ -66,7 +66,7 @@ def test_an_index_by_the_summary_is_that_of_walking_the_file(site, log_file):
     assert len(site.asked) == 2 and site.sent <= 65_537  # the last byte, and the tail
     checked = [replace(block, crc=asked.stored(block)[1]) for block in asked.blocks]
     assert checked == walked.blocks and all(block.crc for block in checked)
-    assert (asked.channels, asked.counts, asked.is_trusted) == (walked.channels, walked.counts, True)
+    assert (asked.channels, asked.counts, asked.is_consistent) == (walked.channels, walked.counts, True)
 
 
 def test_scans_and_truth_are_those_of_the_file_and_every_byte_is_fetched_once(site, log_file):
@@ -224,7 +224,7 @@ def test_a_broken_line_is_tried_again(site, log_file, impatient):
 def test_a_line_that_stays_broken_is_an_error_that_names_the_byte_and_what_there_is_can_be_gone_on_with(
     site, log_file, tmp_path, impatient, monkeypatch, capfd
 ):
-    monkeypatch.setattr(read_ahead, "_PIECE_BYTES", 100_000)
+    monkeypatch.setattr(read_ahead, "_PART_BYTES", 100_000)
     words = [
         "run",
         site.log,
@@ -248,7 +248,9 @@ def test_a_line_that_stays_broken_is_an_error_that_names_the_byte_and_what_there
     site.answer = breaking
     assert main(words) == 2
     error = capfd.readouterr()[1].splitlines()[-1]
-    assert error.startswith(f"error: {site.log}: byte ") and "(503 Service Unavailable); asked 4 times" in error
+    assert (
+        error.startswith(f"error: {site.log}: byte ") and "(503 Service Unavailable); requested 4 times" in error
+    )
     site.answer = answer
     assert main([*words, "--resume"]) == 0
     assert main(["run", str(log_file), *words[2:3], str(tmp_path / "local"), *words[4:]]) == 0
@@ -261,7 +263,7 @@ def test_a_line_that_stays_broken_is_an_error_that_names_the_byte_and_what_there
     [
         ("{url}/logs/none.mcap", r"none\.mcap: no such file; check the address \(404"),
         ("{url}/forbidden.mcap", r"forbidden\.mcap: may not be read; .*\(403"),
-        ("http://nowhere.invalid/log.mcap", r"log\.mcap: cannot be read \(.*nowhere\.invalid.*asked 4 times"),
+        ("http://nowhere.invalid/log.mcap", r"log\.mcap: cannot be read \(.*nowhere\.invalid.*requested 4 times"),
         ("foo://bucket/log.mcap", r"log\.mcap: Protocol not known: foo; give a path, s3:// or https://"),
         ("gs://bucket/log.mcap", r"log\.mcap: .*install gcsfs"),
         ("{url}/empty.mcap", r"empty\.mcap: is empty"),

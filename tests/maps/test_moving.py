@@ -91,10 +91,10 @@ def test_sight_equals_naive(shape):
 def test_points_outside_the_spans_and_those_seen_often_enough_are_left_alone():
     points, ranges_m = np.tile([5.0, 0.0, 0.0], (3, 1)), np.full((90, 180), FAR)
     nearest_ranges(points[:1], ranges_m)
-    seen, looked_through = np.array([0, 3, 0], np.int32), np.zeros(3, np.int32)
+    seen, seen_through = np.array([0, 3, 0], np.int32), np.zeros(3, np.int32)
     limits = np.array([15.0, 1.0, 0.3, 0.03, 0.2, 0.01])
-    weigh_points(points, np.array([[0, 2]]), np.eye(4), ranges_m, limits, 3, seen, looked_through)
-    assert seen.tolist() == [1, 3, 0] and not looked_through.any()
+    weigh_points(points, np.array([[0, 2]]), np.eye(4), ranges_m, limits, 3, seen, seen_through)
+    assert seen.tolist() == [1, 3, 0] and not seen_through.any()
 
 
 def test_a_pole_before_a_far_wall_stands_though_most_rays_pass_it():

@@ -1,4 +1,4 @@
-"""Scans made ready for matching: cropped, thinned out, and seen from one place."""
+"""Scans made ready for matching: cropped, downsampled, deskewed."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_points_are_seen_from_the_middle_at_constant_velocity(dimension):
 
 def test_a_thinned_sweep_keeps_the_times_of_its_points():
     sweep = sweep_of(some_scan(), CONFIG)
-    thin = sweep.thinned(4.0)
+    thin = sweep.downsampled(4.0)
     assert 10 < len(thin.points) < len(sweep.points)
     assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
     place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
@@ -57,7 +57,7 @@ def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_tim
     sweep = sweep_of(some_scan(with_times=with_times), config)
     assert not sweep.is_distorted and sweep.middle_s == 0.0
     assert np.array_equal(sweep.from_middle(np.ones(6)), sweep.points)
-    assert not sweep.thinned(4.0).is_distorted
+    assert not sweep.downsampled(4.0).is_distorted
 
 
 def box_scan(half_m, n=60_000, seed=0):
@@ -71,7 +71,7 @@ def box_scan(half_m, n=60_000, seed=0):
 def test_voxels_are_small_where_the_place_is_narrow_and_enough_points_are_matched(half_m, scale):
     resolution = Resolution(PreprocessConfig(match_points=2000), 1.0)
     for k in range(5):
-        sweep, sparse = resolution.look(box_scan(half_m, seed=k))
+        sweep, sparse = resolution.downsampled(box_scan(half_m, seed=k))
     assert resolution.scale == scale
     assert len(sweep.points) == len(
         naive.first_per_voxel(box_scan(half_m, seed=4).points, 0.5 * scale, 0.5, 100.0)
@@ -84,24 +84,24 @@ def test_voxels_are_small_where_the_place_is_narrow_and_enough_points_are_matche
 
 def test_voxels_change_when_the_place_does_and_not_for_a_glance():
     resolution = Resolution(PreprocessConfig(), 1.0)
-    resolution.look(box_scan(6.0))
+    resolution.downsampled(box_scan(6.0))
     assert resolution.scale == 0.5
     for half_m in (4.5, 9.0, 6.0):
-        resolution.look(box_scan(half_m))
+        resolution.downsampled(box_scan(half_m))
         assert resolution.scale == 0.5
-    resolution.look(box_scan(30.0))
+    resolution.downsampled(box_scan(30.0))
     assert resolution.scale == 1.0
 
 
 def test_the_plane_keeps_the_voxels_of_its_preset():
     resolution = Resolution(configured(2).preprocess, 0.1)
-    resolution.look(scan_of(np.random.default_rng(0).uniform(-1.0, 1.0, (500, 2))))
+    resolution.downsampled(scan_of(np.random.default_rng(0).uniform(-1.0, 1.0, (500, 2))))
     assert (resolution.scale, resolution.match_voxel_m) == (1.0, 0.01)
 
 
 def test_a_scan_without_a_point_in_range_leaves_the_voxels_alone():
     resolution = Resolution(PreprocessConfig(), 1.0)
-    sweep, sparse = resolution.look(scan_of(np.zeros((10, 3))))
+    sweep, sparse = resolution.downsampled(scan_of(np.zeros((10, 3))))
     assert len(sweep.points) == len(sparse.points) == 0
-    resolution.look(box_scan(2.5))
+    resolution.downsampled(box_scan(2.5))
     assert resolution.scale == 0.25

@@ -192,7 +192,7 @@ class Telling(Unwatched):
     def say(self, line):
         self.lines.append(line)
 
-    tell = say
+    announce = say
 
     def track(self, scans, count):
         yield from scans

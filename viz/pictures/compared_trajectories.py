@@ -15,7 +15,7 @@ from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, c
 
 
 def read_trajectories(directory: Path) -> list[DrawnTrajectory]:
-    """One a method that began, in the order of the table, of the first run that came furthest."""
+    """Trajectory of each method that began, in the order of the table, of its longest run."""
     scans, file = pq.read_table(directory / SCANS_FILE), directory / RELATIONS_FILE
     relations = pq.read_table(file) if file.exists() else None
     rows = read_table(directory).rows
@@ -47,7 +47,7 @@ def _of(table: pa.Table, method: str) -> pa.Table:
 
 
 def _furthest(repeats: NDArray[np.int64]) -> int:
-    """The run with most scans, the first of several."""
+    """Index of the run with most scans, the first of several."""
     return int(np.argmax(np.bincount(repeats))) if len(repeats) else 0
 
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 _WIDTH = 4.6  # inches
 INK, LINE = "#010203", "#040506"  # stand for the page's own colors; nothing else is drawn in these
 _VARIABLES = {INK: "var(--ink)", LINE: "var(--line)"}
-_DPI = 140  # of what is drawn as pixels
+_DPI = 140  # dots an inch of what is drawn as pixels
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
-_LOWEST, _HIGHEST = 1.5, 5.2  # inches of a plan
+_LOWEST, _HIGHEST = 1.5, 5.2  # least and greatest height of a plan in inches
 _SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.size": 8.0,
@@ -47,7 +47,7 @@ class SvgFigure:
     """One figure with one pair of axes; a context, inside which ``axes`` is drawn on.
 
     height_inches : of the whole figure
-    name : tells its parts from those of other figures on the same page
+    name : prefix of the ids of its parts on a page
     """
 
     def __init__(self, name: str, height_inches: float = 2.7) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 BEFORE, AFTER, _TRUTH = "#e07b00", "#1f5fd0", "#1a1a1a"
 _FRAME = "#cccccc"
 _ACROSS = 4  # panels of factors in a row
-_PIXELS = 500  # of a picture of a factor, at most
+_PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _TITLE = {"loc": "left", "fontsize": 11}
 
@@ -74,7 +74,7 @@ def svg_after(study: Study, number: int) -> Markup:
 
 
 def svg_factor(method: MethodResult, number: int) -> Markup:
-    """Where the factor of a method is not zero."""
+    """Sparsity of a method's factor."""
     with SvgFigure(f"{method.method}{number}", 4.4) as figure:
         _draw_factor(figure.axes, method, "")
         figure.axes.set_title("", loc="left")
@@ -82,7 +82,7 @@ def svg_factor(method: MethodResult, number: int) -> Markup:
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
-    """Draw where the factor of every method is not zero, to a PNG; several problems stand side by side.
+    """Draw the nonzero entries of every method's factor to a PNG; several problems stand side by side.
 
     The place of a method that a problem was not solved by stays empty.
     """
@@ -106,7 +106,7 @@ def draw_factors(path: Path, studies: Sequence[Study]) -> None:
 
 
 def _frame(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what must be seen, and a margin."""
+    """Corners of the required view, with a margin."""
     parts = [study.true_poses, study.true_landmarks]
     for estimate in (study.before, study.after):
         parts += list(_in_truth(estimate))

@@ -16,7 +16,7 @@ _POINTS = "#808893"
 _MAX_POINTS = 120_000
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
-_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; how many times its size a point may lie outside of these
+_BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
 
 
 def surroundings(low: Floats, high: Floats, clouds: Sequence[Points]) -> tuple[Floats, Floats]:
@@ -66,7 +66,7 @@ def _draw_points(figure: SvgFigure, points: Points, low: Floats, high: Floats, *
 
 
 def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
-    """(H, W, 4), clear where nothing is, the fuller the more points there are, colored as the highest of them."""
+    """(H, W, 4), clear where nothing is, opacity by the number of points, color by the highest of them."""
     from matplotlib import colormaps
     from matplotlib.colors import to_rgba
 

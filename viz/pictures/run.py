@@ -28,7 +28,7 @@ _WIDTH_INCHES = 8.0
 _MAX_POINTS = 400_000
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
 _POINTS = "#8a8f98"
-_FREE, _OCCUPIED = 35, 65  # percent; what is below is drawn white, above dark
+_FREE, _OCCUPIED = 35, 65  # per cent of occupancy below which a cell is drawn white, and above which dark
 _UNKNOWN = 0.90
 
 
@@ -81,7 +81,7 @@ def draw_map(
 def _frame(
     paths: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what must be seen: every trajectory, the map without outliers, and a margin."""
+    """Corners of the required view: every trajectory, the map without outliers, and a margin."""
     corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
     if points is not None and len(points):
         corners.append(np.array(extent(points[:, :2])))
@@ -172,8 +172,8 @@ def draw_run(directory: Path, picture: Path) -> None:
     truth_file = directory / TRUTH_FILE
     truth = None
     if truth_file.exists():
-        judged = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
-        truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=judged.get("max_gap_s"))
+        accuracy = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
+        truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
     try:
         draw_map(
             picture,

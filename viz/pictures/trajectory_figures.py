@@ -1,4 +1,4 @@
-"""Figures of trajectories: where they went, their errors, time per scan, consistency and observability."""
+"""Figures of trajectories: paths, errors, time per scan, consistency and observability."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _COLORS = (
     "#b0413e", "#5f8f57",
 )  # fmt: skip
 
-TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never one of theirs
+TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never the color of a method
 CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what it is called and its line's color
     VERIFICATION: ("rejected by verification", "#8a6d5b"),
     BACK_END: ("rejected by the back end", "#0f9bb5"),
@@ -82,14 +82,14 @@ def color_of(place: int) -> str:
     return _COLORS[place % len(_COLORS)]
 
 
-_MAX_POINTS = 1500  # of a line
-_WINDOWS = 250  # that a value a scan is averaged over
+_MAX_POINTS = 1500  # largest number of points of a line
+_WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _MARGIN = 0.25
 _FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
 _TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 3))}
-_LOWEST, _HIGHEST = 0.01, 1000.0  # observability is clipped to these
+_LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
 _BAR_INCHES = 0.65  # of a color bar and its numbers
 
 
@@ -142,7 +142,7 @@ def error_over_distance(name: str, trajectories: Sequence[DrawnTrajectory]) -> M
 def distribution(
     name: str, trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str
 ) -> Markup:
-    """Share below a value, which is shown up to the 99.5th percentile of the worst trajectory."""
+    """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
     with SvgFigure(name) as figure:
         ends = []
         for trajectory in _known(trajectories, key):

@@ -2,5 +2,5 @@
 
 import os
 
-# what cannot be written is told in our words; the library's own lines on it would come in between, in color
+# errors of writing are our own warnings; the library's own lines on it would come in between, in color
 os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off")

@@ -19,7 +19,7 @@ from scanchain.viz.recording.messages import Message, Times
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
-_BLIND = 1e-3  # observability; less is drawn as that
+_LEAST_DRAWN = 1e-3  # least observability that is drawn
 _WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
 
 
@@ -87,11 +87,11 @@ class Batcher:
             *self._trails(times, odom, world),
             *_matches([step.match for step in steps], times),
             Message(entities.TIME, _times_by_stage(steps), times),
-            *self._judged(steps, verdicts, times),
+            *self._states(steps, verdicts, times),
         ]
 
     def settled(self, verdicts: Verdicts, times: Times) -> list[Message]:
-        """The verdicts after the last step, whose ``times`` these are; the numbers in any case, up to there."""
+        """The verdicts after the last step, at its ``times``; their numbers in any case."""
         self.closures = None
         return [
             *_events([[(_INFORMATION, text) for text in verdicts.events]], times),
@@ -127,15 +127,15 @@ class Batcher:
             messages.append(Message(entities.ODOM, shapes.transforms(corrections[changed]), times[changed]))
         return messages
 
-    def _judged(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
-        """The state where it changes, and as events why, with the verdicts on loop closures."""
+    def _states(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
+        """The state where it changes, with the reason as an event, and the verdicts on loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state
         events: list[list[tuple[str, str]]] = []
-        for step, is_new, judged in zip(steps, changed, verdicts, strict=True):
+        for step, is_new, verdict in zip(steps, changed, verdicts, strict=True):
             why = [(_WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
-            events.append([*why, *((_INFORMATION, text) for text in judged.events)])
+            events.append([*why, *((_INFORMATION, text) for text in verdict.events)])
         messages = [*_events(events, times), *self._counts(verdicts, times)]
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
@@ -144,7 +144,7 @@ class Batcher:
 
     def _counts(self, verdicts: list[Verdicts], times: Times) -> list[Message]:
         """Numbers of accepted and rejected closures, where they change."""
-        counts = [(judged.accepted, judged.rejected) for judged in verdicts]
+        counts = [(verdict.accepted, verdict.rejected) for verdict in verdicts]
         before = [self.closures, *counts[:-1]]
         changed = np.array([now != then for now, then in zip(counts, before, strict=True)])
         self.closures = counts[-1]
@@ -177,7 +177,7 @@ def _matches(matches: list[Match], times: Times) -> list[Message]:
                 match.inliers,
                 match.inlier_share,
                 match.residual_m,
-                math.log10(max(match.observability, _BLIND)),
+                math.log10(max(match.observability, _LEAST_DRAWN)),
                 match.iterations,
             )
             for match in matches

@@ -24,7 +24,7 @@ from scanchain.viz.recording.sinks import write_recording
 
 RECORDING_FILE = "compare.rrd"
 _MAP_POINTS = 60_000
-_HEADROOM = 1.2  # over the 99th percentile
+_HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
 _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 
@@ -122,7 +122,7 @@ def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
 
 
 def _stamps(directory: Path) -> np.ndarray:
-    """(N,) of all scans, from the method that came furthest."""
+    """(N,) of all scans, from the method with the most."""
     table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
     indices, first = np.unique(table["index"].to_numpy(), return_index=True)
     return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)

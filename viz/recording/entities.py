@@ -1,4 +1,4 @@
-"""The entities of a recording: their paths, colors, and what holds for all of their time.
+"""The entities of a recording: their paths, colors, and static messages.
 
 Frames are entities: points under ``world/lidar`` move with the scan's pose, points under ``world/odom`` with the
 correction that loop closures make. A 2D log is drawn in the plane z = 0.

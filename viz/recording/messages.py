@@ -1,4 +1,4 @@
-"""A message: what is to be said about one entity, to every place that a recording goes to."""
+"""A message: columns of one entity, for every sink of a recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """When the rows of a message hold: on the timelines ``scan`` and ``sensor_time``.
+    """Times of the rows of a message, on the timelines ``scan`` and ``sensor_time``.
 
     Header stamps may step back in time, so the rows need not be in order of ``stamps_ns``.
     """

@@ -19,7 +19,7 @@ from rerun.error_utils import catch_and_log_exceptions
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Step
 from scanchain.errors import InputError
-from scanchain.runs.closures import JudgedClosure
+from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepRow
 from scanchain.viz.recording import entities, shapes, viewer
@@ -124,9 +124,9 @@ class Recording:
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
 
-    def log_closures(self, judged: Sequence[JudgedClosure], graph: GraphState) -> None:
+    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        self._send(lambda: self._settled(judged, graph))
+        self._send(lambda: self._settled(closures, graph))
 
     def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
@@ -195,8 +195,8 @@ class Recording:
             messages.append(Message(entities.LOCAL_MAP, columns, self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
-    def _settled(self, judged: Sequence[JudgedClosure], graph: GraphState) -> list[Message]:
-        verdicts = self.graph.settle(judged, graph)
+    def _settled(self, closures: Sequence[FinalClosure], graph: GraphState) -> list[Message]:
+        verdicts = self.graph.settle(closures, graph)
         messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
         return [*messages, *self.graph.draw(self.now)]
 
@@ -232,7 +232,7 @@ class Recording:
         return [Message(entities.GRID, grid)]
 
     def _send(self, say: Callable[[], list[Message]]) -> None:
-        """Send what ``say`` has to say to every sink."""
+        """Send the messages that ``say`` returns to every sink."""
         if not self.sinks:
             return
         messages: list[Message] = []

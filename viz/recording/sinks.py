@@ -28,7 +28,7 @@ from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _QUEUED_BATCHES = 16
-_COPIED_CHUNKS = 64  # that are in memory at a time when a recording is copied
+_COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is copied
 _LOOK_EVERY_S = 0.1
 _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
@@ -82,7 +82,7 @@ class Sink:
                 self._give_up("it takes no more data")
 
     def settle(self) -> bool:
-        """Wait until everything handed over is where it goes; whether it is."""
+        """Wait until everything is written; True if it is."""
         settled = threading.Event()
         if not self.warnings:
             with contextlib.suppress(queue.Full):
@@ -127,7 +127,7 @@ class Sink:
             self._give_up(str(error))
 
     def _copy(self, path: Path) -> None:
-        """Pass on a recording but for what is static, which is sent anew."""
+        """Pass on a recording except its static messages, which are sent again."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RerunWarning)  # what a killed process wrote lacks rerun's index
             chunks = RrdReader(path).stream().filter(is_static=False)
@@ -141,7 +141,7 @@ class Sink:
         self.flushes += 1
 
     def _give_up(self, why: str) -> None:
-        """Say so, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""
+        """Warn, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""
         with self.lock:
             if self.warnings:
                 return
@@ -178,7 +178,7 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
 def write_recording(
     path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint, messages: Sequence[Message]
 ) -> None:
-    """Write a .rrd file of what is all known by now, whole or not at all. Raises OSError."""
+    """Write a .rrd file of complete data, whole or not at all. Raises OSError."""
     memory = stream.memory_recording()
     stream.send_blueprint(blueprint, make_active=False)
     for message in messages:
@@ -187,7 +187,7 @@ def write_recording(
 
 
 def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
-    """A viewer that listens on ``address``."""
+    """A viewer at ``address``."""
 
     def connect() -> None:
         stream.set_sinks(rr.GrpcSink(address), default_blueprint=blueprint)

@@ -34,7 +34,7 @@ def grpc_address(port: int) -> str:
 
 
 def web_address(port: int, web_port: int) -> str:
-    """The page that shows what the server on ``port`` takes."""
+    """The page of the server on ``port``."""
     return f"http://{HOST}:{web_port}/?url={quote(grpc_address(port), safe='')}"
 
 
@@ -70,7 +70,9 @@ def start_web(port: int, web_port: int, recording: Path | None = None) -> subpro
     """Serve the web viewer on this machine only: of a .rrd file, or of what is sent to ``port``."""
     for taken in (port, web_port):
         if is_listening(taken):
-            raise ViewerError(f"no web viewer: port {taken} is taken; close what listens there (another viewer?)")
+            raise ViewerError(
+                f"no web viewer: port {taken} is taken; close the program that uses it (another viewer?)"
+            )
     files = [] if recording is None else [str(recording)]
     process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port), *files)
     try:
@@ -103,7 +105,7 @@ def _launch(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
-    """Return once the viewer listens and lives on: without a display it listens for a moment, then dies."""
+    """Return once the viewer accepts connections and stays up: without a display it exits after a moment."""
     deadline = monotonic() + _START_S
     listening_since = None
     while monotonic() < deadline:
@@ -116,16 +118,16 @@ def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:
         if listening_since is not None and monotonic() - listening_since > _SETTLE_S:
             return
         sleep(0.02)
-    raise ViewerError(f"no viewer: it did not answer within {_START_S:.0f} s; try `rerun` on its own")
+    raise ViewerError(f"no viewer: it did not respond within {_START_S:.0f} s; try `rerun` on its own")
 
 
-def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
+def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> None:
     """Open a .rrd file: a window that lives on by itself, or a page served on this machine until Ctrl-C.
 
-    tell : told the page's address
+    announce : called with the page's address
     """
     if in_browser:
-        _serve(path, tell)
+        _serve(path, announce)
         return
     if not has_display():
         raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
@@ -133,12 +135,12 @@ def show(path: Path, tell: Callable[[str], None], *, in_browser: bool) -> None:
     subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
 
 
-def _serve(path: Path, tell: Callable[[str], None]) -> None:
+def _serve(path: Path, announce: Callable[[str], None]) -> None:
     """Until KeyboardInterrupt; whatever ends this ends the server."""
     server = start_web(PORT, WEB_PORT, path)
     try:
         address = web_address(PORT, WEB_PORT)
-        tell(address)
+        announce(address)
         if has_display():
             webbrowser.open(address)
         code = server.wait()

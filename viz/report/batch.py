@@ -33,7 +33,7 @@ from scanchain.viz.report.page import (
 from scanchain.words import counted
 
 _MAX_TRAJECTORIES = 60
-_MAX_POINTS = 1500  # of a line
+_MAX_POINTS = 1500  # largest number of points of a line
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
@@ -64,7 +64,8 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in its own process.",
         facts=tuple(totals(rows)),
-        warnings=(f"{missing:,} of {len(rows):,} logs have no result; the table says why",) * bool(missing)
+        warnings=(f"{missing:,} of {len(rows):,} logs have no result; see the table for the reason",)
+        * bool(missing)
         + tuple(unreliable),
         notes=(),
         sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),
@@ -96,7 +97,7 @@ def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Sectio
 
 
 def _row(directory: Path, row: Row, name: str) -> page.Row:
-    """The figures of a log, or why it has none."""
+    """The figures of a log, or the reason for none."""
     m, link = row.metrics, _link(directory, row)
     if m is None:
         return page.Row(name, (Cell(f"{row.state}: {row.why}", is_wide=True),), link=link)

@@ -1,4 +1,4 @@
-"""report.html of a comparison, made of what lies in its directory."""
+"""report.html of a comparison, made of the files in its directory."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from scanchain.viz.report.sections import (
     uncertainty_section,
 )
 
-_WIDEST = 10  # columns of a table beside the summary
-_NEARLY = 1.25  # times the thickness of the sharpest map
+_WIDEST = 10  # largest number of columns of a table beside the summary
+_NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
 
 def write_compare_report(directory: Path) -> None:
@@ -106,7 +106,7 @@ def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[
 def _grid(
     table: Table, rows: Sequence[TableRow], trajectories: Sequence[DrawnTrajectory], columns: Sequence[Column]
 ) -> Grid:
-    """A row a method; one that failed says how in place of its figures."""
+    """A row a method; the end of a failed one in place of its figures."""
     chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []

@@ -1,4 +1,4 @@
-"""A report: one page that needs nothing but itself, in light and dark, on paper and on a phone."""
+"""A self-contained report: one page, in light and dark, on paper and on a phone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell; ``is_wide`` stretches it to the end of its row, ``is_bad`` marks what needs a look."""
+    """A table's cell; ``is_wide`` stretches it to the end of its row, ``is_bad`` marks a problem."""
 
     text: str
     is_best: bool = False
@@ -37,9 +37,9 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A table's row: what it is about, with its line in the drawings if it has one, and its cells.
+    """A table's row: its subject, with its line in the drawings if it has one, and its cells.
 
-    ``link`` : a page or file beside this one that tells more
+    ``link`` : a page or file beside this one with details
     """
 
     name: str
@@ -50,7 +50,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A column's head: what, in which unit, what that means, and whether words stand below it."""
+    """A column's head: name, unit, definition, and whether words stand below it."""
 
     text: str
     unit: str = ""
@@ -60,7 +60,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A table, and what must be known to read it, a line each."""
+    """A table, and notes on its reading, a line each."""
 
     heads: tuple[Head, ...]
     rows: tuple[Row, ...]
@@ -69,7 +69,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with what it shows; ``svg`` comes from an ``SvgFigure`` or is a scene, all else is escaped.
+    """A picture with its caption; ``svg`` comes from an ``SvgFigure`` or is a scene, all else is escaped.
 
     ``is_wide`` : over the whole width of the page
     """

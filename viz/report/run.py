@@ -1,4 +1,4 @@
-"""report.html of a run, made of what lies in its directory."""
+"""report.html of a run, made of the files in its directory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
-from scanchain.evaluation import absolute_error_on_any_course, pair
+from scanchain.evaluation import absolute_error_of_any_path, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
@@ -65,7 +65,7 @@ def _summary_lines(directory: Path) -> list[str]:
 
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """The result first, what it took last."""
+    """Facts of a run: the result first, its cost last."""
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
@@ -91,7 +91,7 @@ def _accuracy(m: Metrics) -> str:
 
 
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
-    """Accuracy, trajectory and map, closures, errors, certainty; time last."""
+    """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
     trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
@@ -143,7 +143,7 @@ def _against(trajectory: Trajectory, truth: Trajectory | None, gap_s: float | No
     if truth is None:
         return _Off(np.eye(4), errors_m, np.empty((0, 3)))
     pairs = pair(trajectory, truth, gap_s=gap_s)
-    ate = absolute_error_on_any_course(pairs)
+    ate = absolute_error_of_any_path(pairs)
     errors_m[pairs.places] = ate.errors_m
     return _Off(ate.T_reference_estimate, errors_m, pairs.reference[:, :3, 3])
 

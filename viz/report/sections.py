@@ -107,38 +107,38 @@ def time_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
 
 def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Section]:
     """Consistency of the covariances with the errors, and observability."""
-    told = _with(trajectories, "observability")
-    if not told:
+    reported = _with(trajectories, "observability")
+    if not reported:
         return
     along = Drawing(
         "Observability",
         "Information along the least constrained direction over the minimum required, least of neighboring scans. "
         "Below 1 (dotted) a scan is degenerate.",
-        figures.observability("observability", told),
+        figures.observability("observability", reported),
     )
-    whose = f" of {told[0].name}" if len(told) > 1 else ""
+    whose = f" of {reported[0].name}" if len(reported) > 1 else ""
     where = Drawing(
         "Observability on the trajectory",
         f"The same, seen from above{whose}.",
-        figures.observability_plan("blind", told[0]),
+        figures.observability_plan("blind", reported[0]),
     )
     drawings = (*_consistency(trajectories, is_planar=is_planar), along, where)
-    yield Section("Uncertainty", "", _legend(told), drawings)
+    yield Section("Uncertainty", "", _legend(reported), drawings)
 
 
 def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Drawing]:
-    judged = _with(trajectories, "nees")
-    if judged:
+    with_covariances = _with(trajectories, "nees")
+    if with_covariances:
         yield Drawing(
             "Covariance consistency",
             "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
             "they are too large, to the right too small.",
-            figures.consistency("nees", judged, 3 if is_planar else 6),
+            figures.consistency("nees", with_covariances, 3 if is_planar else 6),
         )
 
 
 def loop_section(trajectory: DrawnTrajectory, path: Path, title: str) -> Iterator[Section]:
-    """Every loop closure tried, and how many of them met which verdict."""
+    """Every loop closure tried, and the number of each verdict."""
     if not path.exists():
         return
     table = pq.ParquetFile(path).read()  # read_table imports much more
@@ -189,7 +189,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
 
 
 def _millimeters(value_m: float) -> str:
-    """– for what no point has."""
+    """Millimeters as text, – without a value."""
     return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
@@ -198,7 +198,7 @@ def _with(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajec
 
 
 def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Collapsible]:
-    """The command, and the versions that it ran with."""
+    """The command, and the versions of its packages."""
     yield Collapsible("Command", shlex.join(made.command))
     versions = {"python": made.python} | made.versions | others
     yield Collapsible(

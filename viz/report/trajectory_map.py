@@ -25,8 +25,8 @@ from scanchain.words import counted
 
 _CONTRADICTED, _DISPUTED = "contradicted", "at closures rejected by the back end"
 _COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6", _DISPUTED: "#075e70"}
-_MAX_SEGMENTS = 3000  # of a path; of longer ones the worst state of successive scans
-_MAX_CLOSURES = 1500  # of a verdict
+_MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
+_MAX_CLOSURES = 1500  # largest number of closures of a verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
 
 
 def _states(tables: Tables) -> NDArray[np.int64]:
-    """(N,) of every scan its place in ``_COLORS``, −1 where nothing is wrong."""
+    """(N,) index of every scan's mark in ``_COLORS``, −1 where nothing is wrong."""
     names = list(_COLORS)
     states = tables.steps["state"].to_pylist()
     marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
@@ -115,7 +115,7 @@ def _states(tables: Tables) -> NDArray[np.int64]:
 
 
 def _marked_parts(path: Floats, marks: NDArray[np.int64], mark: int) -> Floats:
-    """The parts of the path that lead to a scan of this mark, NaN elsewhere."""
+    """The segments of the path that lead to a scan of this mark, NaN elsewhere."""
     size = max(1, -(-len(path) // _MAX_SEGMENTS))
     groups = [slice(k, k + size) for k in range(0, len(path), size)]
     is_marked = np.array([bool((marks[group] == mark).any()) for group in groups])
@@ -136,7 +136,7 @@ _WIDER = 1.8  # lines, on the canvas
 def map_scene(
     points: Points, lines: Sequence[PathLine], low: Floats, high: Floats, *, grain_m: float, is_flat: bool
 ) -> Markup:
-    """The canvas that ``SCRIPT`` draws a map (M, 3) and lines in; what lies outside of the corners is left out.
+    """The canvas in which ``SCRIPT`` draws a map (M, 3) and lines; points outside of the corners are left out.
 
     grain_m : distance of neighboring points of the map, which is how large they are drawn from near by
     """
@@ -160,7 +160,7 @@ def map_scene(
 
 
 def _line(line: PathLine, low: Floats, high: Floats) -> dict[str, object]:
-    """As the script takes it: whole and downsampled, or, where it is broken, as pairs of points."""
+    """A line for the script: whole and downsampled, or, where it is broken, as pairs of points."""
     positions, is_known = line.positions, np.isfinite(line.positions[:, 0])
     if is_broken := not is_known.all():
         starts = np.flatnonzero(is_known[:-1] & is_known[1:])

@@ -1,4 +1,4 @@
-"""Pose graphs read from g2o text (SE2, SE3:QUAT, XY, SE2_XY, FIX) or TORO's; other lines are kept as they are."""
+"""Pose graphs read from g2o text (SE2, SE3:QUAT, XY, SE2_XY, FIX) or TORO's; other lines are retained."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Indefinite = Literal["project", "refuse"]
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Which edges of a file have an indefinite information matrix, and what projecting it changed.
+    """Edges of a file with an indefinite information matrix, and the change by projecting it.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Projection:
 
     @property
     def text(self) -> str:
-        """One line for people."""
+        """The projection as one line of text."""
         return (
             f"{self.edges:,} of {self.of:,} edges have an indefinite information matrix, which is no inverse "
             "covariance; each was projected to the nearest positive semidefinite one, which changed it by "
@@ -59,10 +59,10 @@ class G2oFile:
     ----------
     graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
     ids : (K,) the file's vertex ids
-    other_lines : lines that say nothing about poses and edges, kept to be written again
+    other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
-    projection : what became of indefinite information matrices; None without any
-    note : that angles may be degrees; empty where they are radians
+    projection : of the indefinite information matrices; None without any
+    note : warning that angles may be degrees; empty where they are radians
     """
 
     graph: PoseGraph
@@ -74,16 +74,16 @@ class G2oFile:
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
-        """Tags that were not understood, with how many lines of each."""
+        """Tags that are not supported, with the number of lines of each."""
         return tuple(Counter(line.split(maxsplit=1)[0] for line in self.other_lines).items())
 
 
 def read_g2o(
-    path: Path | str, *, loops: Literal["trusted", "suspect"] = "trusted", indefinite: Indefinite = "project"
+    path: Path | str, *, loops: Literal["quadratic", "robust"] = "quadratic", indefinite: Indefinite = "project"
 ) -> G2oFile:
     """Read a graph.
 
-    loops : "suspect" marks edges between poses that do not follow each other for the robust loss
+    loops : "robust" marks edges between poses that do not follow each other for the robust loss
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
     """
@@ -111,8 +111,8 @@ def read_g2o(
         graph.add_pose(pose, stamp)
     for point, stamp in zip(points, point_ids.tolist(), strict=True):
         graph.add_point(point, stamp)
-    suspect = (loops == "suspect") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1)
-    graph.add_edges(pairs, measurements, information, suspect)
+    is_robust = (loops == "robust") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1)
+    graph.add_edges(pairs, measurements, information, is_robust)
     if len(sightings):
         graph.add_sightings(sightings, seen, certainty)
     for index in fixed.tolist():
@@ -158,7 +158,7 @@ def _indefinite(path: Path, rows: Rows, information: Matrix, indefinite: Indefin
 
 
 def _project(kinds: list[_Indefinite], edges: int) -> Projection | None:
-    """Put the nearest semidefinite matrices in place of the indefinite ones, with a warning; what that changed."""
+    """Replace indefinite matrices by the nearest semidefinite ones, with a warning; returns the changes."""
     off = []
     for kind in kinds:
         before = kind.information[kind.which]

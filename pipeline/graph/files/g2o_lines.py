@@ -68,7 +68,7 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What a tag stands for: where its lines go, ids and numbers on each, whether they are written as in TORO."""
+    """A tag's kind: destination of its lines, ids and numbers on each, True if they are written as in TORO."""
 
     name: Literal["vertices", "edges", "points", "sightings"]
     dimension: int
@@ -145,7 +145,7 @@ def sort_lines(path: Path) -> G2oLines:
 
 
 def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2oLines) -> None:
-    """Put one line where it belongs."""
+    """Sort one line in."""
     tag = words[0]
     if tag == "FIX":
         for word in words[1:]:

@@ -92,9 +92,9 @@ def write_toro(
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
 ) -> None:
-    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO knows no points."""
+    """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO has no points."""
     if graph.is_point.any():
-        raise InputError(f"{path}: TORO knows no points, and the graph has {graph.is_point.sum()}; write .g2o")
+        raise InputError(f"{path}: TORO has no points, and the graph has {graph.is_point.sum()}; write .g2o")
     d = graph.dimension
     names = (np.arange(len(graph)) if ids is None else ids).tolist()
     lines = [
@@ -130,7 +130,7 @@ def _toro(poses: Matrix) -> list[list[float]]:
 
 
 def _triangles(graph: PoseGraph, edges: Chosen) -> tuple[NDArray[np.bool_], list[list[float]]]:
-    """Which edges are chosen, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
+    """Chosen edges, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
     upper = np.triu_indices(graph.freedom)
     triangles = graph.information[:, upper[0], upper[1]]
     if edges == "rejected":

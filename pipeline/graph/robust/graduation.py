@@ -17,8 +17,8 @@ from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 OutlierRejection = Literal["gnc", "refined"]
 
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
-_MAX_ROUNDS = 50  # of refining the inlier set
-_FEWER, _FEWEST = 0.3, 1e-3  # after changes that do not help, of those that promise the most
+_MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
+_FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
 
 
 def minimize(
@@ -102,7 +102,7 @@ class _Focus:
 def _refine(
     minimizer: Minimizer, now: Evaluation, loss: RobustLoss, max_iterations: int, tolerance: float
 ) -> Minimum:
-    """The minimum with the inliers of now, and then with those that the other edges do not contradict."""
+    """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
     minimum = _settle(minimizer, now, InlierSet(kept, nominal), max_iterations, tolerance)
     problem = minimizer.problem
@@ -140,6 +140,6 @@ def _settle(
 
 
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
-    """What every loop edge costs the others, (L,)."""
+    """Cost of every loop edge in the χ² of the others, (L,)."""
     kept = minimum.weights > 0.5
     return contradictions(minimizer.problem, minimum.estimate.poses, kept, price)[minimizer.loops]

@@ -13,8 +13,8 @@ from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.covariance import difference_covariance
 
-_MARGIN = 6.0  # over what a pessimistic noise model would allow: residuals have longer tails than the normal law
-_FEWEST = 10  # kept edges that say something about the noise model
+_MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals have long tails
+_FEWEST = 10  # least number of inlier edges from which a noise model is estimated
 _ROUNDING = 1e-9  # keeps an edge without which its poses would be loose from a division by zero
 
 
@@ -45,7 +45,7 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
     """The price, lowered where the contradictions of kept edges (L,) show that the noise model is pessimistic.
 
     Information matrices that are far too small would let in any edge. The median of the contradictions, against
-    that of χ² with so many degrees of freedom, says by how much they are.
+    that of χ² with so many degrees of freedom, is the factor.
     """
     if len(against) < _FEWEST:
         return nominal
@@ -54,12 +54,12 @@ def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> fl
 
 
 def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_], price: float) -> Matrix:
-    """How much of the whole graph's χ² each edge costs, or would cost were it kept, (E,), to first order.
+    """Share of each edge in the χ² of the whole graph, or its rise were the edge an inlier, (E,), to first order.
 
     It is the squared Mahalanobis distance between what the edge measures and what all the other kept edges (E,)
     predict: with P the covariance of the prediction, given all kept edges,
         eᵀ(Ω⁻¹ − P)⁻¹e of a kept edge,    eᵀ(Ω⁻¹ + P)⁻¹e of another.
-    The residual alone says less: a kept edge bends the graph toward itself. Where a lower bound of the second,
+    The residual alone is too small: a kept edge bends the graph toward itself. Where a lower bound of the second,
     by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
     """
     errors, k = problem.errors(poses), problem.freedom

@@ -170,14 +170,14 @@ class RobustLoss:
 
 
 class Graduation:
-    """The ``loss`` of now, made less convex step by step."""
+    """The present ``loss``, made less convex step by step."""
 
     def __init__(self, loss: RobustLoss, schedule: Schedule) -> None:
         self.loss = loss
         self._schedule = schedule
 
     def is_over(self, chi2: Array) -> bool:
-        """Whether it has reached its end: the loss itself, or weights that are all 0 or 1."""
+        """True at the end of the schedule: the loss itself, or weights that are all 0 or 1."""
         return self._schedule.is_over(self.loss.control, self.loss.weight(chi2))
 
     def tighten(self) -> None:

@@ -25,7 +25,7 @@ class SingularMatrixError(ArithmeticError):
 
 
 class BlockPattern:
-    """Which blocks of a symmetric matrix may be nonzero: every diagonal one and the given pairs.
+    """Blocks of a symmetric matrix that may be nonzero: every diagonal one and the given pairs.
 
     The values of such a matrix are one flat array: the n diagonal blocks, then one block for each pair
     (row, column), each row-major. Blocks may differ in size.
@@ -44,7 +44,7 @@ class BlockPattern:
         self.diagonal = self._diagonal()
 
     def _diagonal(self) -> NDArray[np.int64]:
-        """Place among the values of every scalar's diagonal entry, (scalars,)."""
+        """Index among the values of every scalar's diagonal entry, (scalars,)."""
         squares = np.cumsum(self.sizes**2) - self.sizes**2
         within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
         return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
@@ -75,7 +75,7 @@ class Packing:
         return blocks.reshape(-1) if self._is_whole else blocks[self._kept]
 
     def blocks(self, values: NDArray[np.float64]) -> Matrix:
-        """Blocks (B, k, k) of block values, zero where nothing is kept."""
+        """Blocks (B, k, k) of block values, zero where none is stored."""
         if self._is_whole:
             return values.reshape(-1, self._k, self._k)
         result = np.zeros(self._kept.shape)
@@ -87,7 +87,7 @@ class Packing:
         return vectors[self._kept_rows]
 
     def spread_rows(self, packed: Matrix) -> Matrix:
-        """(n, k, ...) of (scalars, ...), zero where nothing is kept."""
+        """(n, k, ...) of (scalars, ...), zero where none is stored."""
         result = np.zeros((*self._kept_rows.shape, *packed.shape[1:]))
         result[self._kept_rows] = packed
         return result
@@ -95,7 +95,7 @@ class Packing:
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What follows from the pairs alone: elimination order (n,), tree (n,), rows of the factor by column."""
+    """Symbolic analysis of the pairs: elimination order (n,), tree (n,), rows of the factor by column."""
 
     order: NDArray[np.int64]
     parent: NDArray[np.int64]
@@ -104,7 +104,7 @@ class Analysis:
 
 
 def analyze(pattern: BlockPattern) -> Analysis:
-    """Fill-reducing order of the variables, and where the factor fills in; the same for blocks of any size."""
+    """Fill-reducing order of the variables, and the fill-in of the factor; the same for blocks of any size."""
     start, neighbors = _adjacency(pattern)
     order = _fill_reducing_order(start, neighbors)
     order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
@@ -113,7 +113,7 @@ def analyze(pattern: BlockPattern) -> Analysis:
 
 
 class SparseCholesky:
-    """The factor A = Uᵀ U of a block-sparse matrix; the fill-reducing ordering and the symbolic analysis are kept.
+    """The factor A = Uᵀ U of a block-sparse matrix; ordering and symbolic analysis are retained.
 
     ``factorize`` may be called any number of times with new values of the same pattern.
     """
@@ -196,12 +196,12 @@ def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64])
 
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
-    """U of the last factorization, A = Uᵀ U, in the order of elimination; zeros kept where it may fill in."""
+    """U of the last factorization, A = Uᵀ U, in the order of elimination, with explicit zeros of the fill-in."""
     return front_rows(cholesky._fronts, cholesky._factor)
 
 
 def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
-    """The upper triangular matrix whose rows the fronts keep, in the order of elimination."""
+    """The upper triangular matrix whose rows the fronts store, in the order of elimination."""
     widths = np.diff(fronts.row_start)
     count = int(fronts.pivots.sum())
     front = np.repeat(np.arange(len(widths)), fronts.pivots)

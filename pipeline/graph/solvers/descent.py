@@ -17,17 +17,17 @@ Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
 _LEAST_DAMPING = 1e-15
-_FIRST_DAMPING = 1e-12  # all but Gauss-Newton: the weakest modes of a long chain have 1e-9 of diag H
+_FIRST_DAMPING = 1e-12  # first damping, all but Gauss-Newton: weak modes of a long chain have 1e-9 of diag H
 _GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
 _SHORTEST = 1e-12  # share of the first trust region, or of the best length, at which no step is worth trying
 
 
 class Estimate(Protocol):
-    """Where a minimization is."""
+    """State of a minimization."""
 
     @property
     def cost(self) -> float:
-        """χ², or what stands in its place."""
+        """χ², or the robust cost."""
         ...
 
 
@@ -54,14 +54,14 @@ E = TypeVar("E", bound=Estimate)
 
 @dataclass(frozen=True, slots=True)
 class Move(Generic[E]):
-    """A step (n,), and where it leads."""
+    """A step (n,), and the estimate after it."""
 
     step: Vector
     to: E
 
 
 class StepRule(Protocol):
-    """Makes moves; may keep what it learns from one to the next."""
+    """A rule for steps; may adapt from one to the next."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
         """One move, or None where no step lowers the cost."""
@@ -187,17 +187,17 @@ class Landscape(Protocol[E]):
     """A cost to minimize."""
 
     def model(self, now: E) -> LocalModel:
-        """Its quadratic model there."""
+        """Quadratic model of the cost at an estimate."""
         ...
 
     def moved(self, now: E, step: Vector) -> E:
-        """Where a step (n,) leads."""
+        """The estimate after a step (n,)."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[E]):
-    """Where a minimization ended, after how many steps, and why."""
+    """End of a minimization: estimate, number of steps and reason."""
 
     end: E
     iterations: int

@@ -14,7 +14,7 @@ from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.graph.solvers.descent import Optimizer, Vector, descend, step_rule
 
-_STEP = 1e-6  # m or rad, of the central differences
+_STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet
 
 
@@ -30,7 +30,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a minimization ended, with what robust weights (E,), after how many linear solves, and why."""
+    """End of a minimization: poses, robust weights (E,), number of linear solves, and reason."""
 
     estimate: Evaluation
     weights: NDArray[np.float64]
@@ -76,7 +76,7 @@ def _slopes(
 
 
 class Minimizer:
-    """Minimizes Σ χ² of trusted edges plus Σ ρ(χ²) of loop edges; its step rule keeps what it learns."""
+    """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of loop edges, with one step rule throughout."""
 
     def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
@@ -96,17 +96,17 @@ class Minimizer:
         return Evaluation(now.poses, now.errors, now.chi2, self._cost(now.chi2, loss))
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
-        """The same with some of the edges, kept (E,)."""
+        """The same with a subset of the edges, kept (E,)."""
         return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
-        """Robust weight of every edge, (E,); 1 for the trusted ones."""
+        """Robust weight of every edge, (E,); 1 for the quadratic ones."""
         result = np.ones(len(chi2))
         result[self.loops] = loss.weight(chi2[self.loops])
         return result
 
     def descend(self, now: Evaluation, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
-        """Step after step until nothing more is to be gained."""
+        """Iterate until convergence."""
         descent = descend(_Landscape(self, loss), now, self._rule, max_iterations, tolerance)
         weights = self.weights(descent.end.chi2, loss)
         return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)

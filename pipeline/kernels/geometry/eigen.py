@@ -4,8 +4,8 @@ import math
 
 from numba import njit
 
-_SWEEPS = 30  # of rotations; a handful does
-_BESIDE = 1e-16  # of the diagonal, what is left beside it
+_SWEEPS = 30  # largest number of sweeps of rotations; a handful does
+_BESIDE = 1e-16  # largest off-diagonal entry as a share of the diagonal
 
 
 @njit(cache=True)

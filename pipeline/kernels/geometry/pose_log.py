@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-_SMALL = 1e-8  # of half the angle's sine, below which the series is exact
+_SMALL = 1e-8  # sine of half the angle, below which the series is exact
 
 
 @njit(cache=True)

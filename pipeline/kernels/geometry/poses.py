@@ -35,7 +35,7 @@ def between(T_a, T_b):
 
 @njit(cache=True)
 def centered(T, T_origin):
-    """The pose T (d+1, d+1) with its position counted from that of T_origin."""
+    """The pose T (d+1, d+1) with its position relative to that of T_origin."""
     d = T.shape[0] - 1
     out = T.copy()
     for i in range(d):
@@ -45,7 +45,7 @@ def centered(T, T_origin):
 
 @njit(cache=True)
 def apart(T_a, T_b):
-    """How far two poses are from each other: meters, and the angle in [0, π] between their rotations.
+    """Distance between two poses: meters, and the angle in [0, π] between their rotations.
 
     8 sin²(θ/2) = |R_a − R_b|², 2 cos²(θ/2) = 1 + cos θ by the trace.
     """

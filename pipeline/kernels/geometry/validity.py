@@ -1,4 +1,4 @@
-"""Whether arrays hold finite numbers and rigid transformations, without temporaries."""
+"""Checks of arrays for finite numbers and rigid transformations, without temporaries."""
 
 import math
 

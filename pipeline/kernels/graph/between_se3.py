@@ -68,7 +68,7 @@ def _relative(T_i: _Array, T_j: _Array, Z: _Array, E: _Array) -> None:
 
 @njit(cache=True)
 def _rotation_vector(R: _Array, quat: _Array, error: _Array) -> None:
-    """Write φ = log R into error[3:6] by way of the quaternion xyzw, which is well conditioned from 0 to π.
+    """Write φ = log R into error[3:6] by the quaternion xyzw, which is well conditioned from 0 to π.
 
     The quaternion comes from its largest component (Shepperd 1978).
     """

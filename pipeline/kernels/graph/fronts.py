@@ -10,7 +10,7 @@ _Index = NDArray[np.int64]
 
 
 class Fronts(NamedTuple):
-    """Where everything lies. A front is a small dense symmetric matrix: its pivots first, then its update rows.
+    """Layout of the fronts. A front is a small dense symmetric matrix: its pivots first, then its update rows.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Fronts(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Where the blocks of the matrix go: those of front f are start[f] to start[f + 1].
+    """Destinations of the blocks of the matrix: those of front f are start[f] to start[f + 1].
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def _walk(
 def lay_out_blocks(
     fronts: Fronts, scalar_start: _Index, sizes: _Index, block_rows: _Index, block_columns: _Index
 ) -> Blocks:
-    """Find the front and the place of every block of the matrix.
+    """Find the front and the position of every block of the matrix.
 
     scalar_start (n,) : first scalar position, in the elimination order, of every variable
     sizes (n,) : scalars of every variable

@@ -1,4 +1,4 @@
-"""Which information matrices are ones, compiled: finite, symmetric, positive semidefinite."""
+"""Test of information matrices, compiled: finite, symmetric, positive semidefinite."""
 
 import math
 
@@ -8,16 +8,18 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True)
-def judge_matrices(matrices: NDArray[np.float64], rounding: float, is_sound: NDArray[np.bool_]) -> None:
-    """Fill ``is_sound`` (E,): which matrices (E, k, k) have no eigenvalue below −rounding · largest entry.
+def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidefinite: NDArray[np.bool_]) -> None:
+    """Fill ``is_semidefinite`` (E,): matrices (E, k, k) without an eigenvalue below −rounding · largest entry.
 
     Such a matrix has a Cholesky factor once that much is added to its diagonal.
     """
     factor = np.empty(matrices.shape[1:])
     for e in range(matrices.shape[0]):
         scale = _largest_entry(matrices[e])
-        is_sound[e] = math.isfinite(scale) and _is_symmetric(matrices[e], rounding * scale)
-        is_sound[e] = is_sound[e] and (scale == 0.0 or _has_factor(matrices[e], rounding * scale, factor))
+        is_semidefinite[e] = math.isfinite(scale) and _is_symmetric(matrices[e], rounding * scale)
+        is_semidefinite[e] = is_semidefinite[e] and (
+            scale == 0.0 or _has_factor(matrices[e], rounding * scale, factor)
+        )
 
 
 @njit(cache=True)
@@ -44,7 +46,7 @@ def _is_symmetric(A, margin: float) -> bool:
 
 @njit(cache=True)
 def _has_factor(A, shift: float, factor) -> bool:
-    """Whether A + shift · I has a Cholesky factor; ``factor`` (k, k) is room for it."""
+    """True if A + shift · I has a Cholesky factor; ``factor`` (k, k) is a buffer for it."""
     for i in range(A.shape[0]):
         for j in range(i + 1):
             total = A[i, j]

@@ -11,7 +11,7 @@ _PANEL = 16  # rows of the border that are subtracted from the corner together
 
 @njit(cache=True)
 def bandwidth(row_start: _Index, columns: _Index, split: int) -> int:
-    """Most that two columns before ``split`` lie apart in one row."""
+    """Largest distance of two columns before ``split`` in one row."""
     widest = 0
     for r in range(row_start.size - 1):
         low, high = split, -1
@@ -80,7 +80,7 @@ def eliminate(band: _Array, border: _Array, share: float) -> int:
 
 @njit(cache=True)
 def complement(corner: _Array, border: _Array) -> None:
-    """Subtract YᵀY from the upper triangle of the corner, four rows of Y at a time, a panel that stays near."""
+    """Subtract YᵀY from the upper triangle of the corner, four rows of Y at a time, in cached panels."""
     whole = border.shape[0] - border.shape[0] % 4
     for first in range(0, whole, _PANEL):
         for a in range(corner.shape[0]):

@@ -11,7 +11,7 @@ _Index = NDArray[np.int64]
 
 @njit(cache=True)
 def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Index, rows: _Index) -> _Index:
-    """Column to eliminate at each place, by approximate minimum degree (COLAMD, Davis et al. 2004).
+    """Column to eliminate at each position, by approximate minimum degree (COLAMD, Davis et al. 2004).
 
     Eliminating a column joins all rows that hold it to one, its pivot row, which is how QR fills in at the worst.
     The next column is one whose rows, by the sum of what each has beyond the last pivot row, hold the fewest
@@ -60,7 +60,7 @@ def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Ind
 def _join(
     r: int, k: int, begin: _Index, length: _Index, done: NDArray[np.bool_], mark: _Index, store: _Index, end: int
 ) -> int:
-    """Append the live columns of row r that the pivot row has not got yet; return its new end."""
+    """Append the remaining columns of row r that the pivot row lacks; return its new end."""
     for w in store[begin[r] : begin[r] + length[r]]:
         if not done[w] and mark[w] != k:
             mark[w] = k
@@ -74,7 +74,7 @@ def _count_beyond(
     members: _Index, k: int, column_start: _Index, rows: _Index, held: _Index, length: _Index, beyond: _Index,
     seen: _Index,
 ) -> None:  # fmt: skip
-    """Fill, for every live row that shares a column with the pivot row, how many columns it has beyond it."""
+    """Fill, for every remaining row that shares a column with the pivot row, its number of columns beyond it."""
     for w in members:
         for q in range(column_start[w], column_start[w] + held[w]):
             r = rows[q]
@@ -90,7 +90,7 @@ def _count_beyond(
 def _adopt(
     w: int, pivot: int, column_start: _Index, rows: _Index, held: _Index, length: _Index, beyond: _Index
 ) -> int:
-    """Put the pivot row in the place of the rows that it absorbs; return the sum of what the others have more."""
+    """Put the pivot row in place of the rows that it absorbs; return the sum of the others' excess columns."""
     kept, total = column_start[w], 0
     for q in range(column_start[w], column_start[w] + held[w]):
         r = rows[q]

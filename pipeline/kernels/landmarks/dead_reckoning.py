@@ -1,4 +1,4 @@
-"""Velocities of a wheeled robot integrated to motions, with what their noise does to them; compiled."""
+"""Velocities of a wheeled robot integrated to motions, with the Jacobians by their noise; compiled."""
 
 import numpy as np
 from numba import njit
@@ -54,7 +54,7 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
 
 @njit(cache=True)
 def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, driven: float) -> None:
-    """Carry a covariance along one arc and add what its own noise adds."""
+    """Propagate a covariance along one arc and add that of its own noise."""
     for a in range(2):  # F P Fᵀ, F the identity but for its last column
         for b in range(3):
             P[a, b] += F[a, 2] * P[2, b]

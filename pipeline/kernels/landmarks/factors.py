@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
-_NOWHERE_M = 1e-9  # nearer to the pose than this a landmark has no bearing
+_NOWHERE_M = 1e-9  # distance to the pose below which a landmark has no bearing
 
 
 @njit(cache=True)

@@ -12,11 +12,11 @@ _Index = NDArray[np.int64]
 def product_structure(
     row_start: _Index, columns: _Index, column_start: _Index, rows: _Index
 ) -> tuple[_Index, _Index, _Index]:
-    """Find which pairs of columns share a row, and where each product of two entries of a row goes.
+    """Pairs of columns that share a row, and the destination of each product of two entries of a row.
 
     row_start (m + 1,), columns : columns in each row, each once; column_start (n + 1,), rows : rows in each column
-    Returns start (n + 1,), partners, slots: pair p of column v, for start[v] ≤ p < start[v + 1], is
-    (v, partners[p]) with partners[p] > v. ``slots`` has, row by row, a square of as many rows and columns as the
+    Returns start (n + 1,), others, slots: pair p of column v, for start[v] ≤ p < start[v + 1], is
+    (v, others[p]) with others[p] > v. ``slots`` has, row by row, a square of as many rows and columns as the
     row has entries; slots[a, b] is the place of the product of its entries a and b in a list of the n diagonal
     entries and then the pairs, -1 below the diagonal.
     """
@@ -25,11 +25,11 @@ def product_structure(
     for r in range(row_start.size - 1):
         base[r + 1] = base[r] + (row_start[r + 1] - row_start[r]) ** 2
     slots = np.full(base[-1], -1, np.int64)
-    start, partners = np.zeros(n + 1, np.int64), np.empty(max(columns.size, 16), np.int64)
+    start, others = np.zeros(n + 1, np.int64), np.empty(max(columns.size, 16), np.int64)
     place, end = np.full(n, -1, np.int64), 0
     for v in range(n):
-        if end + n > partners.size:
-            partners = np.concatenate((partners, np.empty(partners.size + n, np.int64)))
+        if end + n > others.size:
+            others = np.concatenate((others, np.empty(others.size + n, np.int64)))
         for q in range(column_start[v], column_start[v + 1]):
             r = rows[q]
             first, width = row_start[r], row_start[r + 1] - row_start[r]
@@ -40,19 +40,19 @@ def product_structure(
                 w = columns[first + b]
                 if w > v and place[w] < start[v]:
                     place[w] = end
-                    partners[end] = w
+                    others[end] = w
                     end += 1
                 if w >= v:
                     slots[base[r] + a * width + b] = v if w == v else n + place[w]
         start[v + 1] = end
-    return start, partners[:end].copy(), slots
+    return start, others[:end].copy(), slots
 
 
 @njit(cache=True)
 def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, slots: _Index, H: _Array, g: _Array
 ) -> None:
-    """Fill H = AᵀA, in the order that ``slots`` says, and g = Aᵀb.
+    """Fill H = AᵀA, in the order of ``slots``, and g = Aᵀb.
 
     row_start (m + 1,), columns, values : A by rows; b (m,); H (n + pairs,), g (n,) filled
     """

@@ -1,4 +1,4 @@
-"""Sparse orthogonal factorization A = Q R by dense Householder fronts; Q is applied to b and forgotten; compiled.
+"""Sparse orthogonal factorization A = Q R by dense Householder fronts; Q is applied to b, not stored; compiled.
 
 The multifrontal method (Matstoms 1994; Davis 2011) on the structure of R, which is at most that of the Cholesky
 factor of AᵀA (George & Heath 1980): a front gathers the rows of A that begin at its pivots and the rows that its
@@ -153,7 +153,7 @@ def _place_children(
     front: _Array, target: _Index, at: int, fronts: Fronts, children: _Index, height: _Index, stack: _Array,
     depth: int,
 ) -> int:  # fmt: skip
-    """Write the rows that the children hand on, from place ``at`` on; return the stack's depth without them."""
+    """Write the children's update rows, from row ``at`` on; return the stack's depth without them."""
     for k in range(children.size):
         child = int(children[k])
         first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
@@ -174,7 +174,7 @@ def _place_children(
 
 @njit(cache=True)
 def _keep(front: _Array, columns: _Index, pivots: int, factor: _Array, z: _Array) -> None:
-    """Keep the rows of R that belong to the pivots; zeros where the front has too few rows."""
+    """Store the rows of R that belong to the pivots; zeros where the front has too few rows."""
     width = columns.size
     for a in range(pivots):
         if a < front.shape[0]:
@@ -201,20 +201,20 @@ def back_substitute(fronts: Fronts, factor: _Array, z: _Array) -> None:
 
 @njit(cache=True)
 def _handed_on(height: int, rest: int, pivots: int) -> int:
-    """Rows that a front of this height hands on."""
+    """Number of update rows of a front of this height."""
     return max(min(height, rest + pivots) - pivots, 0)
 
 
 @njit(cache=True)
 def _rows_of(fronts: Fronts, height: _Index, child: int) -> int:
-    """Rows that a front hands on to its parent."""
+    """Update rows of a front, for its parent."""
     width = fronts.row_start[child + 1] - fronts.row_start[child]
     return int(_handed_on(height[child], width - fronts.pivots[child], fronts.pivots[child]))
 
 
 @njit(cache=True)
 def _sort_by_lead(leads: _Index, width: int) -> tuple[_Index, _Index]:
-    """Rows that begin at or before each column, (width,), and the place of every row when sorted so."""
+    """Rows that begin at or before each column, (width,), and the position of every row when sorted so."""
     stairs = np.zeros(width + 1, np.int64)
     for lead in leads:
         stairs[lead] += 1

@@ -9,7 +9,7 @@ from scanchain.kernels.raycast.extents import extents_of
 from scanchain.kernels.raycast.ground import hit_ground
 from scanchain.kernels.raycast.solids import hit_solid
 
-SECTORS = 720  # of azimuth; a ray tests only the solids that overlap its own
+SECTORS = 720  # sectors of azimuth; a ray tests only the solids that overlap its own
 
 
 @njit(cache=True, nogil=True)
@@ -17,7 +17,7 @@ def cast_rays(
     origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, max_range_m,
     ranges_m, solid_of_ray,
 ):  # fmt: skip
-    """Range to the first hit of every ray and what it hit; inf and −1 where nothing is within reach.
+    """Range to the first hit of every ray and the solid it hit; inf and −1 where nothing is within reach.
 
     Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
     solids of its azimuth sector from near to far, passes over those it goes above or below, and stops where the

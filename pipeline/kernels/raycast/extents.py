@@ -1,4 +1,4 @@
-"""Under what angles each solid can be seen, and from how near, by any ray of a sensor that moves a little."""
+"""Visible extent of each solid: angles and least distance, for all rays of a sensor that moves a little."""
 
 import math
 
@@ -20,7 +20,7 @@ def _middle(origins):
 
 @njit(cache=True)
 def extents_of(origins, boxes, cylinders, ellipsoids):
-    """(S, 5) what of each solid can be seen: bearing, half angle, nearest distance in the plane, slopes between.
+    """(S, 5) extent of each solid: bearing, half angle, nearest distance in the plane, slopes between.
 
     A ray from anywhere within ``slack`` of the middle of the origins that hits the solid has an azimuth in that
     interval, because the parallel ray from the middle hits the footprint grown by ``slack``. Its slope, dz over

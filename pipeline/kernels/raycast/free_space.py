@@ -1,9 +1,9 @@
-"""Points held against what a lidar saw elsewhere: on its surfaces, behind them, or where it looked through."""
+"""Points compared with the ranges of a lidar elsewhere: on its surfaces, behind them, or in its free space."""
 
 import numpy as np
 from numba import njit
 
-FAR = 1e9  # m, in bins that no ray fell into
+FAR = 1e9  # m, range of bins that no ray fell into
 
 
 @njit(cache=True, nogil=True)
@@ -22,7 +22,7 @@ def nearest_ranges(points, ranges_m):
 
 @njit(cache=True, nogil=True)
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
-    """How many points (N, 3), moved by T (4, 4) into the lidar's frame, agree with its ranges and contradict.
+    """Numbers of points (N, 3), moved by T (4, 4) into the lidar's frame, that agree and that contradict.
 
     A point agrees where its range is that of its bin, within the margin: so many meters and such a share of the
     range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.
@@ -48,21 +48,21 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
 
 
 @njit(cache=True, nogil=True)
-def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_through):
-    """Count, for each point, whether one scan saw a surface there or looked through it.
+def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through):
+    """Count, for each point, the scan as one that saw a surface there or saw through it.
 
-    All rays that pass within half the window of the point, to its sides and above it, are looked at; below it, a
-    single bin, or else the ground would vouch for what goes over it. The point was seen where the nearest of them
-    ended there, within the margin: so a thin pole before a far wall is not looked through, though most rays miss
-    it. It was looked through where the nearest went on behind it, unless that one ended at the same height, as
+    All rays that pass within half the window of the point, to its sides and above it, are compared; below it, a
+    single bin, or else the ground would confirm what passes above it. The point was seen where the nearest of them
+    ended there, within the margin: so a thin pole before a far wall is not free space, though most rays miss
+    it. It was seen through where the nearest went on behind it, unless that one ended at the same height, as
     rays do on ground that they graze, and where one is within a bin of its direction. Otherwise it is hidden or
     out of sight.
 
-    points : (N, 3) meters, world; spans : (S, 2) int64 first and last + 1 of the points to look at
+    points : (N, 3) meters, world; spans : (S, 2) int64 first and last + 1 of the points to test
     T : (4, 4) T_lidar_world; ranges_m : (E, A) of ``nearest_ranges``; one row for scans in a plane
     limits : (6,) reach m; window m; margin of a range m, and per meter; margin of a height m, and per meter
-    enough : points that so many scans saw are not looked at again
-    seen, looked_through : (N,) int32, changed in place
+    enough : points that so many scans saw are not tested again
+    seen, seen_through : (N,) int32, changed in place
     """
     for s in range(spans.shape[0]):
         for i in range(spans[s, 0], spans[s, 1]):
@@ -78,12 +78,12 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, looked_throug
             if sight > 0:
                 seen[i] += 1
             elif sight < 0:
-                looked_through[i] += 1
+                seen_through[i] += 1
 
 
 @njit(cache=True, inline="always")
 def _sight(x, y, z, ranges_m, limits):
-    """1 where a point in the lidar's frame was seen, −1 where it was looked through, else 0."""
+    """1 where a point in the lidar's frame was seen, −1 where it lies in free space, else 0."""
     reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
     if x * x + y * y + z * z > reach_m * reach_m:
         return 0

@@ -1,4 +1,4 @@
-"""Beams drawn into an occupancy grid, and where they end."""
+"""Beams drawn into an occupancy grid up to their ends."""
 
 import numpy as np
 from numba import njit

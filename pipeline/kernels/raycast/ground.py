@@ -1,4 +1,4 @@
-"""Where a ray meets rolling ground."""
+"""Intersection of a ray with rolling ground."""
 
 import math
 
@@ -54,7 +54,7 @@ def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
 
 @njit(cache=True)
 def _steepest(dx, dy, dz, ground):
-    """Bounds of how fast a ray and the ground approach each other, and of how fast that changes."""
+    """Bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
     slope_x, slope_y = ground[1] * ground[2], ground[4] * ground[5]
     closing = abs(slope_x * dx) + abs(slope_y * dy) - dz
     curvature = abs(slope_x * ground[2]) + abs(slope_y * ground[5])
@@ -67,7 +67,7 @@ def _steepest(dx, dy, dz, ground):
 
 @njit(cache=True)
 def _gap(x, y, z, dx, dy, dz, ground):
-    """Height of a place above the ground and its change along the ray."""
+    """Height of a position above the ground and its change along the ray."""
     phase_x, phase_y = ground[2] * x + ground[3], ground[5] * y + ground[6]
     gap = z - ground[0] - ground[1] * math.sin(phase_x) - ground[4] * math.sin(phase_y)
     slope = dz - ground[1] * ground[2] * math.cos(phase_x) * dx - ground[4] * ground[5] * math.cos(phase_y) * dy

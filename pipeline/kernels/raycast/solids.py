@@ -1,4 +1,4 @@
-"""Where a ray meets a box, a cylinder or an ellipsoid."""
+"""Intersection of a ray with a box, a cylinder or an ellipsoid."""
 
 import math
 

@@ -6,9 +6,9 @@ import math
 import numpy as np
 from numba import njit
 
-HIT, NEAR = 2, 1  # what a point scores in a cell with a surface, and in one beside it
-APART_M, APART_RAD = 1.0, 0.1  # from which on two poses are different answers
-RIVAL = 0.8  # share of the best score, from which on another answer is told
+HIT, NEAR = 2, 1  # score of a point in a cell with a surface, and in one beside it
+APART_M, APART_RAD = 1.0, 0.1  # least difference of two distinct poses
+RIVAL = 0.8  # share of the best score, from which on a distinct pose is returned as its rival
 
 
 @njit(cache=True, nogil=True)
@@ -51,7 +51,7 @@ def fill_pyramid(pyramid):
 def search(
     pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float
 ):
-    """The pose around T, within so many shifts of a cell and turns, whose points score best; and its rival.
+    """The best-scoring pose around T, within so many shifts of a cell and turns, and the best one apart from it.
 
     A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
     bound is split until one of a single shift comes first: nothing that is left can beat it. The search goes on
@@ -134,7 +134,7 @@ def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: 
 
 @njit(cache=True, inline="always")
 def _score(layer, cells, dx: int, dy: int) -> int:
-    """Sum of what the points, shifted by so many cells, find in a layer; cells outside hold nothing."""
+    """Score of the points, shifted by so many cells, in a layer; 0 for cells outside."""
     total = 0
     for i in range(cells.shape[0]):
         column, row = cells[i, 0] + dx, cells[i, 1] + dy

@@ -1,9 +1,9 @@
-"""A bird's-eye view of a local map: which heights are occupied above each cell of a square."""
+"""A bird's-eye view of a local map: the occupied heights above each cell of a square."""
 
 import numpy as np
 from numba import njit
 
-HEIGHTS = 64  # bits of a cell
+HEIGHTS = 64  # number of heights, one bit of a cell each
 
 
 @njit(cache=True, nogil=True)
@@ -27,7 +27,7 @@ def mark_heights(points, T, cell_m: float, masks):
 
 @njit(cache=True, nogil=True)
 def count_heights(masks, counts):
-    """Fill ``counts`` (S, S) uint8 with how many heights of each cell are occupied above its lowest one."""
+    """Fill ``counts`` (S, S) uint8 with the number of occupied heights of each cell above its lowest one."""
     for row in range(masks.shape[0]):
         for column in range(masks.shape[1]):
             mask = masks[row, column]

@@ -1,1 +1,1 @@
-"""Hash tables of voxels, and what they hold; compiled."""
+"""Hash tables of voxels, and their contents; compiled."""

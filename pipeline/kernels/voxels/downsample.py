@@ -1,4 +1,4 @@
-"""One point of every voxel of a scan, and the motion taken out of it."""
+"""Downsampling to one point a voxel, and deskewing."""
 
 import numpy as np
 from numba import njit
@@ -65,7 +65,7 @@ def gather(points, chosen, out):
 
 @njit(cache=True, nogil=True)
 def deskew(points, shares, twist):
-    """Move each point, in place, to where the lidar would see it at one instant, as a rule the scan's middle.
+    """Move each point, in place, to its position as seen by the lidar at one instant, usually the scan's middle.
 
     points : (N, d) meters, each in the lidar frame of its own instant
     shares : (N,) time from that instant to the point's own, in units of the time in which the lidar moves by twist

@@ -10,7 +10,7 @@ _LIMIT = (1 << 21) - 1
 
 @njit(cache=True, inline="always")
 def pack(ix: int, iy: int, iz: int) -> int:
-    """One non-negative int64 for a voxel; unique for coordinates in [−2²⁰, 2²⁰), where larger ones fold over."""
+    """One non-negative int64 for a voxel; unique for coordinates in [−2²⁰, 2²⁰), larger ones collide."""
     return (((ix + _OFFSET) & _LIMIT) << 42) | (((iy + _OFFSET) & _LIMIT) << 21) | ((iz + _OFFSET) & _LIMIT)
 
 
@@ -43,7 +43,7 @@ def find(keys, key: int):
 def find_row(rows, keys, key: int) -> int:
     """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
 
-    rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for a fast look
+    rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for fast probing
     """
     slot = _first_slot(rows.size, key)
     while True:

@@ -1,4 +1,4 @@
-"""A hash map of voxels that keep running moments of their points and the local shape fitted to them.
+"""A hash map of voxels with running moments of their points and the local shape fitted to them.
 
 A voxel's row of ``moments`` holds n, Σx, Σy, Σz, Σxx, Σxy, Σxz, Σyy, Σyz, Σzz relative to the voxel's center, so
 that nothing cancels far from the origin. Its row of ``cells`` holds what matching reads, two cache lines: mean
@@ -22,9 +22,9 @@ MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
 MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
 CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
-_GROWN = 1.3  # times the points of its last fit, from which on a voxel is fitted anew
-_BROAD = 0.125  # voxels, the least width of a plane that is fitted to a voxel's own points
-MANY = 30.0  # points, beyond which more of them tell nothing new, because their poses share errors
+_GROWN = 1.3  # factor by which the points of a voxel grow until it is fitted again
+_BROAD = 0.125  # least width, in voxels, of a plane that is fitted to a voxel's own points
+MANY = 30.0  # number of points beyond which more add no information, as their poses share errors
 
 
 class Voxels(NamedTuple):
@@ -45,7 +45,7 @@ class Voxels(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def insert(voxels, points, T, tick: int, alone: float):
-    """Add points (N, d), moved by T into the map's frame, and fit the voxels anew that have grown by enough.
+    """Add points (N, d), moved by T into the map's frame, and refit the voxels that have grown by enough.
 
     alone : points from which on a voxel is fitted without its neighbors
     Room for N more voxels must be there.

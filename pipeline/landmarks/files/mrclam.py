@@ -18,7 +18,7 @@ _ROBOTS = 5  # subjects 1 to 5 are robots, the others landmarks (Leung et al. 20
 
 @dataclass(frozen=True, slots=True)
 class RangeLog:
-    """What one robot logged, in order of time.
+    """Log of one robot, in order of time.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class RangeLog:
 
 
 def read_mrclam(folder: Path, robot: int) -> RangeLog:
-    """Read what robot ``robot`` logged; raises InputError for whatever is missing or wrong."""
+    """Log of robot ``robot``; raises InputError for whatever is missing or wrong."""
     if not (folder / "Barcodes.dat").is_file():
         raise InputError(
             f"{folder}: is no MRCLAM folder (Barcodes.dat is missing); name an npz file or such a folder"

@@ -26,7 +26,7 @@ _SHAPES = {
 def read_landmark_data(path: Path) -> LandmarkData:
     """Read a problem; raises InputError for whatever is wrong with the file, pickled objects included.
 
-    Nothing in the file says whether its observations are relative positions or bearings and ranges: the one that
+    The file does not state whether its observations are relative positions or bearings and ranges: the one that
     the true positions fit better is taken.
     """
     arrays = _read(path)
@@ -117,7 +117,7 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 
 
 def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
-    """What the true positions fit better: median distance of the measured point from the true one.
+    """Kind of the measurements: least median distance of the measured point from the true position.
 
     Raises InputError where they fit bearings in degrees best.
     """

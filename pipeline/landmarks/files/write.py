@@ -1,4 +1,4 @@
-"""Writes what a study found: tables as text, JSON and CSV."""
+"""Writes a study: tables as text, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def text_of(study: Study) -> str:
 
 
 def size_of(study: Study) -> str:
-    """A in words."""
+    """Size of A as text."""
     return (
         f"{counted(study.rows, 'row')}, {counted(study.columns, 'column')}, "
         f"{counted(study.entries, 'entry', 'entries')},"

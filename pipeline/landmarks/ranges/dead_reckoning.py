@@ -1,4 +1,4 @@
-"""Dead reckoning between the observations of a log: motions, their uncertainty and what they depend on."""
+"""Dead reckoning between the observations of a log: motions, their uncertainty and their Jacobians."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from scanchain.kernels.landmarks import dead_reckoning
 from scanchain.landmarks.bearing_range import Calibration
 from scanchain.landmarks.files.mrclam import RangeLog
 
-_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot is told to move
+_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
 
 OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
 _MEAN = np.zeros(5)
-_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # what differential drives may have; the units as above
+_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are taken
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoise:
-    """White noise of a robot's wheels: what its motion is off by after a meter, and after a radian turned.
+    """White noise of a robot's wheels: standard deviations of its motion after a meter, and after a radian turned.
 
     It grows with the root of either. The values at hand are of a small differential drive on a smooth floor.
     """
@@ -48,7 +48,7 @@ class Reckoning:
     ----------
     motion : (K − 1, 3) from each node to the next, in the frame of the former
     sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each noise of unit density, and by none
-    calibration : what the robot's velocities may be off by, and the motion's slope
+    calibration : errors of the robot's velocities, and the motion's Jacobian
     """
 
     motion: Matrix
@@ -89,7 +89,7 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 def _integrated(
     log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64], *, sources: int
 ) -> tuple[Matrix, Matrix]:
-    """Motions (K − 1, 3) and what so many sources of noise do to them (K − 1, sources, 3, 3)."""
+    """Motions (K − 1, 3) and their Jacobians by so many sources of noise (K − 1, sources, 3, 3)."""
     v, turn_rate = log.velocities.T
     driven = np.stack(
         [(1.0 + own[0]) * v + own[1] * np.abs(turn_rate), (1.0 + own[2]) * turn_rate + own[3] * v], axis=1

@@ -21,21 +21,21 @@ from scanchain.landmarks.solvers import LinearSolver
 _ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
 _SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
 _LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
-_LEAST_FREEDOM = 1e-3  # observations beyond what the state takes up
+_LEAST_FREEDOM = 1e-3  # least redundancy of the observations
 _TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
-_RECKONED = 2  # of them begin with dead reckoning anew, by the robot as it is known then
+_RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is known then
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
 
 
 class LogModel:
-    """What of a log's problem does not depend on its noise: nodes, landmarks, who saw what."""
+    """The part of a log's problem independent of its noise: nodes, landmarks, observations."""
 
     def __init__(self, log: RangeLog) -> None:
         self._log = log
         self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
         self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
         self.observed = np.stack([node, landmark], axis=1)
-        self.likeness = SightingPairs(log.seen_s, landmark)
+        self.sighting_pairs = SightingPairs(log.seen_s, landmark)
 
     def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
         """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
@@ -58,7 +58,7 @@ class LogModel:
 
 @dataclass(frozen=True, slots=True)
 class LogFit:
-    """A minimum, the noise it was found for, and what follows from both.
+    """A minimum, the noise it was found for, and their consistency.
 
     Attributes
     ----------
@@ -82,9 +82,9 @@ class LogFit:
 
 
 def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) -> LogFit:
-    """Estimate state and noise; that of the odometry stays what it is unless it is None.
+    """Estimate state and noise; that of the odometry is fixed unless it is None.
 
-    Raises InputError where the observations tell nothing of the sensor's.
+    Raises InputError where the observations contain no information about that of the sensor.
     """
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
     reckoning = model.reckoned(np.zeros(len(OWN)))
@@ -93,7 +93,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
     variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
     now = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
     if not np.all(now.consistency.redundancy > _LEAST_FREEDOM):
-        raise InputError("the landmarks were seen too seldom to tell the sensor's noise; give a longer log")
+        raise InputError("the landmarks were seen too seldom to estimate the sensor's noise; give a longer log")
     iterations = now.minimum.iterations
     for turn in range(_TURNS):
         growth = now.consistency.growth(stated / variances)
@@ -102,7 +102,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
         is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
         residuals = np.sqrt(now.minimum.weights / loss.share)[:, None] * now.minimum.at.observations
-        loss = StudentLoss(model.likeness.share(model.likeness.correlation(residuals)))
+        loss = StudentLoss(model.sighting_pairs.share(model.sighting_pairs.correlation(residuals)))
         state = now.minimum.state
         if turn < _RECKONED:
             reckoning = model.reckoned(state.calibration)
@@ -118,7 +118,7 @@ def fit_log(model: LogModel, noise: OdometryNoise | None, solver: LinearSolver) 
 
 @dataclass(frozen=True, slots=True)
 class _Settled:
-    """A minimum, the covariance there, and what its residuals say."""
+    """A minimum, the covariance there, and the consistency of its residuals."""
 
     minimum: Minimum
     covariance: Covariance
@@ -134,7 +134,7 @@ def _settled(
     solver: LinearSolver,
     tolerance: float,
 ) -> _Settled:
-    """The minimum with noise as it is."""
+    """The minimum for a given noise."""
     minimum = minimize(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )

@@ -15,14 +15,14 @@ from scanchain.landmarks.minimize import Minimum
 _FREEDOM = 4.0
 _SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
 _LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # edges; farther apart errors count as independent
-_FEWEST = 30  # pairs that tell a correlation
-_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that what was stated counts as
-_LEAST_REDUNDANCY = 0.05  # of what the sightings count as
+_FEWEST = 30  # least number of pairs from which a correlation is estimated
+_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the stated noise counts as
+_LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
 
 
 @dataclass(frozen=True, slots=True)
 class StudentLoss:
-    """ρ(χ²) of a bearing and a range together, ν = 4, times what the observation counts as.
+    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class SightingPairs:
         return np.minimum.accumulate(np.clip(found, 0.0, 1.0)).astype(np.float64)
 
     def share(self, correlation: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How much of an independent sighting each is, (N,): one over the sum of its correlations (Kish 1965)."""
+        """Weight of each sighting as a share of an independent one, (N,): 1 / Σ of correlations (Kish 1965)."""
         alike = correlation[self._lag]
         sums = np.bincount(self._first, alike, self._count) + np.bincount(self._second, alike, self._count)
         return (1.0 / (1.0 + sums)).astype(np.float64)
@@ -73,13 +73,13 @@ class SightingPairs:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """What an estimate's residuals say about the noise it was found with.
+    """Consistency of an estimate's residuals with the noise it was found with.
 
     Attributes
     ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
     motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
-    sightings : what all of them count as
+    sightings : effective number of them
     sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
     """
 
@@ -93,11 +93,11 @@ class Consistency:
 
     @property
     def sensor_freedom(self) -> NDArray[np.float64]:
-        """The redundancy, but a small share of the sightings where shares are too rough for it, (2,)."""
+        """The redundancy, at least a small share of the sightings, (2,)."""
         return np.maximum(self.redundancy, _LEAST_REDUNDANCY * self.sightings)
 
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
-        """By what the variances, those of odometry first, should grow, (6,); one where they are right.
+        """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
 
         stated : (6,) what they were thought to be beforehand, in units of what they are now
         """
@@ -113,7 +113,7 @@ def consistency(
     sources: Matrix,
     share: NDArray[np.float64],
 ) -> Consistency:
-    """Weigh residuals against what they should be where the noise is right.
+    """Compare residuals with their expectation under the noise model.
 
     With r a whitened motion, W its whitening, H = J C Jᵀ its leverage and V = Σ Vₛ its covariance by sources, the
     part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). Of observations,

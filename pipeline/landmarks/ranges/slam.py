@@ -21,7 +21,7 @@ from scanchain.landmarks.system import landmark_columns, pose_columns
 
 @dataclass(frozen=True, slots=True)
 class RangeSolution:
-    """What became of a range log.
+    """Solution of a range log.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class RangeSolution:
     pose_covariance, landmark_covariance : (K, 3, 3), (L, 2, 2) relative to the first pose
     odometry_noise : estimated, or as stated
     bearing_sigma_rad, range_sigma_m : noise of the sensor, estimated
-    loss : with which the observations were weighed; it knows the share of each
+    loss : with which the observations were weighed; with the share of each
     weights : (N,) robust weight of every observation, times its share
     motion_chi2, observation_chi2 : χ² per degree of freedom of either kind, observations weighed; 1 is a noise
         model that fits

@@ -30,7 +30,7 @@ _MAKERS = {
     "spqr_colamd": lambda: SuiteSparseQrSolver("colamd"),
 }
 METHODS = tuple(name for name in _MAKERS if not name.startswith("spqr"))
-ESTIMATOR = "schur"  # the fastest: it estimates where no other is asked for
+ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
 
 
 def create_solver(method: str) -> LinearSolver:
@@ -53,14 +53,14 @@ def parse_methods(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def methods_for(asked: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:
-    """Methods to run on a problem of so many unknowns, and what is to be said of one that "all" leaves out there.
+def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:
+    """Methods to run on a problem of so many unknowns, and a note on one that "all" leaves out there.
 
     "all" is every method of the default installation. Raises InputError where one is named that is too slow.
     """
-    if "pinv" in asked:
+    if "pinv" in requested:
         check_pinv(unknowns)
-    chosen = dict.fromkeys(method for name in asked for method in (METHODS if name == "all" else (name,)))
+    chosen = dict.fromkeys(method for name in requested for method in (METHODS if name == "all" else (name,)))
     if "pinv" not in chosen or unknowns < PINV_BELOW:
         return tuple(chosen), ""
     del chosen["pinv"]

@@ -26,11 +26,11 @@ class NormalEquations:
 
     def __init__(self, pattern: Pattern) -> None:
         n = pattern.shape[1]
-        start, partners, self._slots = normal_equations.product_structure(
+        start, others, self._slots = normal_equations.product_structure(
             pattern.row_start, pattern.columns, *pattern.by_column()
         )
         owners = np.repeat(np.arange(n), np.diff(start))
-        self.pattern = BlockPattern(np.ones(n, np.int64), np.stack([owners, partners], axis=1))
+        self.pattern = BlockPattern(np.ones(n, np.int64), np.stack([owners, others], axis=1))
 
     def form(self, system: LinearSystem) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Values of H and g."""
@@ -41,7 +41,7 @@ class NormalEquations:
 
 
 class CholeskySolver:
-    """Multifrontal Cholesky of AᵀA; while the pattern is the same only the numbers are done anew."""
+    """Multifrontal Cholesky of AᵀA; while the pattern is the same only the numbers are computed again."""
 
     def __init__(self) -> None:
         self._known: tuple[Pattern, NormalEquations, SparseCholesky] | None = None

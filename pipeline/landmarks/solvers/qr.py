@@ -21,7 +21,7 @@ Ordering = Literal["natural", "colamd"]
 
 @dataclass(frozen=True, slots=True)
 class _Analysis:
-    """What follows from the pattern: the asked order, the place of each column, fronts, and their rows of A."""
+    """Analysis of the pattern: requested order, position of each column, fronts, and their rows of A."""
 
     order: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -33,7 +33,7 @@ class _Analysis:
 
 
 class QrSolver:
-    """Householder QR of the project's own; its analysis is kept while the pattern is the same."""
+    """Householder QR of the project's own; its analysis is reused while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering
@@ -61,10 +61,10 @@ class QrSolver:
         sparse_qr.back_substitute(fronts, R, z)
         x = z[analysis.place]
         solve_s = watch.lap()
-        to_asked = analysis.place[analysis.order]
+        to_requested = analysis.place[analysis.order]
         return Solution(
             x, build_s, factor_s, solve_s,
-            lambda: Factor("R of A", matrix[to_asked][:, to_asked].tocsc(), analysis.order),
+            lambda: Factor("R of A", matrix[to_requested][:, to_requested].tocsc(), analysis.order),
         )  # fmt: skip
 
     def _analysis(self, pattern: Pattern) -> _Analysis:
@@ -76,16 +76,16 @@ class QrSolver:
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
     """Order the columns and lay out the fronts.
 
-    Within the asked order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
-    it is (Liu 1990), so that R can be given in the order asked for.
+    Within that order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
+    it is (Liu 1990), so that R can be given in the requested order.
     """
     n = pattern.shape[1]
     column_start, rows = pattern.by_column()
     order = np.arange(n)
     if ordering == "colamd":
         order = column_order.column_minimum_degree(pattern.row_start, pattern.columns, column_start, rows)
-    start, partners, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
-    start, neighbors = _neighbor_lists(start, partners)
+    start, others, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
+    start, neighbors = _neighbor_lists(start, others)
     after = symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))
     eliminated = order[after]
     parent = symbolic.elimination_tree(start, neighbors, eliminated)
@@ -99,10 +99,10 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
 
 
 def _neighbor_lists(
-    start: NDArray[np.int64], partners: NDArray[np.int64]
+    start: NDArray[np.int64], others: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every column's partners on either side, from those beyond it: (start (n + 1,), neighbors)."""
+    """Every column's neighbors on either side, from those beyond it: (start (n + 1,), neighbors)."""
     n = len(start) - 1
-    beyond = csr_matrix((np.ones(len(partners), np.int8), partners, start), shape=(n, n))
+    beyond = csr_matrix((np.ones(len(others), np.int8), others, start), shape=(n, n))
     both = csr_matrix(beyond + beyond.T)
     return both.indptr.astype(np.int64), both.indices.astype(np.int64)

@@ -19,13 +19,13 @@ from scanchain.kernels.landmarks import arrow
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern
 
-_WIDEST_BAND = 64  # scalars; beyond it poses are joined by more than odometry
-_LARGEST_BORDER = 25_000_000  # numbers of the dense border, 200 MB
+_WIDEST_BAND = 64  # widest band in scalars; beyond it poses are joined by more than odometry
+_LARGEST_BORDER = 25_000_000  # largest number of entries of the dense border: 200 MB
 
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """What is left for the poses, as the sparse Cholesky factorization takes it: its pattern, with the factor."""
+    """The reduced system of the poses: its pattern, with the sparse Cholesky factor."""
 
     rows: NDArray[np.int32]
     columns: NDArray[np.int32]
@@ -76,7 +76,7 @@ class LandmarkElimination:
         return roots
 
     def _factored(self, S: csc_matrix, diagonal: NDArray[np.float64], system: LinearSystem) -> SparseCholesky:
-        """The factor of S; its analysis is kept while its pattern is the same."""
+        """The factor of S; its analysis is reused while its pattern is the same."""
         lower = coo_matrix(S)
         beyond = lower.row > lower.col
         rows, columns = lower.row[beyond], lower.col[beyond]
@@ -200,7 +200,7 @@ def _eliminate(H: Arrow, system: LinearSystem) -> None:
 
 
 def _factor_of_arrow(U: Arrow) -> Factor:
-    """The three parts put together, with every place that may fill in."""
+    """The three parts put together, with every entry that may fill in."""
     width, split = U.band.shape[0] - 1, U.band.shape[1]
     n, rest = split + len(U.corner), len(U.corner)
     places = np.indices(U.band.shape).reshape(2, -1)

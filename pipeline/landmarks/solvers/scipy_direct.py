@@ -1,4 +1,4 @@
-"""The methods of the course report that scipy brings: on the normal equations AᵀA x = Aᵀb, with SuperLU."""
+"""The methods of the course report in scipy: on the normal equations AᵀA x = Aᵀb, with SuperLU."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scanchain.errors import InputError
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem
 
-PINV_BELOW = 3_000  # unknowns: their inverse is all but dense, 110 MB with its indices, and takes seconds
+PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
 
 
 class PinvSolver:
@@ -50,7 +50,7 @@ def check_pinv(unknowns: int) -> None:
 
 
 class DefaultSolver:
-    """``default``: scipy's spsolve, which keeps its factor to itself.
+    """``default``: scipy's spsolve, which returns no factor.
 
     Its time counts as factorization. The factor is that of splu with the same settings as spsolve has.
     """
@@ -86,7 +86,7 @@ class LuSolver:
 
 @contextmanager
 def _naming_the_undetermined(system: LinearSystem) -> Iterator[None]:
-    """What scipy says of a singular matrix becomes the error that names its unknowns."""
+    """Raise scipy's error about a singular matrix as one that names its unknowns."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", MatrixRankWarning)

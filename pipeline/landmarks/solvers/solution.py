@@ -1,4 +1,4 @@
-"""What every linear solver returns, and what it raises where the unknowns are not determined."""
+"""Solution, factor and error of the linear solvers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Factor:
 
     Attributes
     ----------
-    name : what it is, as "U of AᵀA" or "R of A"
+    name : such as "U of AᵀA" or "R of A"
     matrix : (n, n) its rows and columns as the method ordered them; may hold zeros where it could have filled in
     order : (n,) column of A at each place of that order
     """
@@ -42,7 +42,7 @@ class Factor:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The answer of a linear solver.
+    """Result of a linear solver.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Solution:
 
 
 class LinearSolver(Protocol):
-    """Solves A x = b; keeps the structure that it found for as long as the pattern is the same object."""
+    """Solves A x = b; reuses its analysis for as long as the pattern is the same object."""
 
     def solve(self, system: LinearSystem) -> Solution:
         """Solve in the least-squares sense; raises UndeterminedError where A has not full column rank."""
@@ -74,7 +74,7 @@ class LinearSolver(Protocol):
 
 
 class UndeterminedError(InputError):
-    """The equations leave unknowns open; ``columns`` are theirs."""
+    """The equations do not determine some unknowns, whose ``columns`` these are."""
 
     def __init__(self, layout: Layout, columns: NDArray[np.int64]) -> None:
         names = ", ".join(layout.name(int(column)) for column in columns[:_NAMED])
@@ -87,7 +87,7 @@ class UndeterminedError(InputError):
 
 
 class Stopwatch:
-    """Seconds since it was last asked."""
+    """Seconds since the last lap."""
 
     def __init__(self) -> None:
         self._last_s = working_s()
@@ -100,7 +100,7 @@ class Stopwatch:
 
 
 def undetermined(system: LinearSystem) -> UndeterminedError:
-    """Name the unknowns that A leaves open: those with a share in its null space.
+    """Error that names the undetermined unknowns: those with a share in the null space of A.
 
     ε (H + ε I)⁻¹ tends to the projection onto the null space of H = AᵀA, here scaled to a unit diagonal; applied
     a few times to a random vector it leaves a nonzero entry just where some null vector has one.

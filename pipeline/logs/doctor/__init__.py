@@ -1,1 +1,1 @@
-"""Faults of a log: what they are, how much they matter, what helps."""
+"""Faults of a log: severity, effect, fix."""

@@ -19,17 +19,17 @@ from scanchain.logs.doctor.statistics import LEAST_S, Rest, Survey
 from scanchain.words import counted
 
 _MANY_LOST = 0.5
-_MANY_UNUSED = 0.3  # of returns, from which on a wider range is of use
-_SOME_BELOW = 0.05  # of beams, below range_min
-_STUCK_SHARE = 0.01  # of beams, all at the farthest range
+_MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
+_SOME_BELOW = 0.05  # share of beams below range_min that is reported
+_STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _LONG_REST_S = 5.0
-_WHEELS_MOVE = 0.02  # meters, or the sine of a turn
+_WHEELS_MOVE = 0.02  # least motion by the wheels that ends a rest: meters, or the sine of a turn
 _FEW_POINTS = 50
-_OPEN = 0.003  # information about the weakest motion, below which matches are degenerate as a rule
+_OPEN = 0.003  # information about the weakest motion, below which matches are usually degenerate
 
 _VOXEL_M = 0.5  # at most one point in each, in 3D: else the ground near the lidar outweighs all else
-_POINTS = 1500  # whose normals are estimated, at most
-_NEIGHBORS = {2: 7, 3: 10}  # of a point, for its normal
+_POINTS = 1500  # largest number of points whose normals are estimated
+_NEIGHBORS = {2: 7, 3: 10}  # number of neighbors from which a point's normal is estimated
 _FLAT = 0.02  # largest ratio of the two least eigenvalues of the covariance of neighbors on a surface
 _LINE = 0.03  # least ratio of the two largest ones: neighbors on one ring make no surface
 _FEW_SURFACES = 20
@@ -119,17 +119,17 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
 
 
 def _no_return(seen: Survey) -> Finding:
-    """Whether many beams tell one farthest range, as scanners do that write a number for no return."""
+    """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
     values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
     farthest_m = max(values, default=0.0)
-    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below what is told, to the last bit
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below the stated range, to the last bit
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
-    told_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
-    limit_m = min(told_m, seen.log.config.max_range_m)
+    stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
+    limit_m = min(stated_m, seen.log.config.max_range_m)
     if share < _STUCK_SHARE:
-        return Finding("no return", Severity.OK, "no range is told so often that it must stand for no return")
-    found = f"{100 * share:.2g} % of the beams tell exactly {farthest_m:.6g} m, the farthest there is"
+        return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
+    found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
     if farthest_m >= limit_m:
         return Finding("no return", Severity.OK, f"{found}; range limits take it out")
     effect = "if it stands for no return, it is taken for a wall that moves along"
@@ -155,7 +155,7 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
 
 
 def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
-    """Whether the surfaces in sight determine every motion; a run judges this by matching, scan by scan."""
+    """Finding on surfaces that leave a motion unobservable; a run tests this by matching, scan by scan."""
     found = [weakest_motion(sample, preprocess) for sample in seen.samples]
     open_motions = Counter(each.direction for each in found if each.information < _OPEN)
     bad = open_motions.total()
@@ -164,17 +164,17 @@ def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
             "surfaces", Severity.OK, f"they determine every motion in {counted(len(found), 'scan')} looked at"
         )
     motions = " and ".join(motion for motion, _ in open_motions.most_common(2))
-    told = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
+    extent = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
     effect = "scans are degenerate there, that motion is predicted; a run most of whose scans are so is unreliable"
     if not seen.wheels:
         effect += "; wheel odometry, or a lidar with a wider view or a longer range, helps"
-    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, told, effect)
+    return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, extent, effect)
 
 
 def _rings(seen: Survey) -> Finding:
     rings = [scan.rings for scan in seen.scans]
     if not any(rings):
-        return Finding("rings", Severity.OK, "points do not tell their ring; a run does not need it")
+        return Finding("rings", Severity.OK, "points have no field of their ring; a run does not need it")
     most, least = max(rings), min(rings)
     found = counted(most, "ring") if most == least else f"{least} to {most} rings"
     if least < most:
@@ -195,7 +195,7 @@ def _duplicates(seen: Survey) -> Finding:
 
 
 def _rest(seen: Survey) -> Finding:
-    """How long the surroundings do not change and the wheels, where there are any, do not move."""
+    """Finding on the time during which neither the surroundings change nor the wheels, if any, move."""
     rests = [_until_wheels_move(seen, rest) for rest in seen.rests]
     rests = [rest for rest in rests if rest.duration_s >= LEAST_S]
     still_s = sum(rest.duration_s for rest in rests)
@@ -205,7 +205,7 @@ def _rest(seen: Survey) -> Finding:
         f"{still_s:.1f} of {total_s:.1f} s nothing changes from scan to scan, {first_s:.1f} s of it at the start"
     )
     if rests and rests[0].last - rests[0].first == len(seen.scans) - 1:
-        effect = "nothing moves, or all looks alike as in a bare corridor: the trajectory is one point"
+        effect = "nothing moves, or all scans are the same as in a bare corridor: the trajectory is one point"
         return Finding("rest", Severity.WARNING, found, effect)
     if first_s > _LONG_REST_S:
         effect = "the trajectory drifts by millimeters meanwhile, and it takes time"
@@ -216,7 +216,7 @@ def _rest(seen: Survey) -> Finding:
 
 
 def _until_wheels_move(seen: Survey, rest: Rest) -> Rest:
-    """The rest up to where the wheels tell a motion."""
+    """The rest up to the first motion by the wheels."""
     begin_ns, end_ns = seen.stamps_ns[rest.first], seen.stamps_ns[rest.last]
     poses = [pose for pose in seen.wheels if begin_ns <= pose.stamp_ns <= end_ns]
     for pose in poses:
@@ -235,13 +235,13 @@ def _mounting(seen: Survey) -> Finding:
         return Finding(
             "mounting", Severity.PROBLEM, f"scans in several frames: {', '.join(sorted(frames))}", effect
         )
-    told = next((note for note in seen.log.notes if note.startswith("no static transform")), "")
-    if told:
+    note = next((line for line in seen.log.notes if line.startswith("no static transform")), "")
+    if note:
         effect = "trajectories are the lidar's; record /tf_static"
         if not seen.wheels:
-            return Finding("mounting", Severity.WARNING, told, effect)
+            return Finding("mounting", Severity.WARNING, note, effect)
         effect += ", as the wheels' turns are taken about the lidar instead of the robot"
-        return Finding("mounting", Severity.WARNING, told, effect, "--odometry.prior constant-velocity")
+        return Finding("mounting", Severity.WARNING, note, effect, "--odometry.prior constant-velocity")
     place = ", ".join(f"{value:.3f}" for value in seen.log.T_base_lidar[:-1, -1])
     mounting = seen.log.mounting
     if mounting.motion is not None:
@@ -249,14 +249,14 @@ def _mounting(seen: Survey) -> Finding:
         effect += "; wheels are carried over to it by /tf" if seen.log.has_odometry else ""
         return Finding("mounting", Severity.NOTE, f"the lidar moves: {mounting.motion}", effect)
     if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
-        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not told")
+        return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not stated")
     return Finding(
         "mounting", Severity.OK, f"lidar frame {frame}: at {place} m of {mounting.base_name}, {mounting.source}"
     )
 
 
 class Weakest(NamedTuple):
-    """The motion that a scan's surfaces determine least: 0 to 1, relative to one that all constrain; and which."""
+    """The least observable motion of a scan: its relative information, 0 to 1, and its name."""
 
     information: float
     direction: str

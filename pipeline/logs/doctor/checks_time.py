@@ -16,17 +16,17 @@ from scanchain.logs.messages.readers import is_scan
 from scanchain.words import counted
 
 _GAP_PERIODS = 2.5
-_MOST_MISSING = 10  # scans in a row, beyond which a step of the stamps tells nothing of their jitter
-_JITTER = 0.1  # of the period
+_MOST_MISSING = 10  # largest number of scans missing in a row at which a step of the stamps counts as jitter
+_JITTER = 0.1  # least jitter that is reported, as a share of the period
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _SLOW_HZ = 4.0
 _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
-_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # of the period, where a unit of time is hard to believe
+_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
-_WIDE_M = 8  # of a search for motions of meters between scans
-_SURE = 0.9  # share of the scans that turn alike, and how alike they begin
-_NEAR_NS = 500_000_000  # as far as a run looks for the wheels' reading
+_WIDE_M = 8  # least radius of a search for motions of meters between scans
+_SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
+_NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 
 
 def check_time(seen: Survey, matching: MatchingConfig) -> Iterator[Finding]:
@@ -82,7 +82,7 @@ def _gaps(seen: Survey) -> Finding:
 
 
 def _periods(seen: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How many periods lie between scans and the scan before, by the stamps, and the seconds that are left over.
+    """Number of periods between each scan and the scan before, by the stamps, and the seconds left over.
 
     Missing scans make two periods or more of one; stamps that step back, repeat or jump are left out.
     """
@@ -95,7 +95,7 @@ def _periods(seen: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _jitter(seen: Survey) -> Finding:
     _, off_s = _periods(seen)
     if not len(off_s):
-        return Finding("jitter", Severity.OK, "too few scans to tell")
+        return Finding("jitter", Severity.OK, "too few scans for statistics")
     jitter_s = float(np.std(off_s))
     share = jitter_s / seen.period_s
     found = (
@@ -173,7 +173,7 @@ def _point_times(seen: Survey) -> Finding:
 
 
 def _by_azimuth(seen: Survey) -> str:
-    """Flags that tell the times of a lidar that spins by its azimuth, where the order of its points shows how."""
+    """Flags for a spinning lidar's times by azimuth, where the order of its points shows how it turns."""
     turns = np.array([scan.turn for scan in seen.scans])
     sense = int(np.sign(turns.sum()))
     start = complex(np.mean(np.exp(1j * np.array([scan.start_rad for scan in seen.scans])[turns == sense])))
@@ -181,9 +181,11 @@ def _by_azimuth(seen: Survey) -> str:
         return ""
     low_s, high_s = _SPINS_AT_S
     revolution_s = f"{seen.period_s:.3g}" if low_s < seen.period_s < high_s else "0.1"
-    way = "counterclockwise" if sense > 0 else "clockwise"
+    direction = "counterclockwise" if sense > 0 else "clockwise"
     start_rad = f"{np.angle(start) % (2.0 * np.pi):.3g}"
-    return f"--log.point_times {way} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+    return (
+        f"--log.point_times {direction} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+    )
 
 
 def _other_unit(seen: Survey, part: float) -> str:

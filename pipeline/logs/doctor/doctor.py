@@ -1,4 +1,4 @@
-"""What is wrong with a log, what that does to the result, and the flags that help."""
+"""Diagnosis of a log: its faults, their effect on the result, and the flags that fix them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def examine(
     log_config: LogConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> Diagnosis:
-    """Look at every scan of a log. Raises InputError where a run could not open it either.
+    """Diagnosis from every scan of a log. Raises InputError where a run could not open it either.
 
     config_of : what a run would use for a log of this dimension
     """
@@ -52,7 +52,7 @@ def examine(
 
 
 def _sensors(log: Log) -> Finding:
-    """What else there is, and whether a run uses it."""
+    """Finding on other sensors, and their use by a run."""
     seen = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
     found = "; ".join(f"{each.sensor} {each.topic}: {each.use}" for each in seen)
     return Finding("sensors", Severity.OK, found or "no IMU, GNSS or ground truth")

@@ -1,4 +1,4 @@
-"""What the doctor says of a log."""
+"""A finding of the doctor, and its severity."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Severity(StrEnum):
-    """How much a finding matters to a run."""
+    """Severity of a finding for a run."""
 
     OK = "ok"
     NOTE = "note"
@@ -17,7 +17,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes
     ----------

@@ -26,24 +26,24 @@ from scanchain.words import grouped
 
 _FORGOTTEN = np.empty(0)
 _NO_POINTS = np.empty((0, 2), np.float32)
-_SAMPLED = 10  # scans whose points are looked at
+_SAMPLED = 10  # number of scans whose points are analyzed
 
 RING_FIELDS = ("ring", "line", "channel")
 _AZIMUTHS, _ELEVATIONS = 72, 64  # cells of an outline
 _STEEPEST = 0.7  # sine of the elevation of the uppermost cells
 _OUTLINE_POINTS = 8192
 _PERCENT = np.arange(101)
-_NEXT_RAD = 0.2  # from one point to the next, as a rule, where their order is that of firing
-_ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # stored ring by ring they make many, and none tells the start
+_NEXT_RAD = 0.2  # largest angle from one point to the next, usually, where their order is that of firing
+_ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # one revolution; clouds stored ring by ring turn many times
 
 _QUARTER = 75.0  # percentile of the cells' changes: a wall ahead moves, those beside do not
-_STILL_M = {2: 0.03, 3: 0.08}  # more than the noise of such scanners
-LEAST_S = 1.0  # a shorter rest is none
+_STILL_M = {2: 0.03, 3: 0.08}  # largest change at rest: above the noise of such scanners
+LEAST_S = 1.0  # seconds below which a rest is not recorded
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What a log's scans and wheels show.
+    """Statistics of a log's scans and wheels.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Survey:
 
 
 def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Survey:
-    """Look at every scan of the chosen part. Raises InputError where none is readable."""
+    """Statistics of every scan of the chosen part. Raises InputError where none is readable."""
     times = PointTimes(log.config)
     decoders = {log.topic: facts_of(log.decoder(times)), **log.pose_decoders}
     damage = [line for index in log.indexes for line in index.damage]
@@ -135,20 +135,20 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
 
 
 class ScanFacts(NamedTuple):
-    """One scan.
+    """Statistics of one scan.
 
     Attributes
     ----------
     beams : measurements in the message; ``undefined`` are NaN or infinite, ``zero`` are at no distance at all
     below : closer than ``limits_m``, though not at no distance
     kept : what a run would use
-    limits_m : the least and the largest range that the message believes in, 0 and inf where it tells none
-    farthest_m, at_farthest : the largest finite range and how many beams tell just that one
+    limits_m : the least and the largest valid range of the message, 0 and inf where it states none
+    farthest_m, at_farthest : the largest finite range and the number of beams with just that one
     ranges_m : (101,) percentiles of the ranges that are kept, NaN where none is
     time_span_s : of the per-point times, NaN where there are none
     turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
     start_rad : azimuth of the first point
-    rings : rings with returns, 0 where points do not tell
+    rings : rings with returns, 0 where points have no field for it
     digest : of the measurements, equal for equal ones
     points : (N, d) meters, those that are kept
     outline : (C,) meters, mean distance in each cell of direction, NaN where nothing was seen
@@ -175,7 +175,7 @@ class ScanFacts(NamedTuple):
 
 
 def facts_of(decoder: LaserScanDecoder | PointCloudDecoder) -> Callable[[memoryview], ScanFacts]:
-    """What looks at a message with the eyes of a run's decoder."""
+    """Function from a message to its statistics, by a run's decoder."""
     if isinstance(decoder, LaserScanDecoder):
         return lambda data: _of_scan(decoder, decoder.read(data))
     return lambda data: _of_cloud(decoder, decoder.read(data))
@@ -235,7 +235,7 @@ def _facts(
 
 
 def _turning(points: RawPoints) -> tuple[int, float]:
-    """Which way round the points follow each other, 0 where they make no single turn, and where they begin."""
+    """Direction in which the points turn, 0 where they make no single turn, and their first azimuth."""
     if len(points) < 2:
         return 0, float("nan")
     azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -260,12 +260,12 @@ def _outline(points: RawPoints) -> NDArray[np.float64]:
 
 
 def _cell(place: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Which of ``count`` equal parts of [-1, 1] a number lies in."""
+    """Index of a number's cell among ``count`` equal cells of [-1, 1]."""
     return np.clip((0.5 * (place + 1.0) * count).astype(np.int64), 0, count - 1)
 
 
 class Rest(NamedTuple):
-    """A time at rest, from one scan to another, by their places and log times."""
+    """A time at rest, from one scan to another, by their indices and log times."""
 
     first: int
     last: int
@@ -279,7 +279,7 @@ class Rest(NamedTuple):
 
 
 class RestWatch:
-    """Compares each scan with the one since which nothing has changed; ``rests`` are those of a second or more."""
+    """Detector of rests: compares each scan with the first one of a rest; ``rests`` last a second or more."""
 
     def __init__(self, dimension: int) -> None:
         self.still_m = _STILL_M[dimension]
@@ -289,7 +289,7 @@ class RestWatch:
         self.rests: list[Rest] = []
 
     def take(self, outline: NDArray[np.float64], log_time_ns: int) -> None:
-        """Look at the next scan, the mean distances (C,) of its cells."""
+        """Add the next scan, by the mean distances (C,) of its cells."""
         if self.anchor is None or self._change_m(outline, self.anchor) > self.still_m:
             self.close()
             self.anchor = outline
@@ -299,7 +299,7 @@ class RestWatch:
         self.count += 1
 
     def close(self) -> None:
-        """Keep what has lasted long enough."""
+        """Store the last rest if it was long enough."""
         if self.current.duration_s >= LEAST_S:
             self.rests.append(self.current)
         self.anchor = None

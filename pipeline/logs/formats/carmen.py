@@ -25,7 +25,7 @@ from scanchain.source import Source
 from scanchain.words import counted
 
 _LINES_A_BLOCK = 512
-_LEAST_STEP_NS = 100_000  # between the log times of two scans
+_LEAST_STEP_NS = 100_000  # least step between the log times of two scans
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
 KINDS = (b"FLASER", b"ROBOTLASER1", b"ODOM", b"TRUEPOS")
@@ -34,13 +34,13 @@ _LEAST_CODE_M = 81.83  # of a SICK LMS: from 8183 up its 13 bits are codes, such
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
 _HALF_TURN = math.pi
 
-_MOST_BYTES = 2 << 30  # of text
-_PLAIN_BYTES = 1 << 20  # read at once
+_MOST_BYTES = 2 << 30  # largest size of the text in bytes
+_PLAIN_BYTES = 1 << 20  # bytes read at once
 _PACKED_BYTES = 64  # unpacked at once: what comes of so many before damage is lost with it
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
-    """Whether a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
+    """True if a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
     word = head.split(maxsplit=1)[0] if head.strip() else b""
     is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()
     return head.startswith((b"BZh", b"\x1f\x8b")) or word.startswith(b"#") or is_word
@@ -76,7 +76,7 @@ class _Carmen:
             self._block(begin)
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
         index.make = self.make
-        self._tell()
+        self._summarize()
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """The messages of a block of lines."""
@@ -95,12 +95,12 @@ class _Carmen:
         words = self.text[line.begin : line.end].split()
         if line.kind in SCANS:
             offset_m, reach_m = (self.parameters.get(name, 0.0) for name in _PARAMETERS)
-            told = read_scan(words, line.stamp_ns, reach_m, offset_m)
+            stated = read_scan(words, line.stamp_ns, reach_m, offset_m)
             if is_first:
-                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", told.mounting))
+                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", stated.mounting))
                 yield self._message(self.mounting, line, data)
-            yield self._message(self.odometry, line, told.odometry)
-            yield self._message(self.scan, line, told.scan)
+            yield self._message(self.odometry, line, stated.odometry)
+            yield self._message(self.scan, line, stated.scan)
         elif line.kind == b"ODOM":
             yield self._message(self.odometry, line, read_pose(words, line.stamp_ns, "odom"))
         else:
@@ -150,7 +150,7 @@ class _Carmen:
         size = lines[-1].end - lines[0].begin
         add_block(self.index, begin, size, [line.log_time_ns for line in lines], counts)
 
-    def _tell(self) -> None:
+    def _summarize(self) -> None:
         if self.malformed:
             self.index.note_damage(_complaint(self.index.path, self.malformed))
         if self.others:
@@ -165,7 +165,7 @@ def _complaint(path: Source, malformed: list[int]) -> str:
 
 
 class Line(NamedTuple):
-    """Where a line lies in the text, of which kind it is, and at which log time it counts."""
+    """Offset of a line in the text, its kind, and its log time."""
 
     kind: bytes
     begin: int
@@ -184,7 +184,7 @@ class CarmenScan(NamedTuple):
 
 
 def stamp_of(words: list[bytes]) -> int:
-    """Nanoseconds of a line's own stamp, the third word from behind, held as the double that CARMEN keeps.
+    """Nanoseconds of a line's own stamp, the third word from behind, as a double like in CARMEN.
 
     Raises ValueError or IndexError where that is none.
     """
@@ -198,7 +198,7 @@ def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: f
     """A FLASER or ROBOTLASER1 line. Raises ValueError or IndexError where words are missing or no numbers.
 
     max_range_m, offset_m : the scanner's reach and its place ahead of the robot's center, as the log's PARAM
-        lines tell them for FLASER; ROBOTLASER1 tells both itself
+        lines set them for FLASER; ROBOTLASER1 states both itself
     """
     if words[0] == b"FLASER":
         count = int(words[1])
@@ -238,7 +238,7 @@ def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
 
 def _numbers(words: list[bytes], count: int) -> list[float]:
     if not 0 <= count <= len(words):
-        raise ValueError(f"{count} numbers are told, {len(words)} words follow")
+        raise ValueError(f"{count} numbers are stated, {len(words)} words follow")
     return [float(word) for word in words[:count]]
 
 
@@ -250,7 +250,7 @@ def _mounting(laser: list[float], robot: list[float]) -> Place:
 
 
 class Text(NamedTuple):
-    """What a file unpacks to; ``damage`` says what is wrong with the rest, empty where all is well."""
+    """Unpacked text of a file; ``damage`` describes what is missing, empty where all is well."""
 
     data: bytes
     damage: str
@@ -265,12 +265,12 @@ class _Unpacker(Protocol):
 
 
 def read_text(path: Path) -> Text:
-    """The text of a file. Raises InputError where it cannot be read or unpacks to more than is believed."""
+    """The text of a file. Raises InputError where it cannot be read or unpacks to more than the limit."""
     text = bytearray()
     try:
         with path.open("rb") as file:
-            for piece in _pieces(file):
-                text += piece
+            for block in _blocks(file):
+                text += block
                 if len(text) > _MOST_BYTES:
                     raise InputError(f"{path}: unpacks to more than {_MOST_BYTES:,} bytes; is it a CARMEN log?")
     except (zlib.error, EOFError, ValueError) as error:
@@ -282,7 +282,7 @@ def read_text(path: Path) -> Text:
     return Text(bytes(text), "")
 
 
-def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+def _blocks(file: IO[bytes]) -> Iterator[bytes]:
     head = file.read(3)
     file.seek(0)
     if head == b"BZh":
@@ -290,12 +290,12 @@ def _pieces(file: IO[bytes]) -> Iterator[bytes]:
     elif head[:2] == b"\x1f\x8b":
         yield from _unpacked(file, lambda: zlib.decompressobj(zlib.MAX_WBITS | 16))
     else:
-        while piece := file.read(_PLAIN_BYTES):
-            yield piece
+        while block := file.read(_PLAIN_BYTES):
+            yield block
 
 
 def _unpacked(file: IO[bytes], begin: Callable[[], _Unpacker]) -> Iterator[bytes]:
-    """What comes out of one packed stream after the other. Raises EOFError where the last is cut off."""
+    """Unpacked blocks of one packed stream after the other. Raises EOFError where the last is cut off."""
     unpacker = begin()
     while packed := file.read(_PACKED_BYTES):
         while packed:

@@ -23,7 +23,7 @@ _PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
     (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
 _MOST_PCD_LINES = 100
-_MOST_LZF_RATIO = 1000  # LZF cannot pack tighter than about 1 to 130
+_MOST_LZF_RATIO = 1000  # largest ratio of packing that is accepted; LZF reaches about 130
 
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -35,7 +35,7 @@ _MOST_PLY_LINES = 1000
 
 
 class CloudFileError(Exception):
-    """A file that does not hold what its header says; the message says what is wrong."""
+    """A file that contradicts its header; the message says where."""
 
 
 def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
@@ -61,7 +61,7 @@ def _all_of(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
 
 
 def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.void]:
-    """The points (N,) of a file as they are, little endian, in number types that ROS knows.
+    """The points (N,) of a file as they are, little endian, in number types of ROS.
 
     raw : a point of a .bin file
     Raises CloudFileError, and OSError where the file cannot be read.
@@ -82,7 +82,7 @@ def read_xyzi(path: Path) -> NDArray[np.void]:
 
 
 def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
-    """The points of a file that holds nothing else."""
+    """The points of a file without a header."""
     size = path.stat().st_size
     if size % point.itemsize:
         names = ", ".join(point.names or ())
@@ -115,7 +115,7 @@ def point_of_columns(kind: np.dtype[np.generic], count: int) -> np.dtype[np.void
 
 
 def _ros_type(kind: np.dtype[np.generic]) -> str:
-    """The number type itself, little endian; what ROS does not know becomes float64, of 16 bits float32."""
+    """The number type itself, little endian; float64 for one that ROS lacks, float32 for one of 16 bits."""
     if kind.kind == "f" and kind.itemsize not in (4, 8):
         return "<f4" if kind.itemsize == 2 else "<f8"
     return "<f8" if kind.itemsize == 8 else kind.newbyteorder("<").str.replace("|", "<")
@@ -128,7 +128,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         try:
             point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
         except (KeyError, IndexError, ValueError) as error:
-            raise CloudFileError(f"is no PCD: its header does not tell {error}") from error
+            raise CloudFileError(f"is no PCD: its header does not state {error}") from error
         if form == "ascii":
             return ascii_rows(file, point, count)
         return (
@@ -167,7 +167,9 @@ def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDAr
     packed_size, size = struct.unpack("<II", sizes)
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
-        raise CloudFileError(f"does not unpack: {size} bytes are told for {count} points, {len(packed)} are there")
+        raise CloudFileError(
+            f"does not unpack: {size} bytes are stated for {count} points, {len(packed)} are there"
+        )
     try:
         data = lzf.decompress(packed, size)
     except ValueError:
@@ -191,7 +193,7 @@ def read_ply(path: Path) -> NDArray[np.void]:
 
 
 def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
-    """The layout of a vertex, how many there are, and the form; vertices must come first, as they do."""
+    """The layout of a vertex, their number, and the form; vertices must come first, as they do."""
     fields: list[tuple[str, str]] = []
     form, element, count = "", "", 0
     for words in _ply_lines(file):

@@ -1,4 +1,4 @@
-"""A folder of PCD, PLY, .npy or raw .bin files, one a scan; stamps are in their names, or come at a rate."""
+"""A folder of PCD, PLY, .npy or raw .bin files, one a scan; stamps by their names, or at a rate."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud
 from scanchain.words import counted
 
-_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # by the number of digits since 2001
-_FIRST_FILES = 3  # of which one has to be readable to say what the files hold
-_LIKELY_COLUMNS = (4, 3, 5, 6)  # of .bin files; the first where nothing speaks for another
-_SAMPLE_BYTES, _VOTERS = 1 << 20, 5  # read of a .bin file, and of how many files about
-_SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # sizes of numbers that are plausible, and how many must be
-_FEWEST_ROWS = 20  # that tell columns apart
-_ALIKE, _HARDLY = 0.5, 0.05  # differences of columns, in spreads of the two, and of all, that are none
-_NOTHING = 0.1  # a contrast that speaks for no layout
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
+_FIRST_FILES = 3  # number of files of which one has to be readable
+_LIKELY_COLUMNS = (4, 3, 5, 6)  # numbers of columns of .bin files, the first where none is more likely
+_SAMPLE_BYTES, _VOTERS = 1 << 20, 5  # bytes read of a .bin file; number of files sampled
+_SMALLEST, _LARGEST, _MOSTLY = 1e-9, 1e7, 0.98  # plausible magnitudes, and least share of the numbers within
+_FEWEST_ROWS = 20  # least number of rows from which columns are distinguished
+_ALIKE, _HARDLY = 0.5, 0.05  # largest differences of equal columns, in spreads of the two, and of all
+_NOTHING = 0.1  # contrast below which no layout is preferred
 _NS = 1_000_000_000
 
 
 def claims_clouds(path: Path, _: bytes) -> bool:
-    """Whether it is a folder with such files."""
+    """True for a folder with such files."""
     return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
 
 
@@ -72,7 +72,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0) -> FileIndex:
 
 
 def _raw_point(folder: Path, files: Sequence[Path]) -> np.dtype[np.void]:
-    """How a point lies in .bin files."""
+    """Layout of a point in .bin files."""
     try:
         return raw_point(files if files[0].suffix.lower() == ".bin" else [])
     except CloudFileError as error:
@@ -80,7 +80,7 @@ def _raw_point(folder: Path, files: Sequence[Path]) -> np.dtype[np.void]:
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
-    """What the files hold, by the first that can be read."""
+    """Fields of the files, by the first that can be read."""
     for file in files[:_FIRST_FILES]:
         try:
             points = read_cloud_file(file, raw)
@@ -96,7 +96,7 @@ def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[
 
 
 def stamp_of_name(stem: str) -> int | None:
-    """The stamp in nanoseconds that a file's name tells, None where it tells none.
+    """The stamp in nanoseconds in a file's name, None where there is none.
 
     Understood are nanoseconds, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a
     fraction (``12.375``), and seconds and nanoseconds apart (``cloud_1583836591_182590976``).
@@ -125,18 +125,18 @@ def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
     stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
     if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
         raise InputError(
-            f"{folder}: names such as {files[0].name} tell no stamp of their own; say how often the scans come, "
+            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
             "as in --log.rate_hz 10"
         )
     return stamps_ns
 
 
 def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
-    """How a point lies in .bin files, which do not say: float32 or float64, x y z and up to three more columns.
+    """Layout of a point in .bin files, without a header: float32 or float64, x y z and up to three columns more.
 
     A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
     columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
-    so that all columns look alike. x, y, z, intensity where nothing speaks for another. Raises CloudFileError
+    so that all columns are equal. x, y, z, intensity where no other is more likely. Raises CloudFileError
     where none fits.
     """
     sizes = [file.stat().st_size for file in files]
@@ -152,7 +152,7 @@ def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
 
 
 def _likely_layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[np.void] | None:
-    """How the points of one file seem to lie, None where no layout fits."""
+    """Likely layout of the points of one file, None where no layout fits."""
     for kind in (np.dtype("<f4"), np.dtype("<f8")):
         values = sample[: len(sample) - len(sample) % kind.itemsize].view(kind)
         if not _are_plausible(values):
@@ -173,14 +173,14 @@ def _likely_layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[
 
 
 def _are_plausible(values: NDArray[np.floating]) -> bool:
-    """Whether bytes that are read as such numbers look like meters and the like: random bits would not."""
+    """True if bytes read as such numbers look like meters and the like: random bits would not."""
     with np.errstate(invalid="ignore"):
         size = np.abs(values.astype(np.float64))
     return bool(np.mean((size == 0.0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))) > _MOSTLY)
 
 
 def _contrast(values: NDArray[np.floating], columns: int) -> float:
-    """How far columns differ in mean and spread, in spreads of all numbers."""
+    """Difference of columns in mean and spread, in spreads of all numbers."""
     rows = _finite_rows(values, columns)
     if len(rows) < _FEWEST_ROWS:
         return 0.0
@@ -189,7 +189,7 @@ def _contrast(values: NDArray[np.floating], columns: int) -> float:
 
 
 def _repeats(values: NDArray[np.floating]) -> bool:
-    """Whether rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
+    """True if rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
     rows = _finite_rows(values, 6)
     mean, spread = rows.mean(axis=0).reshape(2, 3), rows.std(axis=0).reshape(2, 3)
     near = _ALIKE * spread.max(axis=0) + _HARDLY * rows.std()

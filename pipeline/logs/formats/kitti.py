@@ -22,22 +22,22 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
-_TRUTH = -1  # the block of the ground truth
+_TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720
 Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
-_MOST_LATITUDE = 89.0  # degrees; Mercator's projection has no poles
+_MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
 _NS = 1_000_000_000
 
 
 def claims_kitti_raw(path: Path, _: bytes) -> bool:
-    """Whether it is the folder of a drive."""
+    """True for the folder of a drive."""
     return (path / "velodyne_points").is_dir()
 
 
 def claims_kitti_odometry(path: Path, _: bytes) -> bool:
-    """Whether it is the folder of a sequence."""
+    """True for the folder of a sequence."""
     return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
 
 
@@ -72,7 +72,7 @@ def _raw_truth(index: FileIndex, folder: Path) -> Truth:
     if len(poses) != len(times_ns):
         raise InputError(
             f"{folder / 'oxts'}: has {counted(len(poses), 'reading')} and {counted(len(times_ns), 'time')}; "
-            "fetch it again"
+            "download it again"
         )
     return list(zip(times_ns, poses, strict=True))
 
@@ -87,7 +87,7 @@ def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) ->
 
 
 def _truth_or_none(index: FileIndex, read: Callable[[], Truth]) -> Truth:
-    """The ground truth; none where its files are damaged, which the sweeps do not suffer from."""
+    """The ground truth; none where its files are damaged, as the sweeps do not need it."""
     try:
         return read()
     except (InputError, LinAlgError) as error:
@@ -155,7 +155,7 @@ def read_seconds(file: Path) -> list[int]:
     """Nanoseconds of each line that is a number of seconds."""
     seconds = _table(file, 1)[:, 0].tolist()
     if not all(0.0 <= each * _NS < LATEST_NS for each in seconds):
-        raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; fetch it again")
+        raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; download it again")
     return [round(each * _NS) for each in seconds]
 
 
@@ -167,7 +167,9 @@ def read_calibration(file: Path) -> Pose:
         T[:3, :3] = np.array(entries["R"].split(), np.float64).reshape(3, 3)
         T[:3, 3] = np.array(entries["T"].split(), np.float64)
     except (KeyError, ValueError) as error:
-        raise InputError(f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); fetch it again") from error
+        raise InputError(
+            f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); download it again"
+        ) from error
     return T
 
 
@@ -181,7 +183,7 @@ def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
     if not len(rows):
         return np.empty((0, 4, 4))
     if np.abs(rows[:, 0]).max() > _MOST_LATITUDE:
-        raise InputError(f"{folder}: tells a latitude beyond {_MOST_LATITUDE:g} degrees; fetch it again")
+        raise InputError(f"{folder}: has a latitude beyond {_MOST_LATITUDE:g} degrees; download it again")
     latitude, longitude, up_m, roll, pitch, yaw = rows.T
     scale = np.cos(np.radians(latitude[0]))
     T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -204,7 +206,7 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
             [np.array(entries["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]
         )
     except (KeyError, ValueError) as error:
-        raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); fetch it again") from error
+        raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); download it again") from error
     T_world_lidar = T_world_camera @ T_camera_lidar
     return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
 
@@ -228,7 +230,7 @@ def _parsed(file: Path, number: int, line: str) -> int:
             raise ValueError("before 1970 or after 2038")
         return stamp_ns
     except ValueError as error:
-        raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); fetch it again") from error
+        raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); download it again") from error
 
 
 def _table(file: Path, columns: int) -> Matrix:
@@ -238,14 +240,14 @@ def _table(file: Path, columns: int) -> Matrix:
     if few:
         raise InputError(
             f"{file}: line {few} has {counted(len(words[few - 1]), 'column')}, {columns} are needed; "
-            "fetch it again"
+            "download it again"
         )
     try:
         rows = np.array([row[:columns] for row in words], np.float64).reshape(-1, columns)
     except ValueError as error:
-        raise InputError(f"{file}: is no table of numbers ({error}); fetch it again") from error
+        raise InputError(f"{file}: is no table of numbers ({error}); download it again") from error
     if not len(rows) or not np.isfinite(rows).all():
-        raise InputError(f"{file}: is empty, or holds numbers that are not finite; fetch it again")
+        raise InputError(f"{file}: is empty, or holds numbers that are not finite; download it again")
     return rows
 
 
@@ -253,4 +255,4 @@ def _lines(file: Path) -> list[str]:
     try:
         return [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); fetch it again") from error
+        raise InputError(f"{file}: cannot be read ({error.strerror}); download it again") from error

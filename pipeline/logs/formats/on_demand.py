@@ -23,7 +23,7 @@ def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
 def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
-    """Append a block: ``offset`` is whatever ``index.make`` finds it by, ``size`` about the bytes it will take."""
+    """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
     entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
     index.blocks.append(
         Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
@@ -43,7 +43,7 @@ def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
 
 
 def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
-    """A note on the files of a folder that hold scans, too, but are of other kinds than those taken."""
+    """A note on the files of a folder that hold scans, too, but are of another kind than those read."""
     counts = Counter(file.suffix.lower() for file in folder.iterdir() if file.is_file())
     others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != taken)
     if not others:
@@ -52,7 +52,7 @@ def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
 
 
 class UnknownFormatError(Exception):
-    """A file or folder that is no log of the format it was taken for: what is read of it, and what it lacks."""
+    """A file or folder that is no log of the assumed format: the expected contents, and what is missing."""
 
     def __init__(self, text: bytes, lack: str) -> None:
         super().__init__(lack)

@@ -1,6 +1,6 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-The records are walked as those of an MCAP file are, and what is damaged is passed over in the same way.
+The records are walked as those of an MCAP file are, and what is damaged is passed over likewise.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scanchain.errors import InputError
 from scanchain.logs.mcap.blocks import unpack
-from scanchain.logs.mcap.index import is_believable
+from scanchain.logs.mcap.index import is_plausible_size
 from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message
 from scanchain.logs.mcap.selection import messages_of
 from scanchain.words import counted
@@ -32,9 +32,9 @@ T = TypeVar("T", int, NDArray[np.int64])
 Data = mmap.mmap | memoryview | bytes
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
-_LONGEST_HEAD = 1 << 16  # bytes; a longer one is damage
-_OPCODE = re.compile(rb"\x04\0\0\0op=[\x04\x05\x07]")  # of an index, a chunk, a connection
-_MOST_BEFORE = 256  # bytes of a head before its opcode
+_LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
+_OPCODE = re.compile(rb"\x04\0\0\0op=[\x04\x05\x07]")  # opcode of an index, a chunk, a connection
+_MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
 
 _INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
 
@@ -81,17 +81,17 @@ def read_record(data: Data, offset: int) -> Record | None:
 
 def channel_of(file: int, record: Record, data: Data) -> Channel:
     """The channel that a connection record defines. Raises struct.error for one without its fields."""
-    told = _read_fields(bytes(data[record.begin : record.end]))
-    if told is None or b"message_definition" not in told:
+    stated = _read_fields(bytes(data[record.begin : record.end]))
+    if stated is None or b"message_definition" not in stated:
         raise struct.error("connection without its fields")
     number = record.number(b"conn")
-    topic, type_name = record.text(b"topic"), told.get(b"type", b"").decode("utf-8", "replace")
-    definition = told[b"message_definition"]
+    topic, type_name = record.text(b"topic"), stated.get(b"type", b"").decode("utf-8", "replace")
+    definition = stated[b"message_definition"]
     return Channel((file, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
 
 
 def whole_records(data: Data) -> Iterator[Record]:
-    """One record after the other. Raises struct.error where what follows is none, or not all of one."""
+    """One record after the other. Raises struct.error at bytes that are no record, or not all of one."""
     offset = 0
     while offset < len(data):
         record = read_record(data, offset)
@@ -101,10 +101,10 @@ def whole_records(data: Data) -> Iterator[Record]:
         offset = record.end
 
 
-def next_record(data: Data, offset: int, believed: int) -> Record | None:
+def next_record(data: Data, offset: int, stated_end: int) -> Record | None:
     """The first record behind the offset that may stand outside of a chunk; None where there is none.
 
-    believed : byte at which the damaged record ends if it tells the truth; no connection before it is taken, as
+    stated_end : byte at which the damaged record ends if its length is right; no connection before it is taken, as
         chunks hold such too
     """
     for match in _OPCODE.finditer(data, offset + 1):
@@ -112,13 +112,13 @@ def next_record(data: Data, offset: int, believed: int) -> Record | None:
             record = read_record(data, begin)
             if record is None or record.begin < match.end() or record.end > len(data):
                 continue
-            if record.opcode != CONNECTION or begin >= believed:
+            if record.opcode != CONNECTION or begin >= stated_end:
                 return record
     return None
 
 
 def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
-    """The fields of a head by name, None where it is not made of fields."""
+    """The fields of a record's head by name, None where it is not made of fields."""
     fields: dict[bytes, bytes] = {}
     offset = 0
     while offset < len(head):
@@ -139,7 +139,7 @@ class _Span(NamedTuple):
 
 
 def _sized(data: Data, offset: int) -> _Span | None:
-    """Where the bytes lie that have their length before them."""
+    """Span of the bytes behind their own length."""
     if offset + _LENGTH.size > len(data):
         return None
     begin = offset + _LENGTH.size
@@ -147,12 +147,12 @@ def _sized(data: Data, offset: int) -> _Span | None:
 
 
 def claims_ros1_bag(_: Path, head: bytes) -> bool:
-    """Whether a file begins as a bag of any version does."""
+    """True if a file begins as a bag of any version does."""
     return head.startswith(b"#ROSBAG")
 
 
 def index_ros1_bag(path: Path, number: int) -> FileIndex:
-    """What lies where in a bag. Raises InputError for one that is empty, encrypted or of an old version."""
+    """Index of a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
@@ -173,7 +173,7 @@ class _Bag:
         self.entries: list[Entry] = []
         self.times_ns: list[int] = []
         self.is_sure = True  # of the entries
-        self.told: Counter[int] = Counter()  # messages by connection, as the bag itself counts them
+        self.stated: Counter[int] = Counter()  # messages by connection, as the bag itself counts them
 
     def walk(self) -> None:
         """Take in one record after the other, and go on behind damage."""
@@ -200,11 +200,11 @@ class _Bag:
         self._close(complete=True)
 
     def finish(self) -> None:
-        """Count what there is, opening the chunks that nothing tells about."""
+        """Count the messages, opening the chunks without a complete index."""
         index = self.index
-        is_doubtful = bool(self.told) and self.told != _counts(index.blocks)
+        is_inconsistent = bool(self.stated) and self.stated != _counts(index.blocks)
         index.blocks = [
-            self._looked_into(block) if is_doubtful or not self._is_known(block) else block
+            self._unpacked(block) if is_inconsistent or not self._is_known(block) else block
             for block in index.blocks
         ]
         index.counts = dict(_counts(index.blocks))
@@ -212,10 +212,10 @@ class _Bag:
         index.is_counted = True
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a chunk; connections met on the way join the index."""
+        """The messages of a chunk; connections found there join the index."""
         name = f"{self.index.path}: the chunk at byte {block.offset}"
         messages: list[Message] = []
-        strangers = 0
+        undefined = 0
         try:
             payload = unpack(self.index, block)
             for record in whole_records(payload):
@@ -224,18 +224,18 @@ class _Bag:
                 elif record.opcode == MESSAGE:
                     number, time_ns = record.number(b"conn"), record.time_ns(b"time")
                     channel = self.index.channels.get(number)
-                    strangers += channel is None
+                    undefined += channel is None
                     if channel is not None and (wanted is None or number in wanted):
                         messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
         except struct.error:
             damage = f"{name}: a record in it is malformed; what follows was left out"
             return Contents(messages, "" if block.is_cut else damage)
         return Contents(
-            messages, f"{name}: {counted(strangers, 'message')} of no known connection" if strangers else ""
+            messages, f"{name}: {counted(undefined, 'message')} of no known connection" if undefined else ""
         )
 
     def _is_known(self, block: Block) -> bool:
-        """Whether it is known what a chunk holds, and all its connections are."""
+        """True if the counts of a chunk are known, and all its connections are."""
         return bool(block.entries) and all(entry.channel in self.index.channels for entry in block.entries)
 
     def _take(self, record: Record) -> None:
@@ -259,17 +259,17 @@ class _Bag:
         elif record.opcode == CHUNK_INFO:
             pairs = np.frombuffer(self.index.data, "<u4", 2 * record.number(b"count"), record.begin)
             for number, count in pairs.reshape(-1, 2).tolist():
-                self.told[number] += count
+                self.stated[number] += count
         elif record.opcode == HEADER and record.text(b"encryptor"):
             raise InputError(f"{self.index.path}: is encrypted ({record.text(b'encryptor')}); decrypt it first")
 
     def _chunk(self, record: Record) -> None:
         index, end = self.index, len(self.index.data)
         size, claimed = min(record.end, end) - record.begin, record.number(b"size")
-        if not is_believable(size, claimed):
+        if not is_plausible_size(size, claimed):
             index.damage.append(
                 f"{index.path}: the chunk at byte {record.offset} claims to unpack from {size} to {claimed} "
-                "bytes, more than is believed, and was left out"
+                "bytes, more than is accepted, and was left out"
             )
             return
         name = record.text(b"compression")
@@ -278,7 +278,7 @@ class _Bag:
         self.chunk = Block(index.number, record.begin, size, compression, claimed, 0, 0, 0, is_cut=is_cut)
 
     def _index(self, record: Record) -> None:
-        """How many messages of a connection the chunk before holds, and when they came."""
+        """Add the number and times of a connection's messages in the chunk before."""
         times = np.frombuffer(self.index.data, _INDEX_TIMES, record.number(b"count"), record.begin)
         if len(times) and self.chunk is not None:
             self.entries.append(Entry(record.number(b"conn"), -1, len(times)))
@@ -289,7 +289,7 @@ class _Bag:
         self.index.channels.setdefault(channel.key[1], channel)
 
     def _close(self, *, complete: bool) -> None:
-        """The chunk is over; what does not tell all of its messages is not believed."""
+        """End the chunk; an index that does not cover all of its messages is discarded."""
         if self.chunk is not None:
             block = self.chunk
             if complete and self.is_sure and self.entries:
@@ -298,7 +298,7 @@ class _Bag:
             self.index.blocks.append(block)
         self.chunk, self.entries, self.times_ns, self.is_sure = None, [], [], True
 
-    def _looked_into(self, block: Block) -> Block:
+    def _unpacked(self, block: Block) -> Block:
         """A chunk whose messages have been counted by unpacking it."""
         messages = messages_of(self.index, block)
         counts = Counter(message.channel.key[1] for message in messages)

@@ -14,36 +14,36 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.writing.pack import schema_text
 from scanchain.words import counted
 
-_BLOCK_BYTES = 8_000_000  # about, of the file
+_BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
 _MOST_BLOCKS = 4096
-_MOST_TRIES = 400  # to read parts of a damaged block
+_MOST_TRIES = 400  # largest number of tries to read parts of a damaged block
 _LATEST_NS = (1 << 63) - 1
 
 
 def claims_ros2_bag(path: Path, head: bytes) -> bool:
-    """Whether it is an SQLite file, or a folder with a bag's metadata."""
+    """True for an SQLite file, or a folder with a bag's metadata."""
     return head.startswith(b"SQLite format 3\0") or (path / "metadata.yaml").is_file()
 
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
     index, reader = on_demand_index(path, number), _open(path)
-    if not all(_is_sound(connection) for connection in reader.connections):
-        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes it anew")
+    if not all(_is_valid(connection) for connection in reader.connections):
+        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
     bag = _Bag(index, reader)
     index.make = bag.make
     return index
 
 
 def parts_of_bag(folder: Path) -> list[Path]:
-    """The MCAP files of a ROS 2 bag in their order; the folder itself where it is kept otherwise or is packed."""
+    """The MCAP files of a ROS 2 bag in their order; the folder itself for another storage or a packed bag."""
     from ruamel.yaml import YAML  # a tenth of a second with rosbags, which other logs need not wait for
     from ruamel.yaml.error import YAMLError
 
     try:
-        told = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
-        parts = [folder / Path(name).name for name in told["relative_file_paths"]]
-        is_packed = str(told.get("compression_mode", "")).lower() not in ("", "none")
+        stated = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
+        parts = [folder / Path(name).name for name in stated["relative_file_paths"]]
+        is_packed = str(stated.get("compression_mode", "")).lower() not in ("", "none")
     except (OSError, YAMLError, KeyError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
@@ -93,7 +93,7 @@ class _Bag:
         return Contents(messages, f"{self.index.path}: {what}" if lost else "")
 
     def _ends(self, block: Block) -> tuple[int, int]:
-        """From when to when a block lasts; the first and the last reach as far as time, whatever the bag says."""
+        """First and last time of a block; the first and the last reach as far as time, whatever the metadata."""
         is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
         return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
 
@@ -128,22 +128,22 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _is_sound(connection: Any) -> bool:
-    """Whether what a bag tells of a topic is of the right kind."""
+def _is_valid(connection: Any) -> bool:
+    """True if the metadata of a topic is of the right types."""
     texts = connection.topic, connection.msgtype, connection.ext.serialization_format
     return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
 
 
 def _channel(key: tuple[int, int], connection: Any) -> Channel:
-    told = connection.msgdef
+    stated = connection.msgdef
     encoding = connection.ext.serialization_format
-    language = "ros2idl" if told.format.name == "IDL" else "ros2msg"
-    definition = told.data.encode() or _definition(connection.msgtype)
+    language = "ros2idl" if stated.format.name == "IDL" else "ros2msg"
+    definition = stated.data.encode() or _definition(connection.msgtype)
     return Channel(key, connection.topic, encoding, key[1], connection.msgtype, language, definition)
 
 
 def _definition(type_name: str) -> bytes:
-    """What a type looks like that an old bag does not define, empty where nobody here knows."""
+    """Definition of a type that an old bag does not define, empty for an unknown type."""
     try:
         return schema_text(type_name)
     except (KeyError, ValueError):

@@ -29,7 +29,7 @@ _TUPLE = "a tuple (stamp_s, points, times_s or None)"
 
 
 class ScanFormat(Protocol):
-    """What a class named by ``log.format`` has: it is made of the path of a log and iterates over its scans."""
+    """Protocol of a class named by ``log.format``: it is made of the path of a log and iterates over its scans."""
 
     def __init__(self, path: Path) -> None: ...
 
@@ -67,7 +67,7 @@ def index_scans(path: Path, number: int, name: str, source: Source | None = None
 
 
 def _write(destination: Path, path: Path, name: str) -> int:
-    """Write what the class reads of a path; the number of scans."""
+    """Write the scans that the class reads of a path; returns their number."""
     written, dimension = 0, 0
     with LogWriter(destination) as log:
         for scan in _scans(path, name):
@@ -88,7 +88,7 @@ def _write(destination: Path, path: Path, name: str) -> int:
 
 
 def _scans(path: Path, name: str) -> Iterator[object]:
-    """What the class yields; whatever goes wrong in it is an InputError that says where."""
+    """Scans of the class; whatever goes wrong in it is an InputError that says where."""
     make = load_format(name)
     scans = _guarded(lambda: iter(make(path).scans()), f"{path}: {name}")
     end = object()

@@ -1,1 +1,1 @@
-"""MCAP files: where their messages lie, damage included, and their messages in order."""
+"""MCAP files: index of their messages, damage included, and their messages in order."""

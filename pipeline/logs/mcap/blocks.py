@@ -32,7 +32,7 @@ class DamagedBlockError(Exception):
 
 
 def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
-    """The messages of a block, of all channels or of those wanted; channels met on the way join the index.
+    """The messages of a block, of all channels or of those wanted; channels found there join the index.
 
     Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
@@ -40,7 +40,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         return index.make(block, wanted)
     payload = unpack(index, block)
     messages: list[Message] = []
-    met = strangers = 0
+    met = undefined = 0
     try:
         for opcode, begin, end in _records(payload):
             if opcode == SCHEMA:
@@ -51,18 +51,20 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
                 met += 1
                 channel = index.channels.get(number)
-                strangers += channel is None
+                undefined += channel is None
                 if channel is not None and (wanted is None or number in wanted):
                     messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
     except (struct.error, UnicodeDecodeError):
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
-    told = sum(entry.messages for entry in block.entries)
-    if strangers:
+    stated = sum(entry.messages for entry in block.entries)
+    if undefined:
         return Contents(
-            messages, f"{_name(index, block)}: {counted(strangers, 'message')} of a channel that nothing defines"
+            messages, f"{_name(index, block)}: {counted(undefined, 'message')} of a channel that nothing defines"
         )
-    return Contents(messages, f"{_name(index, block)}: holds {met} of the {told} indexed messages" * (met < told))
+    return Contents(
+        messages, f"{_name(index, block)}: holds {met} of the {stated} indexed messages" * (met < stated)
+    )
 
 
 def unpack(index: FileIndex, block: Block) -> memoryview:
@@ -71,7 +73,7 @@ def unpack(index: FileIndex, block: Block) -> memoryview:
 
 
 def release(index: FileIndex, block: Block) -> None:
-    """Let go of a block's bytes of the file, so that memory does not grow with what has been read."""
+    """Release a block's bytes of the file, so that memory does not grow with what has been read."""
     if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
         begin = block.offset - block.offset % mmap.PAGESIZE
         index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
@@ -118,7 +120,7 @@ def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
 
 
 def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
-    """As much as the beginning of a chunk unpacks to; nothing of it has been checked."""
+    """The unpacked beginning of a chunk, as far as it unpacks; nothing of it has been checked."""
     stored, _ = index.stored(block)
     try:
         if block.compression == "zstd":

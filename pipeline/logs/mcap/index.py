@@ -34,26 +34,26 @@ from scanchain.logs.mcap.records import (
     FileIndex,
     read_string,
 )
-from scanchain.logs.mcap.resync import CHUNK_HEAD, PRIVATE, Resync, is_end, record_end, vouches_for_itself
+from scanchain.logs.mcap.resync import CHUNK_HEAD, PRIVATE, Resync, is_end, record_end, states_length_twice
 from scanchain.source import Source
 from scanchain.words import counted
 
 FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
-_LARGEST_CHUNK = 1 << 30  # bytes; a size beyond is taken for damage, not believed
-_MODEST_CHUNK = 1 << 25  # bytes; a larger one is believed where it is at most
-_MOST_TIMES = 20  # times as large as what is stored
+_LARGEST_CHUNK = 1 << 30  # largest size of a chunk in bytes; one beyond is damage
+_MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is accepted at any ratio
+_MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
 _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
 
 
 def claims_mcap(path: Path, head: bytes) -> bool:
-    """Whether a file begins as MCAP does, or has nothing to begin with, which is refused as a file of MCAP."""
+    """True if a file begins as MCAP does, or is empty, which is refused as a file of MCAP."""
     return head.startswith(MAGIC) or not (head or path.is_dir())
 
 
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
-    """Walk one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
+    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
 
-    source : what it is a copy of, and is called in what is said of it; None for itself
+    source : the original of a copy, named in messages; None for itself
     """
     index = FileIndex(source or path, number, _map(path))
     data, walk, resync = index.data, Walk(index), Resync(index.data)
@@ -65,7 +65,7 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
             offset, end = end, following
             continue
         resumed = resync.behind(offset)
-        if end and (vouches_for_itself(data, offset) or not 0 < resumed < end):
+        if end and (states_length_twice(data, offset) or not 0 < resumed < end):
             walk.take(offset)
             offset = resumed if 0 < resumed < end else end
         if not resumed:
@@ -100,9 +100,9 @@ class Walk:
 
     def __init__(self, index: FileIndex) -> None:
         self.index = index
-        self.is_doubtful = False  # in a summary of a wrong CRC
-        self.chunks_told = 0  # by the statistics
-        self.private: list[int] = []  # where records lie that only some application knows
+        self.is_inconsistent = False  # in a summary of a wrong CRC
+        self.chunks_stated = 0  # by the statistics
+        self.private: list[int] = []  # offsets of records of some application
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
         self.loose_from = -1
@@ -115,14 +115,14 @@ class Walk:
         self._take(opcode, offset, length)
 
     def finish(self, offset: int) -> None:
-        """End the walk at this byte; where a record is cut off there, what is there of a chunk is kept."""
+        """End the walk at this byte; of a chunk that is cut off there the beginning is retained."""
         index, size = self.index, len(self.index.data)
         if is_end(index.data, offset):
             self.close(offset, complete=True)
         else:
             self.close(offset, complete=False)
             self._cut(offset, size)
-        check_claims(index, self.chunks_told, self.private)
+        check_claims(index, self.chunks_stated, self.private)
 
     def _cut(self, offset: int, size: int) -> None:
         where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
@@ -135,7 +135,7 @@ class Walk:
             self.close(offset, complete=False)
 
     def close(self, offset: int, *, complete: bool) -> None:
-        """End the chunk or the run of loose messages at this byte; incomplete entries are not believed."""
+        """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
         if self.chunk is not None:
             entries = tuple(self.entries) if complete else ()
             self.index.blocks.append(replace(self.chunk, entries=entries))
@@ -158,8 +158,8 @@ class Walk:
             )
 
     def _sort(self, opcode: int, offset: int, body: int, length: int) -> None:
-        if self.is_doubtful and opcode in (SCHEMA, CHANNEL, STATISTICS):
-            self.index.doubted.append((opcode, body))
+        if self.is_inconsistent and opcode in (SCHEMA, CHANNEL, STATISTICS):
+            self.index.damaged_summary.append((opcode, body))
             return
         if opcode == MESSAGE:
             self._message(offset, body, length)
@@ -181,7 +181,7 @@ class Walk:
     def _frame(self, opcode: int, body: int, length: int) -> None:
         """The records that begin and end the file and its parts."""
         if opcode == DATA_END:
-            self.is_doubtful = not _is_summary_sound(self.index, body + length)
+            self.is_inconsistent = not _is_summary_intact(self.index, body + length)
         elif opcode == HEADER:
             self.index.profile, body = read_string(self.index.data, body)
             self.index.library, _ = read_string(self.index.data, body)
@@ -217,10 +217,10 @@ class Walk:
         start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(index.data, body)
         compression, records = read_string(index.data, body + CHUNK_HEAD.size)
         size = body + length - records - 8
-        if not is_believable(size, uncompressed):
+        if not is_plausible_size(size, uncompressed):
             index.damage.append(
                 f"{index.path}: the chunk at byte {offset} claims to unpack from {size} to {uncompressed} bytes, "
-                f"more than is believed, and was left out"
+                f"more than is accepted, and was left out"
             )
             return
         self.chunk = Block(index.number, records + 8, size, compression, uncompressed, crc, start_ns, end_ns)
@@ -232,17 +232,17 @@ class Walk:
         for entry in range(offset + 4, min(offset + 4 + size, body + length - 9), 10):
             number, count = struct.unpack_from("<HQ", data, entry)
             self.index.counts[number] = count
-        (self.chunks_told,) = struct.unpack_from("<I", data, body + 22)
+        (self.chunks_stated,) = struct.unpack_from("<I", data, body + 22)
         self.index.is_counted = True
 
 
-def is_believable(size: int, uncompressed: int) -> bool:
-    """Whether a chunk of so many bytes may be as large as it claims once it is unpacked."""
+def is_plausible_size(size: int, uncompressed: int) -> bool:
+    """True if a chunk of so many bytes may unpack to the size that its record states."""
     return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
 
 
-def _is_summary_sound(index: FileIndex, summary: int) -> bool:
-    """Whether the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
+def _is_summary_intact(index: FileIndex, summary: int) -> bool:
+    """True if the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
     data = index.data
     footer = len(data) - len(MAGIC) - FOOTER_BODY.size - RECORD.size
     if footer < summary or data[-len(MAGIC) :] != MAGIC or data[footer] != FOOTER:
@@ -250,28 +250,28 @@ def _is_summary_sound(index: FileIndex, summary: int) -> bool:
     crc = FOOTER_BODY.unpack_from(data, footer + RECORD.size)[2]
     if not crc or zlib.crc32(data[summary : footer + RECORD.size + FOOTER_BODY.size - 4]) == crc:
         return True
-    index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was not believed")
+    index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was discarded")
     return False
 
 
-def check_claims(index: FileIndex, chunks_told: int, private: Sequence[int]) -> None:
-    """Trust what blocks say about their channels where it adds up to the statistics; note what does not.
+def check_claims(index: FileIndex, chunks_stated: int, private: Sequence[int]) -> None:
+    """Accept the counts of blocks by channel where they add up to the statistics; note where they do not.
 
-    chunks_told : by the statistics; private : where records of unknown kinds lie
+    chunks_stated : by the statistics; private : where records of unknown kinds lie
     """
     totals: Counter[int] = Counter()
     for entry in (entry for block in index.blocks for entry in block.entries):
         totals[entry.channel] += entry.messages
-    told = {number: count for number, count in index.counts.items() if count}
+    stated = {number: count for number, count in index.counts.items() if count}
     chunks = sum(block.is_chunk for block in index.blocks)
-    index.is_trusted = index.is_counted and told == dict(totals) and chunks == chunks_told
+    index.is_consistent = index.is_counted and stated == dict(totals) and chunks == chunks_stated
     is_indexed = all(block.entries for block in index.blocks)
-    if index.is_counted and not index.is_trusted and (is_indexed or chunks != chunks_told):
+    if index.is_counted and not index.is_consistent and (is_indexed or chunks != chunks_stated):
         index.damage.append(
             f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
-            f"are not the {chunks_told} and {sum(told.values())} of its statistics"
+            f"are not the {chunks_stated} and {sum(stated.values())} of its statistics"
         )
-    if private and not index.is_counted:  # nothing tells whether one of them was a chunk
+    if private and not index.is_counted:  # one of them may have been a chunk
         index.damage.append(
             f"{index.path}: passed over {counted(len(private), 'record')} of unknown kinds, "
             f"the first at byte {private[0]}"

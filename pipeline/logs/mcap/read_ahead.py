@@ -1,4 +1,4 @@
-"""Byte ranges of a remote file that are known to be wanted: fetched in large pieces, ahead of who reads them."""
+"""Read-ahead of a remote file: byte ranges that will be read, downloaded in large parts."""
 
 from __future__ import annotations
 
@@ -9,79 +9,77 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
-_PIECE_BYTES = 4_000_000  # neighbors are fetched together up to this size
-_GAP_BYTES = 65_536  # read along with what lies on both sides of it, as asking anew takes longer
-_AHEAD = 3  # pieces
-_KEPT = 2  # pieces behind, as threads that read them overtake each other
-_REPEATED = 4  # ranges that nobody told of are kept: the first blocks are looked at more than once
+_PART_BYTES = 4_000_000  # largest size of ranges that are downloaded together
+_GAP_BYTES = 65_536  # largest gap between two ranges that is downloaded along, as another request takes longer
+_AHEAD = 3  # number of parts requested ahead
+_RETAINED = 2  # number of parts retained behind, as threads that read them overtake each other
+_REPEATED = 4  # number of unannounced ranges retained: the first blocks are read more than once
 
 
-class Piece(NamedTuple):
-    """Bytes that are fetched at once."""
+class Part(NamedTuple):
+    """A byte range that is downloaded at once."""
 
     begin: int
     end: int
 
 
 class ReadAhead:
-    """Reads ranges with ``fetch(offset, size)``, those that were told before in the order in which they were."""
+    """Reads ranges with ``fetch(offset, size)``, the expected ones ahead and in their order."""
 
     def __init__(self, fetch: Callable[[int, int], bytes]) -> None:
         self.fetch = fetch
         self.fetch_alone = lru_cache(_REPEATED)(fetch)
-        self.pieces: list[Piece] = []
-        self.by_begin: list[
-            tuple[int, int]
-        ] = []  # byte at which a piece begins, its place in the order of reading
+        self.parts: list[Part] = []
+        self.by_begin: list[tuple[int, int]] = []  # byte at which a part begins, its place in the order of reading
         self.coming: dict[int, Future[bytes]] = {}
         self.lock = threading.Lock()
         self.pool = ThreadPoolExecutor(_AHEAD, thread_name_prefix="scanchain-fetch")
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Take note of what will be read next: first byte and the one behind the last, in the order of reading."""
+        """Announce the ranges that will be read next, in order: first byte and the one behind the last."""
         with self.lock:
-            self.pieces = merged(ranges)
-            self.by_begin = sorted((piece.begin, place) for place, piece in enumerate(self.pieces))
+            self.parts = merged(ranges)
+            self.by_begin = sorted((part.begin, place) for place, part in enumerate(self.parts))
             self.coming = {}
 
     def read(self, offset: int, size: int) -> memoryview:
-        """So many bytes from the offset on; what nobody told of before is fetched by itself."""
+        """So many bytes from the offset on; a range that was not announced is downloaded by itself."""
         with self.lock:
-            place = self._place_of(offset, size)
+            place = self._index_of(offset, size)
             if place is None:
                 begin, coming = offset, None
             else:
-                begin, coming = self.pieces[place].begin, self._ask_for(place)
+                begin, coming = self.parts[place].begin, self._request(place)
         data = self.fetch_alone(offset, size) if coming is None else coming.result()
         return memoryview(data)[offset - begin : offset - begin + size]
 
-    def _place_of(self, offset: int, size: int) -> int | None:
-        """Which piece the bytes lie in."""
-        found = bisect_right(self.by_begin, (offset, len(self.pieces))) - 1
+    def _index_of(self, offset: int, size: int) -> int | None:
+        """Index of the part in which the bytes lie."""
+        found = bisect_right(self.by_begin, (offset, len(self.parts))) - 1
         if found < 0:
             return None
         place = self.by_begin[found][1]
-        return place if offset + size <= self.pieces[place].end else None
+        return place if offset + size <= self.parts[place].end else None
 
-    def _ask_for(self, place: int) -> Future[bytes]:
-        """The piece of a place; those that follow are asked for as well, those passed forgotten."""
-        for number in range(place, min(place + 1 + _AHEAD, len(self.pieces))):
+    def _request(self, place: int) -> Future[bytes]:
+        """The part of an index; the next ones are requested, those passed are dropped."""
+        for number in range(place, min(place + 1 + _AHEAD, len(self.parts))):
             if number not in self.coming:
-                piece = self.pieces[number]
-                self.coming[number] = self.pool.submit(self.fetch, piece.begin, piece.end - piece.begin)
-        for number in [number for number in self.coming if number < place - _KEPT]:
+                part = self.parts[number]
+                self.coming[number] = self.pool.submit(self.fetch, part.begin, part.end - part.begin)
+        for number in [number for number in self.coming if number < place - _RETAINED]:
             del self.coming[number]
         return self.coming[place]
 
 
-def merged(ranges: Iterable[tuple[int, int]]) -> list[Piece]:
-    """Ranges joined with those that follow close behind, up to the size of a piece."""
-    pieces: list[Piece] = []
+def merged(ranges: Iterable[tuple[int, int]]) -> list[Part]:
+    """Ranges joined with those that follow close behind, up to the size of a part."""
+    parts: list[Part] = []
     for begin, end in ranges:
-        last = pieces[-1] if pieces else Piece(0, -_GAP_BYTES - 1)
-        is_close = last.end <= begin <= last.end + _GAP_BYTES and end - last.begin <= _PIECE_BYTES
+        last = parts[-1] if parts else Part(0, -_GAP_BYTES - 1)
+        is_close = last.end <= begin <= last.end + _GAP_BYTES and end - last.begin <= _PART_BYTES
         if is_close:
-            pieces[-1] = Piece(last.begin, end)
+            parts[-1] = Part(last.begin, end)
         else:
-            pieces.append(Piece(begin, end))
-    return pieces
+            parts.append(Part(begin, end))
+    return parts

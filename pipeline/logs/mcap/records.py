@@ -1,4 +1,4 @@
-"""What is known about an MCAP file before any message is read: channels, blocks of messages, damage."""
+"""Index of an MCAP file: channels, blocks of messages, damage."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish ti
 
 _CRC = struct.Struct("<I")
 _CRC_AT = RECORD.size + 24  # of a chunk record
-_LONGEST_STRING = 1 << 16  # bytes; a longer name is damage
+_LONGEST_STRING = 1 << 16  # longest name in bytes; a longer one is damage
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
     """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
 
-    ``definition`` says what the type looks like, in the language ``schema_encoding``.
+    ``definition`` defines the type, in the language ``schema_encoding``.
     """
 
     key: tuple[int, int]
@@ -40,7 +40,7 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message: its channel, when it was logged, and its bytes."""
+    """One message: its channel, log time, and bytes."""
 
     channel: Channel
     log_time_ns: int
@@ -48,14 +48,14 @@ class Message(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """The messages of a block in the order of the file; ``damage`` says what is missing behind them."""
+    """The messages of a block in the order of the file; ``damage`` describes what is missing behind them."""
 
     messages: list[Message]
     damage: str
 
 
 class Entry(NamedTuple):
-    """How many messages of a channel a chunk holds; their (log time, offset) pairs lie at byte ``offset``."""
+    """Number of a channel's messages in a chunk; their (log time, offset) pairs lie at byte ``offset``."""
 
     channel: int
     offset: int
@@ -69,10 +69,10 @@ class Block:
     Attributes
     ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size, crc : as the chunk says; crc 0 means unchecked, None that the chunk's head
+    compression, uncompressed_size, crc : as the chunk states; crc 0 means unchecked, None that the chunk's head
         has to be read for it
     start_ns, end_ns : log time of the first and last message
-    entries : the channels in it; empty where the file does not say
+    entries : the channels in it; empty where the file does not state them
     """
 
     file: int
@@ -89,18 +89,18 @@ class Block:
 
     @property
     def chunk_offset(self) -> int:
-        """Where the record of a chunk begins, its head included."""
+        """Offset of a chunk's record, its head included."""
         return self.offset - (_CRC_AT + 16 + len(self.compression) if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
-        """Whether its times are those that writers give a chunk without any message."""
+        """True if its times are those that writers give a chunk without any message."""
         return (self.start_ns == self.end_ns == 0 and not self.entries) or self.start_ns > self.end_ns
 
 
 @dataclass(slots=True)
 class FileIndex:
-    """Everything that is known of one file before its messages are read.
+    """Index of one file.
 
     Attributes
     ----------
@@ -108,8 +108,8 @@ class FileIndex:
     data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
         makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    doubted : opcodes and bodies of records of a damaged summary, for where nothing else tells of a channel
-    is_trusted : whether what blocks say about their channels agrees with what the file says about itself
+    damaged_summary : opcodes and bodies of records of a damaged summary, for channels defined nowhere else
+    is_consistent : whether the counts of blocks by channel agree with the statistics of the file
     """
 
     path: Source
@@ -125,13 +125,13 @@ class FileIndex:
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
     takes_rate: bool = False
-    is_trusted: bool = True
-    doubted: list[tuple[int, int]] = field(default_factory=list)
+    is_consistent: bool = True
+    damaged_summary: list[tuple[int, int]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def stored(self, block: Block) -> tuple[memoryview, int]:
-        """A block's bytes as the file holds them, and the CRC-32 of what they unpack to, 0 for unchecked."""
+        """A block's bytes as the file holds them, and the CRC-32 of the unpacked bytes, 0 for unchecked."""
         if block.crc is not None:
             return self.bytes_at(block.offset, block.size), block.crc
         head = block.offset - block.chunk_offset
@@ -145,7 +145,7 @@ class FileIndex:
         return self.remote.read(offset, size)
 
     def expect(self, blocks: Iterable[Block]) -> None:
-        """Take note of which blocks will be read next, in this order."""
+        """Announce the blocks that will be read next, in this order."""
         if self.remote is not None:
             self.remote.expect([(block.chunk_offset, block.offset + block.size) for block in blocks])
 
@@ -167,14 +167,14 @@ class FileIndex:
         self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
-        """Whether a block can have messages of the channels."""
-        if not self.is_trusted or not block.entries:
+        """True if a block can have messages of the channels."""
+        if not self.is_consistent or not block.entries:
             return True
         return any(entry.channel in channels for entry in block.entries)
 
-    def believe(self, wanted: AbstractSet[int]) -> None:
-        """Take channels in from a damaged summary, as nothing else tells of them."""
-        for opcode, body in self.doubted:
+    def take_from_damaged_summary(self, wanted: AbstractSet[int]) -> None:
+        """Add channels from a damaged summary, as they are defined nowhere else."""
+        for opcode, body in self.damaged_summary:
             try:
                 if opcode == SCHEMA:
                     self.add_schema(self.data, body)
@@ -189,7 +189,7 @@ class FileIndex:
             self.damage.append(line)
 
     def knows(self, number: int) -> bool:
-        """Whether the channel and its schema have been met."""
+        """True if the channel and its schema are in the index."""
         channel = self.channels.get(number)
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
@@ -212,7 +212,7 @@ def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:
-    """The files of a log as errors name them: all of two, of more the first and how many there are beside."""
+    """Name of a log's files in errors: all of two, of more the first and the number of the others."""
     paths = [str(index.path) for index in indexes]
     shown = f"{paths[0]} and {len(paths) - 1} more files" if len(paths) > 2 else " and ".join(paths)
     return f"{shown}, read as one log" if len(paths) > 1 else shown

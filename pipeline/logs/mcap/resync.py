@@ -1,4 +1,4 @@
-"""Whether a record begins at some byte of an MCAP file, and where the next one does behind damage."""
+"""Record boundaries of an MCAP file, and resynchronization behind damage."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WINDOW = 1 << 20  # bytes searched at once
 
 
 def record_end(data: mmap.mmap | bytes, offset: int) -> int:
-    """The byte behind the record at ``offset``; 0 where what lies there is none, or not all of one."""
+    """The byte behind the record at ``offset``; 0 where there is none, or not all of one."""
     if offset + RECORD.size > len(data):
         return 0
     opcode, length = RECORD.unpack_from(data, offset)
@@ -51,11 +51,11 @@ def record_end(data: mmap.mmap | bytes, offset: int) -> int:
         return end
     if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
         return 0
-    return end if vouches_for_itself(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
+    return end if states_length_twice(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
 
 
-def vouches_for_itself(data: mmap.mmap | bytes, offset: int) -> bool:
-    """Whether the record at ``offset`` tells its length twice, and both agree."""
+def states_length_twice(data: mmap.mmap | bytes, offset: int) -> bool:
+    """True if the record at ``offset`` states its length twice, and both agree."""
     opcode, length = RECORD.unpack_from(data, offset)
     body = offset + RECORD.size
     if opcode == MESSAGE_INDEX:
@@ -70,9 +70,9 @@ def vouches_for_itself(data: mmap.mmap | bytes, offset: int) -> bool:
 
 
 class Resync:
-    """Finds where reading can go on in a file.
+    """Resynchronization in a file behind damage.
 
-    In one with chunks no message is looked for outside of them: what is left of a damaged chunk, unchecked, is not
+    In one with chunks no message is searched outside of them: what is left of a damaged chunk, unchecked, is not
     taken for messages.
     """
 
@@ -102,12 +102,12 @@ def _next(data: mmap.mmap | bytes, offset: int, sought: AbstractSet[int]) -> int
 
 
 def is_end(data: mmap.mmap | bytes, offset: int) -> bool:
-    """Whether nothing but the closing magic is left."""
+    """True if only the closing magic is left."""
     return offset == len(data) - len(MAGIC) and data[offset:] == MAGIC
 
 
 def _has_parts(data: mmap.mmap | bytes, offset: int, end: int) -> bool:
-    """Whether the strings and other parts that a record begins with end inside it."""
+    """True if the strings and other parts that a record begins with end inside it."""
     fixed, count = _PARTS.get(data[offset], (0, 0))
     at = offset + RECORD.size + fixed
     for _ in range(count):
@@ -118,11 +118,11 @@ def _has_parts(data: mmap.mmap | bytes, offset: int, end: int) -> bool:
 
 
 def _begins_chunk(data: mmap.mmap | bytes, offset: int) -> bool:
-    """Whether a compressed chunk begins here, which may be cut off."""
+    """True if a compressed chunk, maybe cut off, begins here."""
     name = offset + RECORD.size + CHUNK_HEAD.size
     return data[offset : offset + 1] == bytes([CHUNK]) and data[name : name + 8].startswith(_COMPRESSED)
 
 
 def _is_start(data: mmap.mmap | bytes, offset: int) -> bool:
     end = record_end(data, offset)
-    return end > 0 and (vouches_for_itself(data, offset) or is_end(data, end) or record_end(data, end) > 0)
+    return end > 0 and (states_length_twice(data, offset) or is_end(data, end) or record_end(data, end) > 0)

@@ -29,11 +29,11 @@ class Span(NamedTuple):
         return (self.end_ns - self.begin_ns) * 1e-9
 
     def meets(self, block: Block) -> bool:
-        """Whether the block may hold messages of the span."""
+        """True if the block may hold messages of the span."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
     def covers(self, block: Block) -> bool:
-        """Whether all messages of the block lie in the span."""
+        """True if all messages of the block lie in the span."""
         return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
 
 
@@ -59,7 +59,7 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
 
 
 def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
-    """What a user may not know of the chosen part: an end beyond that of the log, long gaps within it."""
+    """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
     whole = whole_span(indexes)
     span, notes = chosen_span(whole, config), []
     if whole.duration_s < config.end_s < inf:
@@ -88,7 +88,7 @@ def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
 
 
 def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
-    """How many messages of a topic lie in the span."""
+    """Number of messages of a topic in the span."""
     count = 0
     for index in indexes:
         for number in (number for number, channel in index.channels.items() if channel.topic == topic):
@@ -102,7 +102,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
 
 
 def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
-    """Scans of the topic in the chosen part, thinned out. Raises InputError where there is none."""
+    """Number of scans of the topic in the chosen part, every n-th. Raises InputError where there is none."""
     name, span = name_of(indexes), chosen_span(whole, config)
     total = sum(
         index.counts.get(number, 0)
@@ -124,7 +124,7 @@ def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
 
 
 def _part_in_words(config: LogConfig) -> str:
-    """The chosen part in words."""
+    """The chosen part as text."""
     start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
     if config.end_s == float("inf"):
         return f"after {start}"
@@ -132,7 +132,7 @@ def _part_in_words(config: LogConfig) -> str:
 
 
 def complete(index: FileIndex) -> None:
-    """Learn the channels and counts that a file without a full summary keeps inside its chunks."""
+    """Add the channels and counts that a file without a full summary has inside its chunks."""
     needed = set(index.counts) | {entry.channel for block in index.blocks for entry in block.entries}
     unknown = {number for number in needed if not index.knows(number)}
     counts: Counter[int] = Counter()
@@ -147,16 +147,16 @@ def complete(index: FileIndex) -> None:
         if not block.entries:
             counts.update(message.channel.key[1] for message in messages)
         unknown = {number for number in unknown if not index.knows(number)}
-    index.believe(unknown)
+    index.take_from_damaged_summary(unknown)
     if not index.is_counted:
         index.counts = dict(counts)
         index.is_counted = True
 
 
 def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
-    """How many messages a topic has, and the log times of the first and the last of them; 0, 0 where unknown.
+    """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
 
-    Exact where a file has a message index, else as exactly as its chunks say.
+    Exact where a file has a message index, else as exact as its chunks.
     """
     messages, ends_ns = 0, []
     for index in indexes:

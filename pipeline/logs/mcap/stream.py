@@ -23,11 +23,11 @@ _BLOCKS_AHEAD = 4  # that wait decoded, at most
 _MOST_BYTES_AHEAD = 256_000_000
 
 T = TypeVar("T")
-_SAMPLED_BLOCKS = 8  # of a topic, from the first on, that are searched
+_SAMPLED_BLOCKS = 8  # number of first blocks of a topic that are searched
 
 
 class Decoded(NamedTuple):
-    """A message as its decoder understood it, or the decoder's complaint, a MalformedMessageError."""
+    """A decoded message, or the decoder's error, a MalformedMessageError."""
 
     channel: Channel
     log_time_ns: int
@@ -115,14 +115,14 @@ def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> lis
 
 
 def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
-    """What a topic's messages in its first blocks decode to; malformed ones are passed over."""
+    """Decoded messages of a topic's first blocks; malformed ones are passed over."""
     yield from _decoded_in(indexes, _blocks_of(indexes, topic)[:_SAMPLED_BLOCKS], topic, decode, EVERYTHING)
 
 
 def spread_messages(
     indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span
 ) -> Iterator[T]:
-    """What a topic's messages in blocks from all over a span decode to; malformed ones are passed over."""
+    """Decoded messages of a topic in blocks from all over a span; malformed ones are passed over."""
     blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
     chosen = (
         blocks

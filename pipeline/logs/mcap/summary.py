@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.mcap.index import FOOTER_BODY, is_believable
+from scanchain.logs.mcap.index import FOOTER_BODY, is_plausible_size
 from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -28,7 +28,7 @@ from scanchain.logs.mcap.records import (
     read_string,
 )
 
-_TAIL_BYTES = 65_536  # read at first; most summaries lie in it
+_TAIL_BYTES = 65_536  # number of bytes read at first; most summaries lie in it
 _FOOTER_BYTES = RECORD.size + FOOTER_BODY.size
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # start, end, offset and length of the chunk, bytes of the map
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index record
@@ -38,7 +38,7 @@ _COUNT = struct.Struct("<HQ")
 
 
 def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
-    """What the summary tells of a file, the ``number``-th of a log; None where that is not everything."""
+    """Index by a file's summary, the ``number``-th of a log; None where that is incomplete."""
     try:
         summary = _summary(file)
         return None if summary is None else _index(file, number, summary)
@@ -64,7 +64,7 @@ def _summary(file: RemoteFile) -> bytes | None:
 
 def _index(file: RemoteFile, number: int, summary: bytes) -> FileIndex | None:
     index = FileIndex(file.address, number, b"", ReadAhead(file.read))
-    chunks_told = -1
+    chunks_stated = -1
     for opcode, body in _records(summary):
         if opcode == SCHEMA:
             index.add_schema(summary, body)
@@ -73,10 +73,10 @@ def _index(file: RemoteFile, number: int, summary: bytes) -> FileIndex | None:
         elif opcode == CHUNK_INDEX:
             index.blocks.append(_block(number, summary, body))
         elif opcode == STATISTICS:
-            chunks_told, index.counts = _statistics(summary, body)
+            chunks_stated, index.counts = _statistics(summary, body)
             index.is_counted = True
     index.blocks.sort(key=lambda block: block.offset)
-    return index if _tells_all(index, file.size, chunks_told) else None
+    return index if _is_complete(index, file.size, chunks_stated) else None
 
 
 def _records(summary: bytes) -> Iterator[tuple[int, int]]:
@@ -91,14 +91,14 @@ def _records(summary: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _block(number: int, summary: bytes, body: int) -> Block:
-    """A chunk; how many messages it has of a channel follows from where the next message index begins."""
+    """A chunk; its number of messages of a channel follows from the offset of the next message index."""
     start_ns, end_ns, chunk, length, size = _CHUNK_INDEX_HEAD.unpack_from(summary, body)
     at = body + _CHUNK_INDEX_HEAD.size
-    told = [_INDEX_OFFSET.unpack_from(summary, place) for place in range(at, at + size, _INDEX_OFFSET.size)]
+    stated = [_INDEX_OFFSET.unpack_from(summary, place) for place in range(at, at + size, _INDEX_OFFSET.size)]
     (indexed,) = struct.unpack_from("<Q", summary, at + size)
     compression, at = read_string(summary, at + size + 8)
     compressed, uncompressed = _SIZES.unpack_from(summary, at)
-    offsets = sorted((offset, channel) for channel, offset in told)
+    offsets = sorted((offset, channel) for channel, offset in stated)
     ends = [*(offset for offset, _ in offsets[1:]), chunk + length + indexed]
     entries = tuple(
         Entry(channel, offset + _ENTRY_HEAD, (end - offset - _ENTRY_HEAD) // 16)
@@ -110,23 +110,23 @@ def _block(number: int, summary: bytes, body: int) -> Block:
 
 
 def _statistics(summary: bytes, body: int) -> tuple[int, dict[int, int]]:
-    """How many chunks there are, and messages by channel."""
+    """Number of chunks, and of messages by channel."""
     (chunks,) = struct.unpack_from("<I", summary, body + 22)
     (size,) = struct.unpack_from("<I", summary, body + 42)
     return chunks, dict(_COUNT.unpack_from(summary, at) for at in range(body + 46, body + 46 + size, _COUNT.size))
 
 
-def _tells_all(index: FileIndex, size: int, chunks_told: int) -> bool:
-    """Whether every chunk lies in the file, may be as large as it claims, and no message is left for elsewhere."""
-    if chunks_told != len(index.blocks) or any(block.chunk_offset < 0 for block in index.blocks):
+def _is_complete(index: FileIndex, size: int, chunks_stated: int) -> bool:
+    """True if every chunk lies in the file, has a plausible size, and no message lies elsewhere."""
+    if chunks_stated != len(index.blocks) or any(block.chunk_offset < 0 for block in index.blocks):
         return False
     if any(
-        block.offset + block.size > size or not is_believable(block.size, block.uncompressed_size)
+        block.offset + block.size > size or not is_plausible_size(block.size, block.uncompressed_size)
         for block in index.blocks
     ):
         return False
     totals: Counter[int] = Counter()
     for block in index.blocks:
         totals.update({entry.channel: entry.messages for entry in block.entries})
-    index.is_trusted = dict(totals) == {channel: count for channel, count in index.counts.items() if count}
-    return index.is_trusted or not all(block.entries for block in index.blocks)
+    index.is_consistent = dict(totals) == {channel: count for channel, count in index.counts.items() if count}
+    return index.is_consistent or not all(block.entries for block in index.blocks)

@@ -14,7 +14,7 @@ _ORDER = "<"
 
 
 class MalformedMessageError(Exception):
-    """A message that is not what its schema says; the text says where it ends too early."""
+    """A message that contradicts its schema; the text says where it ends too early."""
 
 
 _FLOATS: dict[str, np.dtype[np.float32]] = {"<": np.dtype("<f4"), ">": np.dtype(">f4")}
@@ -94,7 +94,7 @@ def _layout(order: str, code: str, count: int) -> tuple[struct.Struct, int]:
 
 
 class Ros1Reader(CdrReader):
-    """Reads one message from front to back, by the same verbs as for CDR."""
+    """Reads one message from front to back, with the methods of the reader of CDR."""
 
     __slots__ = ()
 

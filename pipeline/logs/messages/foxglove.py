@@ -90,7 +90,7 @@ class _Transforms(Protocol):
 
 
 def laser_scan(message: _LaserScan) -> LaserScanMessage:
-    """The scan, without range limits and times, which Foxglove does not tell."""
+    """The scan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
     step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
@@ -263,7 +263,7 @@ def parse_json(data: memoryview, kind: type[T]) -> T:
 
 
 def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:
-    """What parses the messages of a channel; one that cannot be made complains at every message."""
+    """Parser of a channel's messages; one without a usable schema raises at every message."""
     from google.protobuf.message import DecodeError
     from mcap.exceptions import McapError
     from mcap.records import Schema

@@ -53,7 +53,7 @@ def read_multi_echo_scan(data: memoryview, form: type[CdrReader] = CdrReader) ->
     reader = form(data)
     stamp_ns, frame = reader.header()
     first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
-    ranges_m = np.full(_believed(reader.integer(), len(data)), np.inf, np.float32)
+    ranges_m = np.full(_checked_count(reader.integer(), len(data)), np.inf, np.float32)
     for beam in range(len(ranges_m)):
         echoes_m = reader.floats()
         if len(echoes_m):
@@ -82,7 +82,7 @@ class LaserScanDecoder:
         self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
 
     def decode(self, data: memoryview) -> Returns:
-        """What came back of a message's beams."""
+        """Valid returns of a message's beams."""
         return self.returns(self.read(data))
 
     def returns(self, message: LaserScanMessage) -> Returns:
@@ -106,7 +106,7 @@ class LaserScanDecoder:
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
 
     def limits_of(self, message: LaserScanMessage) -> tuple[float, float]:
-        """The least range that counts, and the one from which on none does."""
+        """The least valid range, and the one from which on none is valid."""
         low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
         high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
         return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)
@@ -121,7 +121,7 @@ class LaserScanDecoder:
         return geometry
 
 
-def _believed(beams: int, size: int) -> int:
+def _checked_count(beams: int, size: int) -> int:
     if 4 * beams > size:
         raise MalformedMessageError(f"it claims {beams} beams, more than its {size} bytes can hold")
     return beams

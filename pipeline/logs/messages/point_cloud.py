@@ -17,8 +17,8 @@ from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, move
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64
 _MOST_FIELDS = 1024
-PLANAR_M = 5e-4  # off the plane, at the most, of a point of a planar cloud: rounding of float32
-_FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # of a cloud, and in all, that tell whether clouds are planar
+PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
+_FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
@@ -26,7 +26,7 @@ _LIVOX_DESCRIBED = b"livox CustomMsg, little endian", b"livox CustomMsg, big end
 
 
 class PointField(NamedTuple):
-    """A sensor_msgs/PointField: where in a point a number lies, and of which type it is."""
+    """A sensor_msgs/PointField: offset of a number in a point, and its type."""
 
     name: str
     offset: int
@@ -35,7 +35,7 @@ class PointField(NamedTuple):
 
 
 class PointCloudMessage(NamedTuple):
-    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes that say how a point is laid out.
+    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes of the layout of a point.
 
     ``T_frame_cloud`` (4, 4) is where the cloud lies in its frame, None where that is its origin.
     """
@@ -69,7 +69,7 @@ def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> Poi
     begin = reader.offset
     count = reader.integer()
     if count > _MOST_FIELDS:
-        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are believed")
+        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are accepted")
     fields = [
         PointField(reader.string(), reader.integer(), reader.integer("B"), reader.integer()) for _ in range(count)
     ]
@@ -103,14 +103,14 @@ def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
 
 
 class Layout(NamedTuple):
-    """Where a channel keeps its fields: a structured type, and the name of the time field, if any."""
+    """Fields of a channel: a structured type, and the name of the time field, if any."""
 
     point: np.dtype[np.void]
     time: str
 
 
 class PointCloudDecoder:
-    """Decodes clouds; the place of the fields is worked out once for each layout."""
+    """Decodes clouds; the offsets of the fields are computed once for each layout."""
 
     def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud = read_point_cloud) -> None:
         self.read = read
@@ -119,7 +119,7 @@ class PointCloudDecoder:
         self.layouts: dict[bytes, Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
-        """What came back of a message's points."""
+        """Valid returns of a message's points."""
         return self.returns(self.read(data))
 
     def returns(self, message: PointCloudMessage) -> Returns:
@@ -172,7 +172,7 @@ class PlanarCloudDecoder(PointCloudDecoder):
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:
-    """The height of all points of the first clouds, None where it is not one or no cloud has enough to tell."""
+    """The common height of all points of the first clouds, None without one or with too few points."""
     heights_m = np.empty(0, np.float32)
     most = 0
     for cloud in clouds:
@@ -200,7 +200,7 @@ def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
             continue
         if field.datatype not in _FORMATS:
             raise MalformedMessageError(
-                f"field {field.name} has data type {field.datatype}; PointField knows 1 to 8"
+                f"field {field.name} has data type {field.datatype}; PointField has 1 to 8"
             )
         number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
         if field.offset + number.itemsize > message.point_step:
@@ -258,7 +258,7 @@ def read_livox(data: memoryview, form: type[CdrReader] = CdrReader) -> PointClou
     reader = form(data)
     stamp_ns, frame = reader.header()
     reader.numbers("Q")  # time of the first point, by the lidar's clock
-    reader.integer()  # the number of points, told once more by their array
+    reader.integer()  # the number of points, stated once more by their array
     reader.numbers("B", 4)  # lidar and reserved
     count = reader.integer()
     before = reader.offset

@@ -1,4 +1,4 @@
-"""Per-point times, whatever a driver calls them and counts them in, or by the azimuth of a spinning lidar."""
+"""Per-point times, whatever a driver's name and unit for them, or by the azimuth of a spinning lidar."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once"
-_SHORTEST_SCAN_NS = 500_000  # whole numbers that span less are microseconds
-_LONGEST_SCAN = 1e4  # in milliseconds; floats that span more are micro- or nanoseconds
-_NEAR_S = 1.0  # no scan begins further from its stamp than this
-_ABSOLUTE_S = 3600.0  # absolute times are beyond
+_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are microseconds
+_LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
+_NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
+_ABSOLUTE_S = 3600.0  # least absolute time in seconds
 
 
 class PointTimes:
     """Seconds after the stamp for the points of scans, in any order and from any thread.
 
     The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
-    ``assumed`` says in words what was done with one of the first scans that have times.
+    ``assumed`` describes the interpretation of one of the first scans that have times.
     """
 
     def __init__(self, config: LogConfig) -> None:
@@ -38,16 +38,18 @@ class PointTimes:
         return self.assumed != _NONE
 
     def wants(self, field: str) -> bool:
-        """Whether times are taken from a field of this name."""
+        """True if times are taken from a field of this name."""
         return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
 
     def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
-        """Times (N,) of points (N, 3) by how far the lidar has turned since its start, which is at the stamp."""
+        """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
         config = self.config
         sense = -1.0 if config.point_times == "clockwise" else 1.0
         turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
-        way = f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
-        self.assumed = f"point times by the azimuth: {way} (log.point_times)"
+        direction = (
+            f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+        )
+        self.assumed = f"point times by the azimuth: {direction} (log.point_times)"
         return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
 
     def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:

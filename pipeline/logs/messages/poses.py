@@ -46,7 +46,7 @@ def decode_transforms(data: memoryview, form: type[CdrReader] = CdrReader) -> li
     transforms = []
     count = reader.integer()
     if count > _MOST_TRANSFORMS:
-        raise MalformedMessageError(f"it claims {count} transforms; at most {_MOST_TRANSFORMS} are believed")
+        raise MalformedMessageError(f"it claims {count} transforms; at most {_MOST_TRANSFORMS} are accepted")
     for _ in range(count):
         stamp_ns, parent = reader.header()
         child = reader.string()

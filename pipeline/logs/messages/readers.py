@@ -30,27 +30,27 @@ def kind(channel: Channel) -> str:
 
 
 def is_scan(channel: Channel) -> bool:
-    """Whether its messages are planar laser scans that are understood."""
+    """True if its messages are planar laser scans of a supported type."""
     return _kind(channel) in _SCANS
 
 
 def is_cloud(channel: Channel) -> bool:
-    """Whether its messages are clouds that are understood."""
+    """True if its messages are clouds of a supported type."""
     return _kind(channel) in _CLOUDS
 
 
 def is_odometry(channel: Channel) -> bool:
-    """Whether its messages are nav_msgs/Odometry."""
+    """True if its messages are nav_msgs/Odometry."""
     return _kind(channel) in _ODOMETRY
 
 
 def has_poses(channel: Channel) -> bool:
-    """Whether its messages are stamped poses of any understood type."""
+    """True if its messages are stamped poses of any supported type."""
     return _kind(channel) in _POSES | _ODOMETRY
 
 
 def has_transforms(channel: Channel) -> bool:
-    """Whether its messages are transforms between frames."""
+    """True if its messages are transforms between frames."""
     return _kind(channel) in _TRANSFORMS
 
 
@@ -82,7 +82,7 @@ def _kind(channel: Channel) -> Kind:
 
 
 class _Encoding(NamedTuple):
-    """A message encoding: the languages of its schemas, and how it reads ROS's types or parses Foxglove's."""
+    """A message encoding: languages of its schemas, reader of ROS's types, parser of Foxglove's."""
 
     schema_languages: tuple[str, ...]
     reader: type[CdrReader] | None = None

@@ -21,7 +21,7 @@ class Returns(NamedTuple):
     """The valid returns of one scan message.
 
     ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` says for what where nothing is left.
+    counts what was left out, ``why`` is the reason where nothing is left.
     """
 
     stamp_ns: int
@@ -36,7 +36,7 @@ NO_TIMES.flags.writeable = False
 
 
 def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
-    """Points (N, d) in the frame in which they were told to lie; None stands for its origin."""
+    """Points (N, d) moved by the pose of their frame; None stands for its origin."""
     if T_frame_cloud is None:
         return points
     d = points.shape[1]

@@ -31,7 +31,7 @@ _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """What came of a conversion: messages by topic, what was left out by choice, what could not be read."""
+    """Result of a conversion: messages by topic, those left out by choice, those that could not be read."""
 
     path: Path
     messages: dict[str, int]
@@ -109,7 +109,7 @@ def _is_fixed(topic: str) -> bool:
 
 
 def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
-    """The topics to write: all, but of several lidars only the one that is asked for."""
+    """The topics to write: all, but of several lidars only the requested one."""
     lidar = find_lidar(indexes, topic) if topic else None
     channels = topics_of(indexes)
     return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]

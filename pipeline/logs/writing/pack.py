@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 
-LATEST_NS = (1 << 31) * 1_000_000_000  # stamps of ROS end there
+LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
 _FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
 
 _RULE = "=" * 80
@@ -58,7 +58,7 @@ _DEFINITIONS: dict[str, str] = {
 
 
 class Place(NamedTuple):
-    """A pose as messages tell it: meters and a unit quaternion."""
+    """A pose in messages: meters and a unit quaternion."""
 
     x: float
     y: float

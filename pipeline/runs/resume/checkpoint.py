@@ -1,4 +1,4 @@
-"""state.checkpoint: the whole state of SLAM after some scan, to resume from."""
+"""state.checkpoint: the whole state of SLAM after a scan, to resume from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from scanchain.runs.provenance import package_version
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
 from scanchain.slam import Slam
 
-_LEISURE = 20.0  # times as long as a checkpoint takes to write passes at least until the next
+_LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
 
 
 def _version() -> str:

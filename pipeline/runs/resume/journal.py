@@ -1,4 +1,4 @@
-"""steps.journal: every step of a run on disk as soon as it is computed; a killed run leaves it behind."""
+"""steps.journal: every step of a run, on disk as soon as it is computed, for resuming after a crash."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Journal:
     """
 
     def __init__(self, path: Path, *, after_bytes: int = 0) -> None:
-        """after_bytes : of an existing journal that are kept."""
+        """after_bytes : of an existing journal that are retained."""
         self.file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         os.ftruncate(self.file, after_bytes)
         os.lseek(self.file, after_bytes, os.SEEK_SET)
@@ -48,7 +48,7 @@ class Journal:
 
 
 def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int]:
-    """The steps that a run got to before it was killed, and how many bytes of the journal they take.
+    """The steps of a killed run, and the number of bytes of the journal they take.
 
     folder : of the run, named ``NAME.partial-PID``; limit : steps that are read at most
     The last record of a killed run may be torn: reading ends before the first that is not whole. ``write`` of the

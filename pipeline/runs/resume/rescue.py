@@ -1,4 +1,4 @@
-"""A failed run: the files that are kept, and the error that says where they are."""
+"""A failed run: the files that are retained, and the error that names their directory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from scanchain.errors import InputError, ScanchainError, told
+from scanchain.errors import InputError, ScanchainError, remedy_of
 from scanchain.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.resume.journal import JOURNAL_FILE
@@ -49,7 +49,7 @@ def rescued(
             error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
         )
     except OSError as failure:
-        why = "" if isinstance(error, OSError) else f" ({told(failure) or failure.strerror})"
+        why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
         where = f"{until} in {directory.path / JOURNAL_FILE} alone{why}"
     if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
         where += f"; {how_to_resume(provenance.command)}"
@@ -63,7 +63,7 @@ def _reason(error: BaseException) -> str:
     """Reason why a run ended, as text."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
-    known = told(error) if isinstance(error, OSError) else ""
+    known = remedy_of(error) if isinstance(error, OSError) else ""
     return known or str(error) or type(error).__name__
 
 

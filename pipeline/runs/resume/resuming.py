@@ -61,7 +61,7 @@ def after(
 def set_aside(folder: Path, checkpoint: Checkpoint) -> None:
     """Remove files that will be written again, except the recording, which is renamed.
 
-    The name tells which process wrote it: one killed before its own first checkpoint leaves it to the next.
+    Its name holds the number of its process: one killed before its own first checkpoint leaves it to the next.
     """
     before, recording = _recorded_by(checkpoint.process, folder), folder / RECORDING_FILE
     if recording.is_file() and not before.exists():

@@ -24,15 +24,15 @@ _END = 16  # bytes: length of the tree, CRC-32 of all before
 class Classes:
     """The classes that may stand in a snapshot, by name, and the attributes in them that are left out.
 
-    made_anew : what makes these attributes from the object when it is read, its other attributes being there
-    version : a line that tells which code the classes belong to; that of another is not read
+    rebuilt : functions that rebuild these attributes of an object from its others when it is read
+    version : a line that identifies the code of the classes; that of another is not read
     """
 
     def __init__(
-        self, kinds: Iterable[type], made_anew: Mapping[tuple[type, str], Callable[[Any], Any]], version: str
+        self, kinds: Iterable[type], rebuilt: Mapping[tuple[type, str], Callable[[Any], Any]], version: str
     ) -> None:
         self.by_name = {kind.__name__: kind for kind in kinds}
-        self.made_anew = made_anew
+        self.rebuilt = rebuilt
         self.version = version
 
     def of(self, name: str) -> type:
@@ -118,7 +118,7 @@ class _Packer:
         fields = [
             [name, self.pack(getattr(value, name))]
             for name in _field_names(value)
-            if (kind, name) not in self.classes.made_anew
+            if (kind, name) not in self.classes.rebuilt
         ]
         return ["object", number, kind.__name__, fields]
 
@@ -179,7 +179,7 @@ class _Unpacker:
         self.seen[number] = made = object.__new__(kind)
         for name, value in fields:
             object.__setattr__(made, name, self.unpack(value))
-        for (owner, name), make in self.classes.made_anew.items():
+        for (owner, name), make in self.classes.rebuilt.items():
             if owner is kind:
                 object.__setattr__(made, name, make(made))
         return made

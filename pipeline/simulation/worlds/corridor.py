@@ -1,4 +1,4 @@
-"""A corridor of 80 m with bare walls between two lobbies: in its middle nothing tells how far along one is."""
+"""A corridor of 80 m with bare walls between two lobbies: in its middle the motion along it is unobservable."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scanchain.simulation.motion import Vehicle, mount
 from scanchain.simulation.solids import Scenery, Solids
 
 LENGTH_M = 80.0
-SIGHT_M = 20.0  # dust in the air: neither end can be seen from the middle
+SIGHT_M = 20.0  # range limit by dust in the air: neither end can be seen from the middle
 STRUCTURE_M = 5.0  # of the corridor at either end that is not bare
 _HALF_M, _HEIGHT_M, _WALL_M = 1.5, 2.7, 0.3
 _LOBBY_M, _LOBBY_HALF_M = 9.0, 4.5
@@ -18,7 +18,7 @@ ROBOT = Vehicle(
     acceleration_m_s2=0.8,
     lateral_acceleration_m_s2=0.8,
     corner_m=0.7,
-    wander_m=0.08,
+    deviation_m=0.08,
     sway_rad=0.004,
     heave_m=0.004,
     radius_m=0.35,

@@ -19,7 +19,7 @@ MULE = Vehicle(
     acceleration_m_s2=1.0,
     lateral_acceleration_m_s2=1.2,
     corner_m=2.5,
-    wander_m=0.25,
+    deviation_m=0.25,
     sway_rad=0.025,
     heave_m=0.03,
     radius_m=0.6,
@@ -76,7 +76,7 @@ def _tree(scenery: Scenery, place: NDArray[np.float64], rng: np.random.Generator
 
 
 def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng: np.random.Generator) -> None:
-    """A shrub, a boulder or a fallen log, no farther out than the ``room`` there is."""
+    """A shrub, a boulder or a fallen log, no farther out than the free ``room``."""
     x, y = place.tolist()
     kind, size = rng.random(), min(rng.uniform(0.3, 0.9), room)
     if kind < 0.5:
@@ -89,8 +89,8 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 
 
 def _sampled_route() -> Matrix:
-    """The route's straight pieces, a place every 20 cm."""
-    pieces = []
+    """Points along the route's straight segments, one every 20 cm."""
+    segments = []
     for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
-        pieces.append(np.linspace(a, b, int(np.linalg.norm(b - a) / 0.2)))
-    return np.vstack(pieces)
+        segments.append(np.linspace(a, b, int(np.linalg.norm(b - a) / 0.2)))
+    return np.vstack(segments)

@@ -19,7 +19,7 @@ CAR = Vehicle(
     acceleration_m_s2=3.0,
     lateral_acceleration_m_s2=3.0,
     corner_m=15.0,
-    wander_m=0.3,
+    deviation_m=0.3,
     sway_rad=0.006,
     heave_m=0.02,
     radius_m=1.0,
@@ -40,7 +40,7 @@ ROUTE = _stadium()
 
 
 class _Road:
-    """Places beside the route, by the distance along it and to its left."""
+    """Positions beside the route, by the distance along it and to its left."""
 
     def __init__(self, route: Matrix) -> None:
         lap = np.vstack([route, route[:1]])

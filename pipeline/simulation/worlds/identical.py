@@ -1,4 +1,4 @@
-"""Three identical corridors of identical rooms: what is seen does not tell which of them one is in."""
+"""Three identical corridors of identical rooms: scans do not tell them apart."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROUTE = np.array([
     [27.5, -4.0], [27.5, 0.0], [12.5, 0.0], [12.5, 4.0], [7.5, 4.0],
 ])  # fmt: skip
 
-# In every room: where the middle of a piece stands, from the room's, and how long, wide and high it is.
+# In every room: middle of a piece of furniture, from the room's, and how long, wide and high it is.
 _FURNITURE_M = np.array([
     [1.7, 2.4, 1.4, 0.8, 0.74], [1.5, 1.6, 0.45, 0.45, 0.9], [-1.75, 2.65, 1.2, 0.4, 1.9],
     [-2.15, -1.8, 0.4, 1.2, 1.2], [2.15, -2.0, 0.5, 0.6, 2.0],
@@ -64,7 +64,7 @@ def _walls() -> list[Wall]:
 
 
 def _furnish(scenery: Scenery, x: float, y: float, side: float, furniture: Matrix) -> None:
-    """The same pieces in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
+    """The same furniture in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
     yaw_rad = 0.0 if side > 0.0 else np.pi
     for u, v, length, width, height in furniture:
         scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)

@@ -1,4 +1,4 @@
-"""Interiors: walls with doorways, and furniture put where nothing is in its way."""
+"""Interiors: walls with doorways, and furniture put where there is room."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scanchain.simulation.solids import Scenery
 CEILING_M = 2.8
 _WALL_M, _DOOR_M = 0.12, 1.0
 
-_ROUTE_M = 0.5  # kept free beside the robot's route
-_DOORWAY_M = 1.0  # kept free around a doorway
+_ROUTE_M = 0.5  # distance from the robot's route that is kept free
+_DOORWAY_M = 1.0  # distance from a doorway that is kept free
 _TRIES = 12
 Kind = Literal["shelf", "desk", "bin", "plant"]
 _SIZES_M: dict[Kind, tuple[float, float]] = {
@@ -35,7 +35,7 @@ class Wall(NamedTuple):
     leaves: int = 0
 
     def at(self, along_m: float, left_m: float = 0.0) -> tuple[float, float]:
-        """The place so far along the wall and to its left."""
+        """The position so far along the wall and to its left."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return float(self.x0 + c * along_m - s * left_m), float(self.y0 + s * along_m + c * left_m)
 
@@ -46,12 +46,12 @@ class Wall(NamedTuple):
 
     @property
     def yaw_rad(self) -> float:
-        """Which way it runs."""
+        """Direction of the wall."""
         return float(np.arctan2(self.y1 - self.y0, self.x1 - self.x0))
 
 
 def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
-    """The pieces of a wall between its doorways, a lintel over each, and the leaves, open at 90 to 110 degrees."""
+    """The segments of a wall between its doorways, lintels, and door leaves, open at 90 to 110 degrees."""
     edges = [
         0.0,
         *(e for place in wall.doors for e in (place - 0.5 * _DOOR_M, place + 0.5 * _DOOR_M)),
@@ -81,7 +81,7 @@ class Room(NamedTuple):
 
 
 class Furnisher:
-    """Fills rooms at random; a piece that finds no place after a few tries is left out."""
+    """Fills rooms at random; furniture that finds no room after a few tries is left out."""
 
     def __init__(self, scenery: Scenery, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
         self._scenery = scenery
@@ -99,7 +99,7 @@ class Furnisher:
                 any(self._try(kind, room) for _ in range(_TRIES))
 
     def _try(self, kind: Kind, room: Room) -> bool:
-        """Put one piece at a random place in the room, unless something is in its way."""
+        """Put one piece of furniture at a random position in the room, unless something overlaps it."""
         upright = int(self._rng.integers(2))
         half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
         low = np.array([room.x0, room.y0]) + 0.1 + half
@@ -149,6 +149,6 @@ class Furnisher:
 
 
 def _distance_m(places: Matrix, center: Matrix, half: Matrix) -> float:
-    """Distance from the nearest of (N, 2) places to an upright rectangle."""
+    """Distance from the nearest of (N, 2) positions to an upright rectangle."""
     outside = np.maximum(np.abs(places - center) - half, 0.0)
     return float(np.linalg.norm(outside, axis=1).min())

@@ -15,14 +15,14 @@ ROBOT = Vehicle(
     acceleration_m_s2=0.5,
     lateral_acceleration_m_s2=0.5,
     corner_m=0.6,
-    wander_m=0.05,
+    deviation_m=0.05,
     sway_rad=0.0,
     heave_m=0.0,
     radius_m=0.25,
     T_base_lidar=np.array([[1.0, 0, 0, 0.15], [0, 1, 0, 0], [0, 0, 1, 0.25], [0, 0, 0, 1]]),
 )
 
-# Round the ring by way of two rooms; then again, across the core, and by way of two more rooms.
+# Round the ring by two rooms; then again, across the core, and by two more rooms.
 ROUTE = np.array([
     [5.0, 5.0], [8.0, 5.0], [8.0, 2.0], [13.0, 2.0], [13.0, 5.0], [21.0, 5.0], [21.0, 13.0], [5.0, 13.0],
     [5.0, 5.0], [21.0, 5.0], [21.0, 13.0], [12.7, 13.0], [12.7, 5.0], [21.0, 5.0], [21.0, 13.0], [17.0, 13.0],
@@ -78,8 +78,8 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
 
 
 def _sampled_route() -> Matrix:
-    """The route's straight pieces, a place every 5 cm."""
-    pieces = []
+    """Points along the route's straight segments, one every 5 cm."""
+    segments = []
     for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
-        pieces.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))
-    return np.vstack(pieces)
+        segments.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))
+    return np.vstack(segments)

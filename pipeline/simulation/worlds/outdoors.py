@@ -1,4 +1,4 @@
-"""What stands outdoors: trees and parked cars."""
+"""Solids of outdoor worlds: trees and parked cars."""
 
 from __future__ import annotations
 

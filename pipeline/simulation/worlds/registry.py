@@ -17,29 +17,29 @@ from scanchain.simulation.worlds import corridor, forest, highway, identical, of
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A place, the way through it, by whom, and with which lidar and for how long by default.
+    """A world, the route through it, the vehicle, and the default lidar and duration.
 
     Attributes
     ----------
     build : draws the place
-    way : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
+    route : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
     sight_m : how far any lidar sees there
-    holes : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
+    dropouts : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
     """
 
     build: Callable[[np.random.Generator], Solids]
-    way: Matrix | tuple[Pivot, ...]
+    route: Matrix | tuple[Pivot, ...]
     vehicle: Vehicle
     sensor: str
     duration_s: float
     sight_m: float = np.inf
-    holes: tuple[tuple[float, float], ...] = ()
+    dropouts: tuple[tuple[float, float], ...] = ()
 
     def motion(self, solids: Solids, *, duration_s: float, rng: np.random.Generator) -> Motion:
-        """The drive; ``rng`` draws how it strays and sways."""
-        if isinstance(self.way, tuple):
-            return Pivots(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)
-        return Laps(self.way, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        """The drive; ``rng`` draws its deviations and its sway."""
+        if isinstance(self.route, tuple):
+            return Pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        return Laps(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
 
 
 _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
@@ -56,7 +56,7 @@ WORLDS: dict[str, World] = {
     "staircase": World(staircase.staircase, staircase.ROUTE, staircase.WALKER, "os1-32", 40.0),
     "hall": World(sparse.hall, sparse.HALL_ROUTE, sparse.TRUCK, "vlp-16", 25.0),
     "turns": World(sparse.yard, sparse.YARD_STEPS, sparse.YARD_ROBOT, "os1-32", 40.0),
-    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, holes=_GAPS),
+    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, dropouts=_GAPS),
 }
 
 

@@ -9,7 +9,7 @@ from scanchain.simulation.routes import Pivot
 from scanchain.simulation.solids import Scenery, Solids
 from scanchain.simulation.worlds.outdoors import BELOW_M, parked_car, tree
 
-FIELD_SIGHT_M = 60.0  # haze
+FIELD_SIGHT_M = 60.0  # range limit by haze
 _LONG_M, _SHORT_M = 440.0, 160.0
 _GROUPS = ((30.0, 0.0), (260.0, 0.0), (425.0, 0.0), (300.0, _SHORT_M), (70.0, _SHORT_M))
 
@@ -18,7 +18,7 @@ TRACTOR = Vehicle(
     acceleration_m_s2=2.0,
     lateral_acceleration_m_s2=3.0,
     corner_m=12.0,
-    wander_m=0.4,
+    deviation_m=0.4,
     sway_rad=0.008,
     heave_m=0.02,
     radius_m=1.2,
@@ -35,7 +35,7 @@ TRUCK = Vehicle(
     acceleration_m_s2=5.0,
     lateral_acceleration_m_s2=4.0,
     corner_m=6.5,
-    wander_m=0.3,
+    deviation_m=0.3,
     sway_rad=0.0,
     heave_m=0.0,
     radius_m=0.7,
@@ -52,14 +52,14 @@ YARD_ROBOT = Vehicle(
     acceleration_m_s2=1.5,
     lateral_acceleration_m_s2=1.0,
     corner_m=0.0,
-    wander_m=0.0,
+    deviation_m=0.0,
     sway_rad=0.006,
     heave_m=0.004,
     radius_m=0.4,
     T_base_lidar=mount(0.15, 0.9),
 )
 
-# A triangle, a square the other way round, there and back, once round on the spot and once back; it closes.
+# A triangle, a square in the other direction, there and back, once round on the spot and once back; it closes.
 YARD_STEPS = (
     *[Pivot(120.0, 3.0)] * 3,
     *[Pivot(-90.0, 2.0)] * 4,

@@ -26,7 +26,7 @@ CAR = Vehicle(
     acceleration_m_s2=2.5,
     lateral_acceleration_m_s2=4.0,
     corner_m=7.0,
-    wander_m=0.4,
+    deviation_m=0.4,
     sway_rad=0.006,
     heave_m=0.015,
     radius_m=1.0,
@@ -42,10 +42,10 @@ _LANE_M = 2.0  # from the middle of the street, to the right
 _FREE_M = 1.8  # on either side of the middle of a lane
 
 # Crossings in the order they are passed, and the lane taken from there: 1 is the right one, −1 the left one.
-_WAY = (
+_LEGS = (
     ((0, 0), 1), ((100, 0), 1), ((100, 40), 1), ((0, 40), 1),  # new
     ((0, 0), 1), ((0, -40), 1), ((-50, -40), 1), ((-50, 40), 1),  # new
-    ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, the other way round
+    ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, in the other direction
     ((0, 0), 1), ((0, 40), 1), ((0, 80), 1), ((50, 80), 1), ((50, 40), 1),  # partly new
     ((50, 0), 1), ((100, 0), 1), ((100, 40), -1), ((0, 40), -1),  # as the first time, at last in the other lane
 )  # fmt: skip
@@ -168,8 +168,8 @@ def rounds(rng: np.random.Generator) -> Solids:
 
 
 def _lanes() -> Matrix:
-    """The route (W, 2): the lane of each street, and where it meets that of the next one."""
-    legs = [*_WAY, _WAY[0]]
+    """The route (W, 2): the lane of each street, and its intersection with that of the next one."""
+    legs = [*_LEGS, _LEGS[0]]
     lines = []
     for (start, lane), (end, _) in pairwise(legs):
         along = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
@@ -178,7 +178,7 @@ def _lanes() -> Matrix:
 
 
 def _meeting(p: Matrix, u: Matrix, q: Matrix, v: Matrix) -> Matrix:
-    """Where the lines p + s u and q + t v meet, or q where they run the same way."""
+    """Intersection of the lines p + s u and q + t v, or q where they are parallel."""
     cross = u[0] * v[1] - u[1] * v[0]
     if abs(cross) < 1e-9:
         return q

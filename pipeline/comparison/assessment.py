@@ -20,8 +20,8 @@ from scanchain.evaluation import (
     RelationError,
     Relations,
     RelativeError,
-    absolute_error_on_any_course,
-    kitti_error_on_any_course,
+    absolute_error_of_any_path,
+    kitti_error_of_any_path,
     pair,
     relation_error,
     relative_error_over_distance,
@@ -34,8 +34,8 @@ Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """A method against the ground truth, scan by scan.
+class Assessed:
+    """Figures of a method against the ground truth, scan by scan.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Judged:
         end; the identity without truth
     errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
     relations : the error over relations; None without any, or after a failure
-    definitions : what was computed, in words
+    definitions : of the figures, as text
     """
 
     figures: Figures
@@ -56,18 +56,18 @@ class Judged:
     definitions: tuple[str, ...]
 
 
-def judge(
+def assess(
     outcomes: Sequence[Outcome],
     stamps_ns: NDArray[np.int64],
     truth: Trajectory | None,
     relations: Relations | None,
-) -> Judged:
-    """A method's runs over scans of these stamps; the first whole one stands for all, times are those of all."""
+) -> Assessed:
+    """Figures of a method's runs over scans of these stamps: errors of the first whole one, times of all."""
     outcome = representative(outcomes)
     figures = _speed(outcomes)
     blank = np.full(len(outcome.seconds), np.nan)
     if not outcome.is_whole:
-        return Judged(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
+        return Assessed(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
     figures = msgspec.structs.replace(figures, repeats_apart_m=_apart(outcomes))
     error = None if relations is None else relation_error(outcome.trajectory, relations)
     if error is not None:
@@ -75,8 +75,8 @@ def judge(
             figures, relations_m=error.translation_m.mean, relations_rad=error.rotation_rad.mean
         )
     definitions = () if error is None else (error.definition,)
-    judged = Judged(figures, np.eye(4), blank, blank, blank, error, definitions)
-    return judged if truth is None else _against(truth, outcome, judged)
+    assessed = Assessed(figures, np.eye(4), blank, blank, blank, error, definitions)
+    return assessed if truth is None else _against(truth, outcome, assessed)
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
@@ -93,7 +93,7 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
 
 
 def unreliable_by_itself(outcome: Outcome) -> str:
-    """Reason why a method of ours calls itself unreliable; empty if it does not, or reports no states."""
+    """Reason for which a method of ours reports itself unreliable; empty if it does not, or reports no states."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return ""
@@ -113,19 +113,19 @@ def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
         return np.eye(4)
 
 
-def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
+def _against(truth: Trajectory, outcome: Outcome, assessed: Assessed) -> Assessed:
     pairs = pair(outcome.trajectory, truth)
-    ate = absolute_error_on_any_course(pairs)
-    kitti = _or_none(lambda: kitti_error_on_any_course(pairs))
+    ate = absolute_error_of_any_path(pairs)
+    kitti = _or_none(lambda: kitti_error_of_any_path(pairs))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))
     over_10_m = _or_none(lambda: relative_error_over_distance(pairs, 10.0))
     over_100_m = _or_none(lambda: relative_error_over_distance(pairs, 100.0))
     nees = _nees(outcome, truth)
     place = pairs.places
-    errors_m, errors_rad = judged.errors_m.copy(), judged.errors_rad.copy()
+    errors_m, errors_rad = assessed.errors_m.copy(), assessed.errors_rad.copy()
     errors_m[place], errors_rad[place] = ate.errors_m, ate.errors_rad
     figures = msgspec.structs.replace(
-        judged.figures,
+        assessed.figures,
         ate_m=ate.translation_m.rmse,
         ate_share=ate.share_of_path,
         ate_rotation_rad=ate.rotation_rad.rmse,
@@ -138,8 +138,8 @@ def _against(truth: Trajectory, outcome: Outcome, judged: Judged) -> Judged:
         nees=float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
     )
     found = (each.definition for each in (ate, second, over_10_m, over_100_m, kitti) if each is not None)
-    definitions = (*judged.definitions, *found, f"Paired: {pairs.description}")
-    return Judged(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, judged.relations, definitions)
+    definitions = (*assessed.definitions, *found, f"Paired: {pairs.description}")
+    return Assessed(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, assessed.relations, definitions)
 
 
 def _rmse_m(error: RelativeError | None) -> float | None:
@@ -182,7 +182,7 @@ def _speed(outcomes: Sequence[Outcome]) -> Figures:
 
 
 def _stages(outcome: Outcome) -> tuple[float | None, float | None, float | None, float | None]:
-    """Seconds by stage of a method that tells; the mean for loops, most scans of which take nothing."""
+    """Seconds by stage of a method that reports them; the mean for loops, most scans of which take nothing."""
     path = outcome.folder / STEPS_FILE
     if not path.exists():
         return None, None, None, None
