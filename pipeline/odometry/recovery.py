@@ -8,15 +8,18 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import MatchingConfig
-from scanchain.data import Match, Points, Pose, State
+from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
-from scanchain.registration import CorrelativeMap, Matcher, VoxelMap
+from scanchain.preprocess import Sweep
+from scanchain.registration import BirdsEye, CorrelativeMap, Matcher, VoxelMap
 
 _WIDE_SCANS = 3  # searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # lost scans in a row, from which on the map is extended at the predicted pose
 _DOUBTFUL = 2.0  # cost per point over its running mean, from which on other initial poses are tried
 _ELSEWHERE = 3.0  # the same, from which on a scan after a long silence does not belong to the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is doubtful
+_SEEDS = 4  # of a search from above that are aligned
+_NEAR_PERCENT = 95.0  # of the points, whose distance the picture from above covers
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
 
@@ -29,11 +32,20 @@ class Recovery:
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
 
-    def align(self, matcher: Matcher, points: Points, surfaces: VoxelMap, prediction: Prediction) -> Match:
-        """The alignment from the predicted pose or, where that one is doubtful, the best of several."""
+    def align(
+        self, matcher: Matcher, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
+    ) -> Match:
+        """The alignment from the predicted pose or, where that one is doubtful, the best of several.
+
+        points : (N, d) those to be aligned; sweep : all of the scan
+        """
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        if self._is_doubtful(best.cost / len(points), prediction):
+        is_searched = surfaces.dimension == 3 and best.fit < LEAST_FIT
+        if is_searched:
+            best = self._searched(best, matcher, points, sweep, surfaces, prediction)
+        is_found = is_searched and best.fit >= LEAST_FIT
+        if not is_found and self._is_doubtful(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
                 if self._cost(other, prediction) < self._cost(best, prediction):
@@ -72,6 +84,28 @@ class Recovery:
         if prediction.is_guess:
             return cost > self.usual_cost
         return cost > max(_DOUBTFUL * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+
+    def _searched(
+        self,
+        best: Match,
+        matcher: Matcher,
+        points: Points,
+        sweep: Sweep,
+        surfaces: VoxelMap,
+        prediction: Prediction,
+    ) -> Match:
+        """The best alignment in space from where upright structure fits, or the one that there was."""
+        structure = sweep.from_middle(prediction.velocity)
+        for half_width_m, half_width_rad in prediction.windows_in_space():
+            radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
+            seeds = BirdsEye(surfaces, prediction.T_odom_lidar, radius_m).seeds(
+                structure, half_width_m=half_width_m, half_width_rad=half_width_rad, answers=_SEEDS
+            )
+            found = (best, *(matcher.align(points, surfaces, seed, wide=True) for seed in seeds))
+            best = min(found, key=lambda match: (match.fit < LEAST_FIT, self._cost(match, prediction)))
+            if best.fit >= LEAST_FIT:
+                break
+        return best
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""
