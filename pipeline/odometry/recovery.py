@@ -18,7 +18,10 @@ _PATIENCE = 5  # lost scans in a row, from which on the map is extended at the p
 _DOUBTFUL = 2.0  # cost per point over its running mean, from which on other initial poses are tried
 _ELSEWHERE = 3.0  # the same, from which on a scan after a long silence does not belong to the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is doubtful
-_SEEDS = 4  # of a search from above that are aligned
+_UNUSUAL = 1.5  # the same, from which on a contradicted pose in space is searched from above
+_CLEARLY = 0.8  # share of the cost of the pose there was, up to which another one is better
+_SAME_RAD = 0.05  # within which, and within a voxel, two poses have the same minimum
+_SEEDS = 3  # of a search from above that are aligned
 _NEAR_PERCENT = 95.0  # of the points, whose distance the picture from above covers
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
@@ -31,6 +34,7 @@ class Recovery:
         self.usual_cost = 0.0
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
+        self.rough_cost = _ROUGH * 0.5 * config.kernel_scale_m**2  # of a point
 
     def align(
         self, matcher: Matcher, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
@@ -41,17 +45,18 @@ class Recovery:
         """
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        is_searched = surfaces.dimension == 3 and best.fit < LEAST_FIT
-        if is_searched:
+        is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
+        if is_contradicted:
             best = self._searched(best, matcher, points, sweep, surfaces, prediction)
-        is_found = is_searched and best.fit >= LEAST_FIT
+        is_found = is_contradicted and _is_sound(best)
         if not is_found and self._is_doubtful(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
                 if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
-        cost = best.cost / len(points)
-        self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
+        if surfaces.dimension == 2 or _is_sound(best):
+            cost = best.cost / len(points)
+            self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
@@ -59,8 +64,7 @@ class Recovery:
 
         usual_cost : before this scan
         """
-        least = _ROUGH * 0.5 * self.config.kernel_scale_m**2
-        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, least)
+        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, self.rough_cost)
 
     def take(self, state: State) -> None:
         """Count lost scans and those to search wide."""
@@ -77,13 +81,19 @@ class Recovery:
         """Whether so many scans were lost that the map has to go on from the prediction."""
         return self.lost_scans >= _PATIENCE
 
+    def _is_contradicted(self, match: Match) -> bool:
+        """Whether correspondences contradict the pose, and the cost per point is not as usual either."""
+        return (
+            match.fit < LEAST_FIT and match.cost > max(_UNUSUAL * self.usual_cost, self.rough_cost) * match.points
+        )
+
     def _is_doubtful(self, cost: float, prediction: Prediction) -> bool:
         """Whether the cost per point is far above the usual one, and a share of the most it could be."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
             return cost > self.usual_cost
-        return cost > max(_DOUBTFUL * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+        return cost > max(_DOUBTFUL * self.usual_cost, self.rough_cost)
 
     def _searched(
         self,
@@ -96,14 +106,19 @@ class Recovery:
     ) -> Match:
         """The best alignment in space from where upright structure fits, or the one that there was."""
         structure = sweep.from_middle(prediction.velocity)
+        tried = [best]
         for half_width_m, half_width_rad in prediction.windows_in_space():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
             seeds = BirdsEye(surfaces, prediction.T_odom_lidar, radius_m).seeds(
                 structure, half_width_m=half_width_m, half_width_rad=half_width_rad, answers=_SEEDS
             )
-            found = (best, *(matcher.align(points, surfaces, seed, wide=True) for seed in seeds))
-            best = min(found, key=lambda match: (match.fit < LEAST_FIT, self._cost(match, prediction)))
-            if best.fit >= LEAST_FIT:
+            for seed in seeds:
+                if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
+                    tried.append(matcher.align(points, surfaces, seed, wide=True))
+            found = min(tried, key=lambda match: self._cost(match, prediction))
+            if found.observability >= 1.0 and found.cost < _CLEARLY * best.cost:
+                best = found
+            if _is_sound(best):
                 break
         return best
 
@@ -112,6 +127,17 @@ class Recovery:
         prior = prediction.prior
         away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
         return match.cost + 0.5 * self.config.sensor_noise_m**2 * float(away @ away)
+
+
+def _is_sound(match: Match) -> bool:
+    """Whether the correspondences determine the pose and agree with it."""
+    return match.fit >= LEAST_FIT and match.observability >= 1.0
+
+
+def _is_near(T: Pose, T_other: Pose, size_m: float) -> bool:
+    """Whether matching from one pose ends where it does from the other."""
+    away_m, away_rad = lie.apart(T, T_other)
+    return away_m < size_m and away_rad < _SAME_RAD
 
 
 def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tuple[Pose, ...]:

@@ -25,7 +25,7 @@ class BirdsEye:
     """
 
     def __init__(self, target: VoxelMap, T_map_lidar: Pose, radius_m: float) -> None:
-        """T_map_lidar, radius_m : the part of the map that is taken; the plane of the picture is that of the lidar."""
+        """Draw the part of the map around the lidar, seen along its z axis."""
         self.T_map_lidar = T_map_lidar
         self.size_m = target.voxels.size_m
         means = lie.transform(lie.inverse(T_map_lidar), target.points())

@@ -64,7 +64,7 @@ class ScoreGrid:
     """
 
     def __init__(self, points: Points, resolution_m: float) -> None:
-        """points : (V, 2) meters; resolution_m : edge length of a cell."""
+        """Draw points (V, 2) into cells of that edge length."""
         self.resolution_m = resolution_m
         corners = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
         self.origin_m = corners[0] - resolution_m * (2**_TOP + 1)

@@ -55,8 +55,8 @@ def search(
 
     A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
     bound is split until one of a single shift comes first: nothing that is left can beat it. The search goes on
-    to the best pose elsewhere, ``apart_m`` or APART_RAD away from those found, with at least the share ``rival`` of
-    the best score.
+    to the best pose elsewhere, ``apart_m`` or APART_RAD away from those found, with at least the share ``rival``
+    of the best score.
 
     pyramid : of ``fill_pyramid``; its first 2ᵗᵒᵖ − 1 rows and columns are empty
     points : (N, 2) meters, lidar frame; T : (3, 3)
