@@ -104,7 +104,7 @@ def test_a_drive_at_one_hertz_is_held_from_its_second_scan_on(town):
     motion = lie.between(truth.poses[39], truth.poses[49])
     away_m, _ = lie.apart(motion, lie.between(steps[0].T_odom_lidar, steps[1].T_odom_lidar))
     assert np.linalg.norm(motion[:3, 3]) > 6.0
-    assert away_m < 0.1
+    assert away_m < 0.2
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
