@@ -131,7 +131,7 @@ class Odometry:
             self.first_sweep, self.first_points = sweep, sweep.points
             return _Registered(points, match, State.OK, match.reason, prediction)
         usual_cost = self.recovery.usual_cost
-        match = self.recovery.align(self.matcher, points, self.local_map, prediction)
+        match = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
         if sparse.is_distorted and match.inlier_share >= self.config.matching.min_inlier_share:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)

@@ -20,6 +20,8 @@ from scanchain.odometry.motion_filter import MotionFilter
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
+_ACCELERATION_M_S2 = 4.0  # of a car, which limits the distance in space from the predicted pose
+_FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,20 @@ class Prediction:
             min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),
             min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
         )
+
+    def windows_in_space(self) -> tuple[tuple[float, float], ...]:
+        """Half widths of the search windows in space, the likeliest first, meters and radians.
+
+        By the acceleration that a vehicle may have and, where nothing is found there, by its speed.
+        """
+        elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
+        half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
+        fastest_m_s = max(self.config.max_speed_m_s, _FASTEST_M_S)
+        by_speed = min(elapsed_s * fastest_m_s, _LARGEST_REACH_M), half_width_rad
+        if self.is_second or self.is_guess:
+            return (by_speed,)
+        by_acceleration = min(max(elapsed_s**2 * _ACCELERATION_M_S2, 1.0), by_speed[0]), half_width_rad
+        return by_acceleration, by_speed
 
     def alternatives(self) -> tuple[Pose, ...]:
         """Other initial poses.
