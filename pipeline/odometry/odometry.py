@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose, Prior, RawPoints, Scan, State
+from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.live_stamps import LiveStamps
@@ -111,8 +111,9 @@ class Odometry:
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
             match=registered.match,
-            state=registered.state,
+            state=State.LOST if registered.elsewhere_m > 0.0 else registered.state,
             reason=registered.reason,
+            prior=prediction.prior,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
             map_s=working_s() - aligned,
@@ -149,7 +150,7 @@ class Odometry:
         if prediction.is_second:
             T_moved = self._restart(velocity)
             T_odom_middle = T_moved @ T_odom_middle
-            prior = Prior(T_moved @ prior.T_target_source, prior.covariance, prior.widest)
+            prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
             prediction = replace(prediction, T_odom_last=T_moved)
         points = sparse.from_middle(velocity)
         match = self.matcher.align(points, self.local_map, T_odom_middle, prior)
@@ -167,9 +168,10 @@ class Odometry:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()
-        match = first_match(prediction.T_odom_last, points, self.config.matching)
         away_m = prediction.reach_m
         reason = f"may be {away_m:.0f} m away after a time without scans: a new map begins"
+        match = first_match(prediction.T_odom_last, points, self.config.matching)
+        match = replace(match, converged=False, reason=reason)
         return _Registered(points, match, State.OK, reason, prediction, away_m)
 
     def _judge(self, match: Match) -> State:
