@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose, Prior, RawPoints, Scan, State
+from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.live_stamps import LiveStamps
@@ -114,8 +114,9 @@ class Odometry:
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
             match=registered.match,
-            state=registered.state,
+            state=State.LOST if registered.elsewhere_m > 0.0 else registered.state,
             reason=registered.reason,
+            prior=prediction.prior,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
             map_s=working_s() - aligned,
@@ -136,14 +137,14 @@ class Odometry:
         usual_cost = self.recovery.usual_cost
         match = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
-        by_wheels = prediction.statistics is self.predictor.by_wheels
-        if is_placed and not by_wheels and self.standstill.confirms(match):
+        is_measured = prediction.prior.is_measured
+        if is_placed and not is_measured and self.standstill.confirms(match):
             match = replace(match, T_target_source=self.standstill.T_odom_lidar)
             return _Registered(points, match, self._judge(match), match.reason, prediction, is_standing=True)
         if sparse.is_distorted and is_placed:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
-        if state is not State.LOST and not by_wheels:
+        if state is not State.LOST and not is_measured:
             self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             return self._reset_map(points, prediction)
@@ -159,7 +160,7 @@ class Odometry:
         if prediction.is_second:
             T_moved = self._restart(velocity)
             T_odom_middle = T_moved @ T_odom_middle
-            prior = Prior(T_moved @ prior.T_target_source, prior.covariance, prior.widest)
+            prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
             prediction = replace(prediction, T_odom_last=T_moved)
         points = sparse.from_middle(velocity)
         match = self.matcher.align(points, self.local_map, T_odom_middle, prior)
@@ -178,9 +179,10 @@ class Odometry:
         self.map.forget()
         self.recovery.forget()
         self.standstill.begin(prediction.T_odom_last)
-        match = first_match(prediction.T_odom_last, points, self.config.matching)
         away_m = prediction.reach_m
         reason = f"may be {away_m:.0f} m away after a time without scans: a new map begins"
+        match = first_match(prediction.T_odom_last, points, self.config.matching)
+        match = replace(match, converged=False, reason=reason)
         return _Registered(points, match, State.OK, reason, prediction, away_m)
 
     def _judge(self, match: Match) -> State:
