@@ -137,14 +137,14 @@ class Odometry:
         usual_cost = self.recovery.usual_cost
         match = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
-        is_measured = prediction.prior.is_measured
-        if is_placed and not is_measured and self.standstill.confirms(match):
+        may_stand = self.dimension == 3 and not prediction.prior.is_measured
+        if is_placed and may_stand and self.standstill.confirms(match):
             match = replace(match, T_target_source=self.standstill.T_odom_lidar)
             return _Registered(points, match, self._judge(match), match.reason, prediction, is_standing=True)
         if sparse.is_distorted and is_placed:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
-        if state is not State.LOST and not is_measured:
+        if state is not State.LOST and may_stand:
             self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             return self._reset_map(points, prediction)

@@ -167,8 +167,7 @@ class Predictor:
         wheel, is_guess = self._wheel_motion(scan), False
         if wheel is not None:
             motion, statistics = wheel, self.by_wheels
-            share = interval_s / times.usual_s if times.has_gap_before(scan) else 1.0
-            covariance = share**2 * np.diag(self.by_wheels.variances)
+            covariance = np.diag(self.by_wheels.variances)
         elif times.has_gap_before(scan):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
