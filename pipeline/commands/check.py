@@ -56,10 +56,13 @@ def check(
     else:
         from scanchain.runs.foreign import judge_trajectory
         from scanchain.settings import load_settings
+        from scanchain.words import counted
 
         judged, missing = judge_trajectory(trajectory, sources, load_settings(overrides=settings).config.log)
         if missing:
-            click.echo(f"warning: {missing}", err=True)
+            click.echo(
+                f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
+            )
     click.echo(_json(judged) if as_json else _text(judged))
     if judged.verdict is Verdict.NOT_TRUSTWORTHY or (strict and judged.verdict is not Verdict.TRUSTWORTHY):
         ctx.exit(1)

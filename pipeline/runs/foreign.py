@@ -21,8 +21,8 @@ from scanchain.verdict import Judged, judge
 _FEWEST = 3  # scans with a pose
 
 
-def judge_trajectory(file: Path, logs: Sequence[Source], config: LogConfig) -> tuple[Judged, str]:
-    """The verdict by wheels and constant velocity at the scans that have a pose, and how many have none, as text.
+def judge_trajectory(file: Path, logs: Sequence[Source], config: LogConfig) -> tuple[Judged, int]:
+    """The verdict by wheels and constant velocity at the scans that have a pose, and how many have none.
 
     file : TUM, poses of the lidar. Raises InputError where it has poses for fewer than three scans.
     """
@@ -44,4 +44,4 @@ def judge_trajectory(file: Path, logs: Sequence[Source], config: LogConfig) -> t
     trajectory = Trajectory(np.array(stamps, np.int64)[found], T_world_lidar)
     log_times_ns = np.array(log_times, np.int64)[found]
     wheel_poses, counts = np.array(wheels)[found], np.array(points, np.int64)[found]
-    return judge(evidence_of_trajectory(trajectory, log_times_ns, wheel_poses, counts)), pairs.missing
+    return judge(evidence_of_trajectory(trajectory, log_times_ns, wheel_poses, counts)), len(stamps) - len(pairs)

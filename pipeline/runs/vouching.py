@@ -24,6 +24,8 @@ def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
     import pyarrow.parquet as pq
 
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
     except (OSError, ValueError) as error:

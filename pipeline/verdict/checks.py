@@ -15,11 +15,12 @@ Floats = NDArray[np.float64]
 
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
-_LARGEST_CORRECTION = 0.1  # of a motion by the wheels, as a share of the path: a larger one is no calibration
+_LARGEST_CORRECTION = 0.1  # m/m and rad/m: a larger one is no calibration of the wheels
 _RIDGE = 1e-3  # of the calibration's normal equations, against directions in which the wheels never moved
 _ROUNDS = 10  # of the robust regression
-_LEAST_M, _LEAST_SHARE = 0.05, 0.02  # smallest σ of wheels, the latter as a share of the path
-_MOST_SHARE = 0.1  # largest σ of wheels as a share of the path; worse wheels check nothing finer
+_TURN_M_RAD = 0.5  # path of a turn on the spot
+_LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of wheels
+_LEAST_SHARE, _MOST_SHARE = 0.02, 0.1  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
 _TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ is learned, and where a normal has it
 
 _GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
@@ -35,44 +36,56 @@ class WheelCheck(NamedTuple):
     Attributes
     ----------
     innovation : (N,) standard deviations
-    apart_m : (N,) difference of the motions over ``WINDOW_M`` after calibration, meters
+    apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
     """
 
     innovation: Floats
     apart_m: Floats
+    apart_rad: Floats
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     """Motions of a trajectory (N, d+1, d+1) against those by the wheels, NaN where unknown.
 
-    The differences of the translations are summed up in the lidar's frame, so that neither drift of heading nor
-    slopes matter, and compared before and after each scan, as medians along the path, so that readings that are
-    late or out of time do not matter either. Scale errors and a turned or displaced lidar are calibrated by robust
-    regression over the log; the standard deviation of what is left is learned from the log.
+    The differences of the motions are summed up in the lidar's frame, so that neither drift of heading nor slopes
+    matter, and compared before and after each scan, as medians along the path, so that readings that are late or
+    out of time do not matter either. Scale errors, drift and a turned or displaced lidar are calibrated by robust
+    regression over the log; the standard deviations of what is left are learned from the log.
     """
     d, n = poses.shape[-1] - 1, len(poses)
-    innovation, apart = np.full(n, np.nan), np.full(n, np.nan)
+    check = WheelCheck(*(np.full(n, np.nan) for _ in range(3)))
     known = np.isfinite(wheel_poses[:, 0, 0])
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
-    matched, wheels = np.zeros((n, d)), np.zeros((n, lie.twist_size(poses[0])))
-    matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))[:, :d]
+    matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
+    matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
     wheels[ends] = lie.log(lie.between(wheel_poses[ends - 1], wheel_poses[ends]))
-    single_m = np.maximum(_lengths(matched), _lengths(wheels[:, :d]))
+    single_m = np.maximum(_lengths(matched[:, :d]), _lengths(wheels[:, :d]))
+    single_m += _TURN_M_RAD * np.maximum(_lengths(matched[:, d:]), _lengths(wheels[:, d:]))
     path_m = np.cumsum(single_m)
     first = np.searchsorted(path_m, path_m - 0.5 * WINDOW_M, side="left")
     last = np.searchsorted(path_m, path_m + 0.5 * WINDOW_M, side="right") - 1
+    each = np.arange(n)  # with the motions to and from it, however long
+    first, last = np.maximum(np.minimum(first, each - 1), 0), np.minimum(np.maximum(last, each + 1), n - 1)
     length_m, unknown = path_m[last] - path_m[first], np.cumsum(~known)
     checked = np.flatnonzero((length_m >= _SHORTEST_M) & (unknown[last] == unknown[first]) & known)
     if not len(checked):
-        return WheelCheck(innovation, apart)
+        return check
     first, last, length_m = first[checked], last[checked], length_m[checked]
-    calibration = _calibration(_over(wheels, first, last), _over(matched, first, last), length_m)
-    difference = matched - wheels[:, :d] - _limited(wheels @ calibration, single_m)
-    drift_m = _smoothed(np.cumsum(difference, axis=0), path_m)
-    apart[checked] = _lengths(drift_m[last] - drift_m[first])
-    share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
-    innovation[checked] = apart[checked] / np.hypot(_LEAST_M, np.clip(share, _LEAST_SHARE, _MOST_SHARE) * length_m)
-    return WheelCheck(innovation, apart)
+    inputs, outputs = np.column_stack([wheels, single_m]), matched - wheels
+    innovation = np.zeros(len(checked))
+    for part, apart, least in (
+        (slice(0, d), check.apart_m, _LEAST_M),
+        (slice(d, None), check.apart_rad, _LEAST_RAD),
+    ):
+        calibration = _calibration(_over(inputs, first, last), _over(outputs[:, part], first, last), length_m)
+        difference = outputs[:, part] - _limited(inputs @ calibration, single_m)
+        drift = _smoothed(np.cumsum(difference, axis=0), path_m)
+        apart[checked] = _lengths(drift[last] - drift[first])
+        share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
+        sigma = np.hypot(least, np.clip(share, _LEAST_SHARE, _MOST_SHARE) * length_m)
+        innovation = np.maximum(innovation, apart[checked] / sigma)
+    check.innovation[checked] = innovation
+    return check
 
 
 def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:
@@ -117,10 +130,9 @@ def _smoothed(values: Matrix, path_m: Floats) -> Matrix:
     return np.stack([np.interp(path_m, grid_m, each) for each in smooth], axis=1)
 
 
-def _calibration(wheels: Matrix, matched: Matrix, length_m: Floats) -> Matrix:
-    """(k, d) translations by wheel twists (M, k), to be added; by reweighted least squares (Cauchy)."""
-    scale = 1.0 / length_m[:, None]
-    A, B = wheels * scale, (matched - wheels[:, : matched.shape[1]]) * scale
+def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
+    """Linear map from inputs (M, a) to outputs (M, b), by reweighted least squares (Cauchy) per length."""
+    A, B = inputs / length_m[:, None], outputs / length_m[:, None]
     weight = np.ones(len(A))
     correction = np.zeros((A.shape[1], B.shape[1]))
     for _ in range(_ROUNDS):
@@ -132,7 +144,7 @@ def _calibration(wheels: Matrix, matched: Matrix, length_m: Floats) -> Matrix:
 
 
 def _limited(corrections: Matrix, length_m: Floats) -> Matrix:
-    """Translations (N, d) of at most a share of the path."""
+    """Corrections (N, b) of at most a share of the path."""
     size = np.maximum(_lengths(corrections), 1e-12)
     return corrections * np.minimum(1.0, _LARGEST_CORRECTION * length_m / size)[:, None]
 

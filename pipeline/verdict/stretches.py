@@ -15,8 +15,9 @@ from scanchain.data import LEAST_FIT, Matrix
 from scanchain.verdict.checks import Floats, WheelCheck
 from scanchain.verdict.loops import Closures, contradicting_groups
 
-WHEEL_LIMIT, VELOCITY_LIMIT = 6.0, 4.0  # largest innovations that are no finding, standard deviations
+WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
 _GAP_SCANS = 10  # longest gap within a stretch
+_SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
@@ -41,7 +42,7 @@ class Stretch(Struct, frozen=True):
     ----------
     first, last : scans, from 0; start_s, end_s : since the first scan of the run
     scans : of this kind among them
-    size_m : the contradiction, meters; null where it is not measured
+    size_m, size_rad : the contradiction; null where it is not measured
     """
 
     kind: Kind
@@ -51,11 +52,14 @@ class Stretch(Struct, frozen=True):
     start_s: float
     end_s: float
     size_m: float | None = None
+    size_rad: float | None = None
 
     @property
     def text(self) -> str:
         """The stretch in words."""
         size = "" if self.size_m is None else f" by {self.size_m:.1f} m"
+        if (self.size_rad or 0.0) > _SMALL_RAD:
+            size += f" and {np.degrees(self.size_rad):.0f} deg"
         place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
         return f"{place} ({self.start_s:.1f} to {self.end_s:.1f} s): {self.kind}{size}"
 
@@ -134,19 +138,18 @@ def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
 def _of_wheels(evidence: Evidence) -> Iterator[Stretch]:
     is_marked = evidence.wheels.innovation > WHEEL_LIMIT
     for part in merged(is_marked):
-        size_m = float(np.nanmax(evidence.wheels.apart_m[part]))
-        yield _stretch(evidence, Kind.WHEELS, part.start, part.stop - 1, int(is_marked[part].sum()), size_m)
+        sizes = [float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)]
+        yield _stretch(evidence, Kind.WHEELS, part.start, part.stop - 1, int(is_marked[part].sum()), *sizes)
 
 
 def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
-    is_marked = (evidence.velocity > VELOCITY_LIMIT) & ~evidence.starts_segment
-    steps = np.diff(evidence.poses[:, :-1, -1], axis=0, prepend=evidence.poses[:1, :-1, -1])
-    lengths_m = np.linalg.norm(steps, axis=1)
+    is_new = evidence.starts_segment
+    is_marked = (evidence.velocity > VELOCITY_LIMIT) & ~is_new & ~np.concatenate([[False], is_new[:-1]])
+    jumps_m = np.zeros(len(evidence))
+    jumps_m[2:] = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], n=2, axis=0), axis=1)
     for part in merged(is_marked):
-        jumps_m = np.abs(np.diff(lengths_m[max(part.start - 1, 0) : part.stop]))
-        count = int(is_marked[part].sum())
-        size_m = float(jumps_m.max()) if len(jumps_m) else 0.0
-        yield _stretch(evidence, Kind.ACCELERATION, part.start, part.stop - 1, count, size_m)
+        size_m = float(jumps_m[part][is_marked[part]].max())
+        yield _stretch(evidence, Kind.ACCELERATION, part.start, part.stop - 1, int(is_marked[part].sum()), size_m)
 
 
 def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
@@ -177,7 +180,8 @@ def merged(is_marked: NDArray[np.bool_]) -> list[slice]:
 
 
 def _stretch(
-    evidence: Evidence, kind: Kind, first: int, last: int, scans: int, size_m: float | None = None
-) -> Stretch:
+    evidence: Evidence, kind: Kind, first: int, last: int, scans: int, size_m: float | None = None,
+    size_rad: float | None = None,
+) -> Stretch:  # fmt: skip
     start_s, end_s = float(evidence.seconds[first]), float(evidence.seconds[last])
-    return Stretch(kind, first, last, scans, start_s, end_s, size_m)
+    return Stretch(kind, first, last, scans, start_s, end_s, size_m, size_rad)

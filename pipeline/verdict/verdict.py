@@ -17,6 +17,7 @@ _MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and conf
 _LARGE_M = 1.0  # impossible change of the motion above which the trajectory is wrong
 _EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)
 _SHOWN = 3  # stretches that the sentence lists
 
 
@@ -46,7 +47,8 @@ def judge(evidence: Evidence) -> Judged:
     """The verdict on a trajectory.
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
-    impossibly, or that loop closures and wheels contradict at the same place by about the same distance.
+    impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
+    contradict at the same place by about the same distance.
     """
     stretches = tuple(find_stretches(evidence))
     reasons = list(_grave(evidence, stretches))
@@ -64,6 +66,10 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
     if jumps:
         yield _listed(jumps)
     slips = [each for each in stretches if each.kind is Kind.WHEELS]
+    for slip in slips:
+        cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
+        if cause is not None:
+            yield f"{slip.text}, where scans are {cause.kind}"
     for loop in (each for each in stretches if each.kind is Kind.LOOPS):
         slip = next((each for each in slips if _confirms(each, loop)), None)
         if slip is not None:
@@ -74,10 +80,13 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
             return
 
 
+def _overlap(a: Stretch, b: Stretch) -> bool:
+    return a.first <= b.last and b.first <= a.last
+
+
 def _confirms(slip: Stretch, loop: Stretch) -> bool:
     """True if the loops span the slip, and contradict the trajectory by no more than it explains."""
-    is_within = loop.first <= slip.last and slip.first <= loop.last
-    return is_within and (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
+    return _overlap(slip, loop) and (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
 
 
 def _many_contradicted(evidence: Evidence) -> Iterator[str]:
