@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from scanchain.runs.metrics import Metrics
-from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Stretch
+from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain.viz.pictures.trajectory_figures import color_of, innovations
 from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
 
@@ -25,7 +25,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> Section:
         for place, (column, (name, limit)) in enumerate(_CURVES.items())
         if column in steps.column_names
     }
-    shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches]
+    shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
     chips = (
         *(Chip(name, color) for name, (_, color) in curves.items()),
         *((Chip("stretches to check", _SHADE),) if shaded else ()),
@@ -41,7 +41,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> Section:
     )  # fmt: skip
     longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
     rows = tuple(_row(each) for each in sorted(longest, key=lambda each: each.first))
-    return Section("Checks", metrics.sentence, chips, (drawing,), Grid(heads, rows) if rows else None)
+    return Section("Checks", "", chips, (drawing,), Grid(heads, rows) if rows else None)
 
 
 def _row(stretch: Stretch) -> Row:

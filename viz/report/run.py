@@ -73,7 +73,7 @@ def _doubts(m: Metrics) -> str:
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     """Facts of a run: the verdict first, then the result, its cost last."""
-    yield "verdict", m.sentence
+    yield "verdict", str(m.verdict)
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
