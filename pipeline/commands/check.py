@@ -34,8 +34,8 @@ def check(
 ) -> None:
     """Print the verdict on a run directory, computed anew, or on any trajectory of a log.
 
-    A trajectory of another tool is checked against wheel odometry and constant velocity, at the scans whose stamps
-    it has. Exit code 1: not trustworthy.
+    A trajectory of another tool is checked at the scans whose stamps it has: against wheel odometry and constant
+    velocity, and by aligning each scan to a map of those before. Exit code 1: not trustworthy.
 
     \b
     Examples:
@@ -55,10 +55,9 @@ def check(
         judged = judge_run(sources[0])
     else:
         from scanchain.runs.foreign import judge_trajectory
-        from scanchain.settings import load_settings
         from scanchain.words import counted
 
-        judged, missing = judge_trajectory(trajectory, sources, load_settings(overrides=settings).config.log)
+        judged, missing = judge_trajectory(trajectory, sources, settings)
         if missing:
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True

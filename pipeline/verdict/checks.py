@@ -118,7 +118,7 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:
     """Sums of motions (N, k) after each first to each last scan."""
-    total: Matrix = np.cumsum(motions, axis=0).astype(np.float64, copy=False)
+    total = np.cumsum(motions, axis=0)
     return total[last] - total[first]
 
 
@@ -134,10 +134,10 @@ def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
     """Linear map from inputs (M, a) to outputs (M, b), by reweighted least squares (Cauchy) per length."""
     A, B = inputs / length_m[:, None], outputs / length_m[:, None]
     weight = np.ones(len(A))
-    correction = np.zeros((A.shape[1], B.shape[1]))
+    correction: Matrix = np.zeros((A.shape[1], B.shape[1]))
     for _ in range(_ROUNDS):
         H = (A * weight[:, None]).T @ A + _RIDGE * len(A) * np.eye(A.shape[1])
-        correction = np.linalg.solve(H, (A * weight[:, None]).T @ B)
+        correction = np.linalg.solve(H, (A * weight[:, None]).T @ B).astype(np.float64, copy=False)
         error = _lengths(B - A @ correction)
         weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2)
     return correction

@@ -58,8 +58,9 @@ class Stretch(Struct, frozen=True):
     def text(self) -> str:
         """The stretch in words."""
         size = "" if self.size_m is None else f" by {self.size_m:.1f} m"
-        if (self.size_rad or 0.0) > _SMALL_RAD:
-            size += f" and {np.degrees(self.size_rad):.0f} deg"
+        turn_rad = self.size_rad or 0.0
+        if turn_rad > _SMALL_RAD:
+            size += f" and {np.degrees(turn_rad):.0f} deg"
         place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
         return f"{place} ({self.start_s:.1f} to {self.end_s:.1f} s): {self.kind}{size}"
 
