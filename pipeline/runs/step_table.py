@@ -146,14 +146,16 @@ class StepTable:
 
     def _checks(self, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
         """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
+        import pyarrow as pa
+
         log_times_ns = np.array([row.log_time_ns for row in self.rows], np.int64)
         velocity = check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses)
-        columns: dict[str, object] = {"velocity_innovation": velocity}
+        columns: dict[str, object] = {"velocity_innovation": pa.array(velocity, from_pandas=True)}
         if T_base_lidar is None or not any(row.T_odom_base is not None for row in self.rows):
             return columns
         wheels = self.wheel_poses(T_base_lidar)
-        columns |= {"wheel_innovation": check_wheels(trajectory.poses, wheels).innovation}
-        return columns | _wheel_columns(wheels)
+        innovation = check_wheels(trajectory.poses, wheels).innovation
+        return columns | {"wheel_innovation": pa.array(innovation, from_pandas=True)} | _wheel_columns(wheels)
 
     def _trajectory(self, poses: list[Pose]) -> Trajectory:
         stamps_ns = np.array([row.stamp_ns for row in self.rows], np.int64)
@@ -168,7 +170,7 @@ _NOTES = {
     "SE(2) 3x3, SE(3) 6x6; null where a direction of the match is unobservable",
     "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
     "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
-    "NaN where there is nothing to compare",
+    "null where there is nothing to compare",
     "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
     "keyframe": "number in the graph, -1 if none was made",
 }

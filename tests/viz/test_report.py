@@ -132,7 +132,7 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     page = (one_run / "report.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
-        "Accuracy", "Trajectory and map", "Loop closures", "Trajectories", "Error", "Uncertainty",
+        "Accuracy", "Trajectory and map", "Checks", "Loop closures", "Trajectories", "Error", "Uncertainty",
         "Time of a scan", "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
