@@ -20,7 +20,7 @@ _RIDGE = 1e-3  # of the calibration's normal equations, against directions in wh
 _ROUNDS = 10  # of the robust regression
 _TURN_M_RAD = 0.5  # path of a turn on the spot
 _LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of wheels
-_LEAST_SHARE, _MOST_SHARE = 0.02, 0.1  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
+_LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
 _TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ is learned, and where a normal has it
 
 _GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
