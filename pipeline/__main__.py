@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import click
 
 from scanchain.commands.batch import batch
+from scanchain.commands.check import check
 from scanchain.commands.compare import compare
 from scanchain.commands.config import config
 from scanchain.commands.convert import convert
@@ -39,13 +40,14 @@ def scanchain() -> None:
       scanchain run office.mcap --out runs/office
       scanchain view runs/office
 
-    Exit codes: 0 done, 1 the run failed, was stopped, or its result is unreliable,
+    Exit codes: 0 done, 1 the run failed, was stopped, or its result is not trustworthy,
     2 bad input or arguments.
     """
 
 
 _COMMANDS = (
-    run, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config, sequence,
+    run, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config,
+    sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)

@@ -43,7 +43,7 @@ def run(
     ground_truth : a TUM or KITTI file of true poses
     recording : whether a rerun recording is written
     overrides : keys of the configuration, two underscores for the dot: ``loops__drift=0.02``
-    Returns path, metrics, summary and warnings; ``metrics.unreliable`` is the reason not to use it, if any.
+    Returns path, metrics, summary and warnings; ``metrics.verdict`` says whether to rely on it.
     Raises InputError for bad input.
     """
     job = Job(

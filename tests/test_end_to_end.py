@@ -333,7 +333,7 @@ def test_the_error_is_below_5_cm_and_3_per_mille_of_the_path(drive):
 
 def test_the_summary_says_what_the_metrics_say(drive):
     text, metrics = (drive.folder / "summary.txt").read_text(), drive.metrics
-    assert text.splitlines()[0].startswith(str(drive.log))
+    assert text.splitlines()[1].startswith(str(drive.log))
     for part in (
         f"{metrics['scans']:,} over {metrics['log_span_s']:.1f} s",
         f"loop closures  {metrics['closures_tried'] or 'none'} tried",

@@ -22,6 +22,7 @@ from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
+from scanchain.verdict import Verdict
 from scanchain.words import counted
 
 _SHA256_OF_NOTHING = hashed().hexdigest()  # of an empty file, and of an empty folder
@@ -77,12 +78,18 @@ class Batched:
 
     @property
     def failures(self) -> str:
-        """Number of logs without a result or with an unreliable one, as text; empty if there are none."""
+        """Number of logs without a result or with one not to be trusted, as text; empty if there are none."""
         absent = sum(not row.state.has_result for row in self.rows)
-        unreliable = sum(row.state is State.UNRELIABLE for row in self.rows)
+        doubted = sum(row.state is State.NOT_TRUSTWORTHY for row in self.rows)
         parts = [f"{absent:,} of {len(self.rows):,} logs have no result"] if absent else []
-        parts += [f"{unreliable:,} of {len(self.rows):,} logs are unreliable"] if unreliable else []
+        parts += [f"{doubted:,} of {len(self.rows):,} logs are not trustworthy"] if doubted else []
         return ", ".join(parts)
+
+    @property
+    def doubts(self) -> str:
+        """Number of logs with stretches to check, as text; empty if there are none."""
+        count = sum(row.metrics is not None and row.metrics.verdict is Verdict.CHECK for row in self.rows)
+        return f"{count:,} of {len(self.rows):,} logs have stretches to check" if count else ""
 
 
 def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:

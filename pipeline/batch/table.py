@@ -10,6 +10,7 @@ import numpy as np
 
 from scanchain.batch.task import Row, State
 from scanchain.runs.metrics import Metrics
+from scanchain.verdict import Verdict
 from scanchain.words import counted, duration
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
@@ -38,7 +39,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
     import pyarrow.parquet as pq
 
     schema = pa.schema(
-        [(name, pa.string()) for name in ("log", "sha256", "key", "run", "state", "reason")]
+        [(name, pa.string()) for name in ("log", "sha256", "key", "run", "state", "reason", "verdict")]
         + [
             ("warnings", pa.int64()),
             ("tries", pa.int64()),
@@ -64,9 +65,14 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Totals, each log without a result and its reason, each log with warnings."""
+    """Totals, each log without a result and its reason, each log with stretches to check or warnings."""
     lines = [f"{name:<14} {text}" for name, text in totals(rows)]
     lines += [f"{row.state:<14} {row.log}: {row.why}" for row in rows if row.state is not State.DONE]
+    lines += [
+        f"{'check':<14} {row.log}: {row.metrics.verdict_reason}"
+        for row in rows
+        if row.metrics is not None and row.metrics.verdict is Verdict.CHECK
+    ]
     lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
     return "\n".join(lines) + "\n"
 
@@ -122,6 +128,7 @@ def _cells(row: Row) -> dict[str, object]:
     if metrics is None:
         return cells
     cells |= {name: getattr(metrics, name) for name in (*_NUMBERS, *_FIGURES)}
+    cells["verdict"] = str(metrics.verdict)
     if metrics.ground_truth is not None:
         truth = metrics.ground_truth
         cells |= {name: getattr(truth.optimized, name) for name in _ERRORS}

@@ -20,6 +20,7 @@ from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
+from scanchain.verdict import Verdict
 
 ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
@@ -28,7 +29,7 @@ class State(StrEnum):
     """End state of a log."""
 
     DONE = "done"
-    UNRELIABLE = "unreliable"
+    NOT_TRUSTWORTHY = "not trustworthy"
     FAILED = "failed"
     CRASHED = "crashed"
     TIMED_OUT = "timed out"
@@ -37,8 +38,8 @@ class State(StrEnum):
 
     @property
     def has_result(self) -> bool:
-        """True if there is a run directory, even if its result is unreliable."""
-        return self in (State.DONE, State.UNRELIABLE)
+        """True if there is a run directory, even if its result is not trustworthy."""
+        return self in (State.DONE, State.NOT_TRUSTWORTHY)
 
 
 class Task(Struct, frozen=True):
@@ -203,9 +204,9 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
     output = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
-        unreliable = _metrics(task).unreliable
-        if unreliable and error.endswith(unreliable):
-            return State.UNRELIABLE, unreliable
+        metrics = _metrics(task)
+        if metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence):
+            return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:

@@ -59,6 +59,7 @@ _DAY_S = 86_400.0
     show_default=True,
     help="Whether runs write a recording.",
 )
+@click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
 @click.pass_context
 def batch(
     ctx: click.Context,
@@ -73,6 +74,7 @@ def batch(
     retries: int,
     rerun: str,
     gt: str | None,
+    strict: bool,
     **shortcuts: str | bool | None,
 ) -> None:
     """Run many logs, each in its own process.
@@ -124,8 +126,9 @@ def batch(
     write_batch_report(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
     click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")
-    if batched.failures:
-        raise ScanchainError(f"{batched.failures}; {out}/summary.txt has the reason")
+    failures = ", ".join(filter(None, (batched.failures, batched.doubts if strict else "")))
+    if failures:
+        raise ScanchainError(f"{failures}; {out}/summary.txt has the reason")
 
 
 def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:

@@ -61,6 +61,7 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search the
     metavar="SECONDS",
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
+@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context
 def run(
@@ -74,6 +75,7 @@ def run(
     force: bool,
     resume: bool,
     checkpoint: float,
+    strict: bool,
     as_json: bool,
     **shortcuts: str | bool | None,
 ) -> None:
@@ -101,6 +103,7 @@ def run(
     from scanchain.runs.job import Job
     from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
+    from scanchain.verdict import Verdict
 
     truth_file, truth_topic = ground_truth(gt)
     job = Job(
@@ -118,9 +121,10 @@ def run(
     )
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
-    unreliable = finished.metrics.unreliable
-    if unreliable:
-        click.echo(f"error: {finished.path}: {unreliable}", err=True)
+    verdict = finished.metrics.verdict
+    fails = verdict is Verdict.NOT_TRUSTWORTHY or (strict and verdict is not Verdict.TRUSTWORTHY)
+    if fails:
+        click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
     for warning in finished.warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
@@ -129,7 +133,7 @@ def run(
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
     if not as_json:
         click.echo(f"written        {out}")
-    if unreliable:
+    if fails:
         ctx.exit(1)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.figures import Figures
 from scanchain.comparison.outcome import STEPS_FILE, Outcome
-from scanchain.data import Matrix, Pose, State, Trajectory
+from scanchain.comparison.scan_store import StoredScans
+from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     RelationError,
@@ -27,8 +27,9 @@ from scanchain.evaluation import (
     relative_error_over_distance,
     relative_error_over_time,
 )
-from scanchain.runs.metrics import count_contradicted, unreliable
 from scanchain.runs.step_table import COLUMNS, nees_of_steps
+from scanchain.runs.vouching import evidence_of_trajectory, judge_run
+from scanchain.verdict import Judged, judge
 
 Answer = TypeVar("Answer")
 
@@ -92,15 +93,14 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
     return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
 
 
-def unreliable_by_itself(outcome: Outcome) -> str:
-    """Reason for which a method of ours reports itself unreliable; empty if it does not, or reports no states."""
-    path = outcome.folder / STEPS_FILE
-    if not path.exists():
-        return ""
-    table = pq.read_table(path, columns=["state", "scan_points", "fit"])
-    states = [State(name) for name in table["state"].to_pylist()]
-    contradicted = count_contradicted(states, table["fit"].to_pylist())
-    return unreliable(Counter(states), contradicted, table["scan_points"].to_pylist())
+def judged(outcome: Outcome, scans: StoredScans) -> Judged | None:
+    """The verdict: on ours by all that is known, on others by wheels and velocity; None after a failure."""
+    if not outcome.is_whole:
+        return None
+    if (outcome.folder / STEPS_FILE).exists():
+        return judge_run(outcome.folder)
+    wheels = scans.wheels @ scans.T_base_lidar
+    return judge(evidence_of_trajectory(outcome.trajectory, scans.log_times_ns, wheels, scans.points))
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

@@ -29,6 +29,7 @@ class OurOdometry:
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
         self.description = _description(config)
         self.odometry = Odometry(config, T_base_lidar)
+        self.T_base_lidar = T_base_lidar
         self.steps = StepTable()
 
     def track(self, scan: Scan) -> Pose:
@@ -54,7 +55,7 @@ class OurOdometry:
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         """The final poses; tables go into the folder."""
-        self.steps.write(folder / STEPS_FILE, odometry)
+        self.steps.write(folder / STEPS_FILE, odometry, self.T_base_lidar)
         return odometry
 
 
@@ -64,6 +65,7 @@ class OurChain:
     def __init__(self, config: Config, T_base_lidar: Pose) -> None:
         self.description = f"{_description(config)}; loops closed, pose graph optimized at the end"
         self.slam = Slam(config, T_base_lidar)
+        self.T_base_lidar = T_base_lidar
         self.steps = StepTable()
 
     def track(self, scan: Scan) -> Pose:
@@ -75,7 +77,7 @@ class OurChain:
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         """The final poses; tables go into the folder."""
         result = self.slam.finish()
-        self.steps.write(folder / STEPS_FILE, result.trajectory)
+        self.steps.write(folder / STEPS_FILE, result.trajectory, self.T_base_lidar)
         final = final_verdicts(result.closures, result.state)
         write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
         return result.trajectory

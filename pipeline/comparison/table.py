@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
-from scanchain.comparison.assessment import representative, unreliable_by_itself
+from scanchain.comparison.assessment import judged, representative
 from scanchain.comparison.figures import COLUMNS, Figures, columns_of
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import EndReport, Outcome, Status
@@ -24,6 +24,7 @@ from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_
 from scanchain.logs import Log
 from scanchain.processes import Limits
 from scanchain.runs.provenance import Provenance, package_version
+from scanchain.verdict import Verdict
 
 TABLE_FILE = "table.json"
 
@@ -36,7 +37,7 @@ class Row(Struct, frozen=True):
     status, reason : of the first run that did not end well, else ok
     settings : whole, as a TOML file for --settings would hold them
     definitions : of its errors, as text
-    unreliable : reason, by its own account, not to use the result, as most of its scans are degenerate; else empty
+    verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
     """
 
     name: str
@@ -47,7 +48,13 @@ class Row(Struct, frozen=True):
     settings: dict[str, Any]
     figures: Figures
     definitions: list[str]
-    unreliable: str = ""
+    verdict: str = ""
+    verdict_reason: str = ""
+
+    @property
+    def is_doubted(self) -> bool:
+        """True if it has a verdict, and another than trustworthy."""
+        return self.verdict not in ("", Verdict.TRUSTWORTHY)
 
 
 class Table(Struct, frozen=True):
@@ -109,14 +116,14 @@ def read_table(folder: Path) -> Table:
 def markdown(table: Table) -> str:
     """The summary for a README, the best of each column in bold, and below it the meaning of the columns."""
     columns = columns_of(table.figures, "summary")
-    head = ["method", *(column.heading for column in columns)]
+    head = ["method", *(column.heading for column in columns), "verdict"]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     shown, bar = [column.cells(table.figures) for column in columns], "\\|"
     for place, row in enumerate(table.rows):
         cells = [f"**{cells[place].text}**" if cells[place].is_best else cells[place].text for cells in shown]
         if row.status is not Status.OK:
             cells = [f"{row.status}: {row.reason}".replace("|", bar), *[""] * (len(columns) - 1)]
-        lines.append(f"| {row.name.replace('|', bar)} | {' | '.join(cells)} |")
+        lines.append(f"| {row.name.replace('|', bar)} | {' | '.join([*cells, row.verdict])} |")
     notes = [f"- *{column.heading}*: {column.definition}" for column in columns]
     return "\n".join([*lines, "", table.against, "", *notes]) + "\n"
 
@@ -131,21 +138,23 @@ def text(table: Table) -> str:
     for column, cells in zip(columns, shown, strict=True):
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
+    verdicts = ["verdict", "", *(row.verdict for row in table.rows)]
+    lines = [f"{line}  {verdict}" for line, verdict in zip(lines, verdicts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
-    endings += [f"{row.name}: UNRELIABLE: {row.unreliable}" for row in table.rows if row.unreliable]
+    endings += [f"{row.name}: {row.verdict}: {row.verdict_reason}" for row in table.rows if row.is_doubted]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
 
 
 def _csv(table: Table) -> str:
-    """Every figure in its own unit, plus name and status."""
+    """Every figure in its own unit, plus name, status and verdict."""
     keys = [column.key for column in COLUMNS]
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["method", "status", *keys])
+    writer.writerow(["method", "status", "verdict", *keys])
     for row in table.rows:
-        writer.writerow([row.name, row.status, *(getattr(row.figures, key) for key in keys)])
+        writer.writerow([row.name, row.status, row.verdict, *(getattr(row.figures, key) for key in keys)])
     return buffer.getvalue()
 
 
@@ -184,6 +193,7 @@ def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.
     outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
+    judgment = judged(representative(outcomes), results.scans)
     figures: Figures = msgspec.structs.replace(
         assessed.figures,
         thickness_m=sharp.thickness_m if sharp else None,
@@ -196,7 +206,8 @@ def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.
         status=end.status,
         reason=end.reason,
         description=representative(outcomes).report.description,
-        unreliable=unreliable_by_itself(representative(outcomes)),
+        verdict="" if judgment is None else str(judgment.verdict),
+        verdict_reason="" if judgment is None else judgment.reason,
         settings=method.settings,
         figures=figures,
         definitions=list(assessed.definitions),

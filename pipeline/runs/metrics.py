@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 
@@ -19,10 +19,10 @@ from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
 from scanchain.runs.results import Cloud
 from scanchain.runs.step_table import STAGES, StepTable
 from scanchain.slam import SlamResult
+from scanchain.verdict import Judged, Stretch, Verdict
 from scanchain.words import counted
 
-MOST_CONTRADICTED = 0.1  # largest share of contradicted scans of a reliable run; good real runs have up to 0.025
-_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+VERDICT = "verdict"  # first word of a summary
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
@@ -71,7 +71,7 @@ class Metrics(Struct, frozen=True):
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
-    ``unreliable`` is the reason not to use the result as a whole, empty if there is none.
+    ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 
@@ -105,9 +105,16 @@ class Metrics(Struct, frozen=True):
     median_iterations: float
     ground_truth: GroundTruth | None
     warnings: tuple[str, ...]
-    unreliable: str = ""
+    verdict: Verdict = Verdict.TRUSTWORTHY
+    verdict_reason: str = ""
+    stretches: tuple[Stretch, ...] = ()
     stopped: str = ""
     compile_s: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        """Verdict and reason."""
+        return f"{self.verdict}: {self.verdict_reason}"
 
     @property
     def residual(self) -> str:
@@ -148,6 +155,7 @@ def measure(
     result: SlamResult,
     cloud: Cloud,
     final: Sequence[FinalClosure],
+    judged: Judged,
     *,
     run_s: float,
     compile_s: float,
@@ -159,7 +167,7 @@ def measure(
     matches = [row.match for row in steps.rows]
     residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
-    contradicted = count_contradicted([row.state for row in steps.rows], [match.fit for match in matches])
+    contradicted = sum(row.state is State.OK and row.match.fit < LEAST_FIT for row in steps.rows)
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
@@ -194,37 +202,13 @@ def measure(
         median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
         median_iterations=float(np.median([match.iterations for match in matches])),
         ground_truth=ground_truth,
-        unreliable=unreliable(states, contradicted, [row.points for row in steps.rows]),
+        verdict=judged.verdict,
+        verdict_reason=judged.reason,
+        stretches=judged.stretches,
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,
     )
-
-
-def count_contradicted(states: Sequence[State], fits: Sequence[float]) -> int:
-    """Scans whose pose is observable, but contradicted by their correspondences."""
-    return sum(state is State.OK and fit < LEAST_FIT for state, fit in zip(states, fits, strict=True))
-
-
-def unreliable(states: Mapping[State, int], contradicted: int, points: Sequence[int]) -> str:
-    """Reason why a run is unreliable; empty if few scans contradict the map and most poses are measured."""
-    degenerate, lost = states[State.DEGENERATE], states[State.LOST]
-    if contradicted > MOST_CONTRADICTED * len(points):
-        return (
-            f"{contradicted:,} of {len(points):,} scans contradict the map where they were placed (fit below "
-            f"{LEAST_FIT:g}): the motion between scans may be larger than the search (scanchain doctor; "
-            "--matching.wide_max_distance_m), or the log is at fault"
-        )
-    if 2 * (degenerate + lost) <= len(points):
-        return ""
-    line = (
-        f"{degenerate:,} of {len(points):,} scans are degenerate and {lost:,} lost: most poses are predicted, not "
-    )
-    line += "measured, in at least one direction"
-    if np.median(points) < _FEW_POINTS:
-        few = f"scans have {np.median(points):.0f} valid points (median)"
-        return f"{line}; {few}, as a radar's have: choose a lidar with --topic"
-    return f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
 
 
 def compare_with_truth(
@@ -242,7 +226,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
     m = metrics
     dropped = f", {counted(m.dropped_points, 'invalid return')} left out" if m.dropped_points else ""
     lines = [
-        *([f"UNRELIABLE     {m.unreliable}"] if m.unreliable else []),
+        f"{VERDICT:<14} {m.sentence}",
         heading,
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, "

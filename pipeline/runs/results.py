@@ -86,7 +86,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
         "loops.parquet",
         lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
     ),
-    Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory)),
+    Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory, r.log.T_base_lidar)),
     Output(  # after the maps, which it reads
         "results.mcap",
         lambda path, r: write_results_mcap(path, r.log, r.steps, r.result),

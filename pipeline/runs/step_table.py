@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
 from scanchain.evaluation import motion_nees, pair
+from scanchain.verdict import check_velocity, check_wheels
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,6 +38,7 @@ class StepRow:
     reason: str
     keyframe: int
     timing: Timing
+    T_odom_base: Pose | None = None
 
 
 class StepTable:
@@ -65,6 +67,7 @@ class StepTable:
                 step.reason,
                 step.keyframe,
                 step.timing,
+                scan.T_odom_base,
             )
         )
         return self.rows[-1]
@@ -94,8 +97,14 @@ class StepTable:
         """Number of steps in each state."""
         return Counter(row.state for row in self.rows)
 
-    def write(self, path: Path, trajectory: Trajectory) -> None:
-        """Write the table; ``trajectory`` holds the final pose of every step."""
+    def wheel_poses(self, T_base_lidar: Pose) -> Matrix:
+        """(N, d+1, d+1) poses of the lidar by the wheels, NaN where the log has none."""
+        unknown = np.full(T_base_lidar.shape, np.nan)
+        known = (row.T_odom_base for row in self.rows)
+        return np.array([unknown if pose is None else pose @ T_base_lidar for pose in known])
+
+    def write(self, path: Path, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> None:
+        """Write the table; ``trajectory`` has the final pose of each step, ``T_base_lidar`` is for the wheels."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -108,6 +117,7 @@ class StepTable:
             "log_time_ns": [row.log_time_ns for row in rows],
             **pose_columns(trajectory.poses),
             **{f"odom_{name}": values for name, values in pose_columns(self.odometry.poses).items()},
+            **self._checks(trajectory, T_base_lidar),
             "covariance": pa.array(
                 _covariances(np.array([match.information for match in matches])), pa.list_(pa.float64(), k * k)
             ),
@@ -134,6 +144,19 @@ class StepTable:
         table = pa.table(columns).replace_schema_metadata(_NOTES)
         pq.write_table(table, path, compression="zstd")
 
+    def _checks(self, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
+        """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
+        import pyarrow as pa
+
+        log_times_ns = np.array([row.log_time_ns for row in self.rows], np.int64)
+        velocity = check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses)
+        columns: dict[str, object] = {"velocity_innovation": pa.array(velocity, from_pandas=True)}
+        if T_base_lidar is None or not any(row.T_odom_base is not None for row in self.rows):
+            return columns
+        wheels = self.wheel_poses(T_base_lidar)
+        innovation = check_wheels(trajectory.poses, wheels).innovation
+        return columns | {"wheel_innovation": pa.array(innovation, from_pandas=True)} | _wheel_columns(wheels)
+
     def _trajectory(self, poses: list[Pose]) -> Trajectory:
         stamps_ns = np.array([row.stamp_ns for row in self.rows], np.int64)
         return Trajectory(stamps_ns, np.array(poses))
@@ -141,10 +164,14 @@ class StepTable:
 
 STAGES = ("read", "preprocess", "match", "map", "loops")
 _NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it",
+    "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it; "
+    "wheel_*: of the lidar by wheel odometry, null where there is no reading near the stamp",
     "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
     "SE(2) 3x3, SE(3) 6x6; null where a direction of the match is unobservable",
     "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
+    "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
+    "null where there is nothing to compare",
+    "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
     "keyframe": "number in the graph, -1 if none was made",
 }
 
@@ -155,6 +182,15 @@ def pose_columns(poses: Matrix) -> dict[str, list[float]]:
     values = np.hstack([lifted[:, :3, 3], lie.to_quaternion(lifted[:, :3, :3])])
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     return {name: column.tolist() for name, column in zip(names, values.T, strict=True)}
+
+
+def _wheel_columns(poses: Matrix) -> dict[str, object]:
+    """Pose columns of poses (N, d+1, d+1), null where one is NaN."""
+    import pyarrow as pa
+
+    known = np.isfinite(poses[:, 0, 0])
+    columns = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
+    return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
 
 
 def _covariances(informations: Matrix) -> list[list[float] | None]:

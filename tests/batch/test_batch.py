@@ -131,11 +131,11 @@ def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run
     assert main(words) == 1
     output, errors = capfd.readouterr()
     rows, first = table(out), made(out)
-    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("unreliable", "done")
+    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("not trustworthy", "done")
     assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
-    assert len(first) == 2 and "2: 1 done, 1 unreliable" in output
-    assert errors == f"error: 1 of 2 logs are unreliable; {out}/summary.txt has the reason\n"
-    assert f"{radar} is unreliable" in (out / "report.html").read_text()
+    assert len(first) == 2 and "2: 1 done, 1 not trustworthy" in output
+    assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
+    assert f"{radar} is not trustworthy" in (out / "report.html").read_text()
     assert main(words) == 1
     assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
 
@@ -344,7 +344,7 @@ def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars
     assert main(words) == 1
     assert all("choose one with --topic" in row["reason"] for row in table(tmp_path / "out").values())
     assert main([*words, "--topic", "/rear", "--every", "2", "--no-loops"]) == 1  # beside one wall nothing is sure
-    assert [row["state"] for row in table(tmp_path / "out").values()] == ["unreliable", "done"]
+    assert [row["state"] for row in table(tmp_path / "out").values()] == ["not trustworthy", "done"]
     rows = table(tmp_path / "out")
     assert [row["scans"] for row in rows.values()] == [10, 10]
     for row in rows.values():
@@ -362,8 +362,9 @@ def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_ever
     page = (out / "report.html").read_text(encoding="utf-8")
     cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
     blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
-    assert blind[0] == ("", "20") and blind[2] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
-    assert fine[1] == fine[2] == fine[3] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    assert blind[:2] == [(' class="bad"', "not trustworthy"), ("", "20")] and fine[0][1] == "trustworthy"
+    assert blind[3] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
+    assert fine[2] == fine[3] == fine[4] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
     links = re.findall(r'<a href="([^"]+)">', page)
     assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
     assert links[0].endswith("/report.html") and links[2].startswith("rows/")

@@ -440,22 +440,42 @@ def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_resu
     code, output, errors = call("run", path, "--out", out, "--rerun", "off")
     assert code == 1 and len(errors.splitlines()) == 1
     metrics = json.loads((out / "metrics.json").read_text())
-    says(metrics["unreliable"], f"{metrics['degenerate']} of 20 scans are degenerate and {metrics['lost']} lost")
-    says(metrics["unreliable"], "scans have 12 valid points", "radar", "--topic")
-    assert errors.splitlines()[0] == f"error: {out}: {metrics['unreliable']}"
+    why = metrics["verdict_reason"]
+    says(why, f"{metrics['degenerate']} of 20 scans are degenerate and {metrics['lost']} lost")
+    says(why, "scans have 12 valid points", "radar", "--topic")
+    assert errors.splitlines()[0] == f"error: {out}: not trustworthy: {why}"
     for summary in (output, (out / "summary.txt").read_text()):
-        assert summary.splitlines()[0] == f"UNRELIABLE     {metrics['unreliable']}"
+        assert summary.splitlines()[0] == f"verdict        not trustworthy: {why}"
         assert summary.splitlines()[1].startswith(f"{path} /radar")
-    says((out / "report.html").read_text(), metrics["unreliable"].replace("'", "&#39;"))
+    says((out / "report.html").read_text(), why.replace("'", "&#39;"))
     assert json.loads((out / "run.json").read_text())["complete"] and (out / "map.ply").exists()
     code, output, errors = call("run", path, "--out", out, "--force", "--rerun", "off", "--json")
-    assert code == 1 and json.loads(output)["unreliable"] == metrics["unreliable"]
-    assert errors.startswith(f"error: {out}: {metrics['unreliable']}\n")
+    assert code == 1 and json.loads(output)["verdict"] == metrics["verdict"] == "not trustworthy"
+    assert errors.startswith(f"error: {out}: not trustworthy: {why}\n")
+    assert call("check", out) == (1, f"not trustworthy: {why}\n", "")
 
 
-def test_a_run_of_the_office_is_reliable(call, tmp_path, office):
-    code, output, _ = call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--json")
-    assert code == 0 and json.loads(output)["unreliable"] == ""
+def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_not_one_that_jumps(
+    call, tmp_path, office
+):
+    out = tmp_path / "a"
+    code, output, _ = call("run", office, "--out", out, "--rerun", "off", "--json", "--strict")
+    metrics = json.loads(output)
+    assert code == 0 and metrics["verdict"] == "trustworthy" and metrics["stretches"] == []
+    code, output, _ = call("check", out, "--json")
+    assert code == 0 and json.loads(output) == {
+        name: metrics[name] for name in ("verdict", "verdict_reason", "stretches")
+    }
+    truth = office.with_suffix(".tum")
+    code, output, _ = call("check", "--trajectory", truth, office)
+    assert code == 0 and output.startswith("trustworthy: ") and "wheels" in output
+    poses = read_tum(truth)
+    poses.poses[len(poses) // 2 :, 0, 3] += 3.0
+    write_tum(tmp_path / "jump.tum", poses)
+    code, output, _ = call("check", "--trajectory", tmp_path / "jump.tum", office)
+    assert code == 1 and output.startswith("not trustworthy: ") and "impossible acceleration by " in output
+    says(call("check", office)[2], "error: ", "--trajectory")
+    says(call("check", tmp_path)[2], "error: ", "steps.parquet", "run directory")
 
 
 def test_rerun_off_leaves_out_the_recording_alone(call, tmp_path, office):
@@ -573,11 +593,11 @@ def test_leaving_out_point_times_that_a_log_has_is_an_effect(call, tmp_path):
 def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     says(
-        call("run", office, *out)[1].splitlines()[0],
+        call("run", office, *out)[1].splitlines()[1],
         "(wheel odometry /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
     )
     _, output, _ = call("run", office, *out, "--odometry.prior", "constant-velocity")
-    says(output.splitlines()[0], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
+    says(output.splitlines()[1], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,11 @@ import itertools
 import json
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from scanchain import lie
 from scanchain.__main__ import main
-from scanchain.comparison.assessment import unreliable_by_itself
 from scanchain.comparison.compare import Comparison, compare
 from scanchain.comparison.figures import COLUMNS, Figures
 from scanchain.comparison.methods import OURS, default_names, resolve
@@ -495,17 +493,3 @@ def test_errors_drawn_from_the_covariances_have_a_nees_of_one(k):
     np.testing.assert_allclose(twice, 0.25 * nees)
     covariances[7] = np.nan
     assert np.flatnonzero(np.isnan(motion_nees(truth, covariances, truth))).tolist() == [6, 7]
-
-
-# what our own methods say of themselves
-
-
-@pytest.mark.parametrize(("degenerate", "told"), [(4, ""), (6, "6 of 10 scans are degenerate and 0 lost")])
-def test_a_method_most_of_whose_scans_are_degenerate_is_called_unreliable(tmp_path, degenerate, told):
-    states = ["degenerate"] * degenerate + ["ok"] * (10 - degenerate)
-    pq.write_table(
-        pa.table({"state": states, "scan_points": [300] * 10, "fit": [0.9] * 10}), tmp_path / "steps.parquet"
-    )
-    still = Trajectory([0, 1], np.tile(np.eye(3), (2, 1, 1)))
-    outcome = Outcome(EndReport(Status.OK, ""), still.poses, still, np.ones(2), np.ones(2), tmp_path)
-    assert unreliable_by_itself(outcome).startswith(told) and bool(unreliable_by_itself(outcome)) == bool(told)

@@ -132,11 +132,11 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     page = (one_run / "report.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
-        "Accuracy", "Trajectory and map", "Loop closures", "Trajectories", "Error", "Uncertainty",
+        "Accuracy", "Trajectory and map", "Checks", "Loop closures", "Trajectories", "Error", "Uncertainty",
         "Time of a scan", "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
-    assert facts[:2] == ["trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
+    assert facts[:3] == ["verdict", "trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
 
 
 def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -193,6 +193,22 @@ def observability(name: str, trajectories: Sequence[DrawnTrajectory]) -> Markup:
         figure.axes.axhline(1.0, **_DOTTED)
         _logarithmic(figure.axes, "y")
         _label(figure.axes, "scan", "observability")
+        return figure.svg()
+
+
+def innovations(
+    name: str, curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]
+) -> Markup:
+    """Innovations (N,) over their limits scan by scan, 1 (dotted) is a finding; stretches are shaded."""
+    with SvgFigure(name) as figure:
+        for first, last, color in stretches:
+            figure.axes.axvspan(first - 0.5, last + 0.5, color=color, alpha=0.2, linewidth=0.0)
+        for values, color in curves.values():
+            x = np.arange(len(values), dtype=np.float64)
+            shown = np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST)
+            figure.axes.plot(*_windowed(x, shown, np.max), color=color, linewidth=0.9)
+        figure.axes.axhline(1.0, **_DOTTED)
+        _label(figure.axes, "scan", "innovation / limit")
         return figure.svg()
 
 

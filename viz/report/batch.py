@@ -13,9 +13,10 @@ from markupsafe import Markup
 
 from scanchain.batch.table import totals
 from scanchain.batch.task import Row, State, output_file
-from scanchain.runs.metrics import MOST_CONTRADICTED, Metrics
+from scanchain.runs.metrics import Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
+from scanchain.verdict import MOST_CONTRADICTED, Verdict
 from scanchain.viz.pictures.figure import SvgFigure
 from scanchain.viz.pictures.trajectory_figures import color_of
 from scanchain.viz.report import page
@@ -38,6 +39,7 @@ _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
     Head("log"),
+    Head("verdict", "", "reliability of the trajectory; its stretches are in the run's report"),
     Head("scans"),
     Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
     Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
@@ -59,14 +61,14 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     """Draw and write the page; runs are looked up in the directory."""
     done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
     missing = len(rows) - len(done)
-    unreliable = [f"{row.log} is unreliable: {row.why}" for row in rows if row.state is State.UNRELIABLE]
+    doubted = [f"{row.log} is not trustworthy: {row.why}" for row in rows if row.state is State.NOT_TRUSTWORTHY]
     page = Page(
         title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in its own process.",
         facts=tuple(totals(rows)),
         warnings=(f"{missing:,} of {len(rows):,} logs have no result; see the table for the reason",)
         * bool(missing)
-        + tuple(unreliable),
+        + tuple(doubted),
         notes=(),
         sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),
         collapsibles=(
@@ -104,6 +106,7 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
+        Cell(str(m.verdict), is_bad=m.verdict is not Verdict.TRUSTWORTHY),
         Cell(f"{m.scans:,}"),
         Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
         Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),

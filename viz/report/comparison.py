@@ -86,8 +86,8 @@ def _warnings(table: Table) -> Iterator[str]:
     for row in table.rows:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
-        if row.unreliable:
-            yield f"{row.name} is unreliable: {row.unreliable}"
+        if row.is_doubted:
+            yield f"{row.name}: {row.verdict}: {row.verdict_reason}"
 
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
@@ -112,10 +112,15 @@ def _grid(
     lines = []
     for row in rows:
         cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
+        cells += (Cell(row.verdict, is_bad=row.is_doubted),)
         if row.status is not Status.OK:
             cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
         lines.append(Row(row.name, cells, chips.get(row.name)))
-    heads = (Head("method"), *(Head(column.head, column.unit, column.definition) for column in columns))
+    heads = (
+        Head("method"),
+        *(Head(column.head, column.unit, column.definition) for column in columns),
+        Head("verdict", "", "of other tools by wheels and constant velocity alone"),
+    )
     notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
     return Grid(heads, tuple(lines), notes)
 

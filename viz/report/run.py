@@ -17,12 +17,14 @@ from scanchain.evaluation import absolute_error_of_any_path, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
-from scanchain.runs.metrics import Accuracy, GroundTruth, Metrics
+from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
+from scanchain.verdict import Verdict
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
+from scanchain.viz.report.checks import verdict_section
 from scanchain.viz.report.page import REPORT_FILE, Cell, Collapsible, Grid, Head, Page, Row, Section, write_page
 from scanchain.viz.report.sections import (
     error_section,
@@ -45,7 +47,7 @@ def write_run_report(directory: Path) -> None:
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
-        warnings=tuple(line for line in (metrics.unreliable, made.stopped, *metrics.warnings) if line),
+        warnings=tuple(line for line in (_doubts(metrics), made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         collapsibles=(
@@ -60,12 +62,18 @@ def write_run_report(directory: Path) -> None:
 def _summary_lines(directory: Path) -> list[str]:
     """The summary's heading, then its notes."""
     lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
-    heading, *lines = [line for line in lines if not line.startswith("UNRELIABLE")]
+    heading, *lines = [line for line in lines if not line.startswith(VERDICT)]
     return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
 
 
+def _doubts(m: Metrics) -> str:
+    """The verdict where it is none to rely on."""
+    return "" if m.verdict is Verdict.TRUSTWORTHY else m.sentence
+
+
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """Facts of a run: the result first, its cost last."""
+    """Facts of a run: the verdict first, then the result, its cost last."""
+    yield "verdict", str(m.verdict)
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
@@ -110,7 +118,9 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     true_path = None if truth is None else lie.transform(T_world_truth, optimized.truth)
     loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
     grain_m = float(str(config["maps.voxel_size_m"]))
-    yield trajectory_section(trajectories[0], Tables.read(steps, loops_file), true_path, points, grain_m)
+    tables = Tables.read(steps, loops_file, metrics.stretches)
+    yield trajectory_section(trajectories[0], tables, true_path, points, grain_m)
+    yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
         yield from loop_section(trajectories[0], loops_file, "Loop closures")
     text = (

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import LEAST_FIT, Points, State
 from scanchain.runs.closures import BACK_END
+from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import map_picture, path_over_map, surroundings
 from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats, PathLine
@@ -24,22 +25,32 @@ from scanchain.viz.report.page import Chip, Drawing, Section
 from scanchain.words import counted
 
 _CONTRADICTED, _DISPUTED = "contradicted", "at closures rejected by the back end"
-_COLORS = {State.DEGENERATE: "#d98200", State.LOST: "#d6453d", _CONTRADICTED: "#a55bd6", _DISPUTED: "#075e70"}
+_COLORS = {
+    State.DEGENERATE: "#d98200",
+    State.LOST: "#d6453d",
+    _CONTRADICTED: "#a55bd6",
+    _DISPUTED: "#075e70",
+    Kind.WHEELS: "#d6308f",
+    Kind.ACCELERATION: "#8a1c1c",
+    Kind.DISCONNECTED: "#6b7280",
+}
+_OVER_ALL = (Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED)  # drawn over the states of single scans
 _MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict
 
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """Tables of a run: a row a scan, a row a closure tried (None without loop closing)."""
+    """Tables of a run: a row a scan, a row a closure tried (None without loop closing), suspicious stretches."""
 
     steps: pa.Table
     closures: pa.Table | None
+    stretches: Sequence[Stretch] = ()
 
     @classmethod
-    def read(cls, steps: pa.Table, closures_file: Path) -> Tables:
+    def read(cls, steps: pa.Table, closures_file: Path, stretches: Sequence[Stretch]) -> Tables:
         """With the closures, where their file is."""
-        return cls(steps, pq.ParquetFile(closures_file).read() if closures_file.exists() else None)
+        return cls(steps, pq.ParquetFile(closures_file).read() if closures_file.exists() else None, stretches)
 
 
 def trajectory_section(
@@ -72,7 +83,7 @@ def _lines(path: Floats, tables: Tables, truth: Floats | None) -> Iterator[tuple
     """Lines with their legends, the path first; empty ones are omitted."""
     yield PathLine(path, "#2f7de1", 1.2), Chip("trajectory", "#2f7de1")
     yield from _closure_lines(path, tables.closures)
-    marks = _states(tables)
+    marks = _marks(tables)
     for state, color in _COLORS.items():
         count = int((marks == list(_COLORS).index(state)).sum())
         if count:
@@ -97,8 +108,17 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
             yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
-def _states(tables: Tables) -> NDArray[np.int64]:
+def _marks(tables: Tables) -> NDArray[np.int64]:
     """(N,) index of every scan's mark in ``_COLORS``, −1 where nothing is wrong."""
+    names, marks = list(_COLORS), _states(tables)
+    for stretch in tables.stretches:
+        if stretch.kind in _OVER_ALL:
+            marks[stretch.first : stretch.last + 1] = names.index(stretch.kind)
+    return marks
+
+
+def _states(tables: Tables) -> NDArray[np.int64]:
+    """(N,) marks by the states of the scans and by closures that the back end rejected."""
     names = list(_COLORS)
     states = tables.steps["state"].to_pylist()
     marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)

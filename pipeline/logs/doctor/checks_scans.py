@@ -165,7 +165,9 @@ def _surfaces(seen: Survey, preprocess: PreprocessConfig) -> Finding:
         )
     motions = " and ".join(motion for motion, _ in open_motions.most_common(2))
     extent = f"in {bad} of {counted(len(found), 'scan')} looked at they hardly determine {motions} (lidar frame)"
-    effect = "scans are degenerate there, that motion is predicted; a run most of whose scans are so is unreliable"
+    effect = (
+        "scans are degenerate there, that motion is predicted; a run most of whose scans are so is not trustworthy"
+    )
     if not seen.wheels:
         effect += "; wheel odometry, or a lidar with a wider view or a longer range, helps"
     return Finding("surfaces", Severity.WARNING if 2 * bad >= len(found) else Severity.NOTE, extent, effect)

@@ -1,0 +1,78 @@
+"""``scanchain check``: the verdict on a run, or on the trajectory of another tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from scanchain.commands.options import LOG, OverrideCommand, overrides, part_of, part_options
+from scanchain.errors import InputError
+from scanchain.source import Source
+
+if TYPE_CHECKING:
+    from scanchain.verdict import Judged
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
+@click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
+@click.option("--trajectory", metavar="FILE.tum", type=_PATH, help="Check this trajectory of the lidar in LOG.")
+@part_options()
+@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.pass_context
+def check(
+    ctx: click.Context,
+    sources: tuple[Source, ...],
+    trajectory: Path | None,
+    strict: bool,
+    as_json: bool,
+    **shortcuts: str | bool | None,
+) -> None:
+    """Print the verdict on a run directory, computed anew, or on any trajectory of a log.
+
+    A trajectory of another tool is checked at the scans whose stamps it has: against wheel odometry and constant
+    velocity, and by aligning each scan to a map of those before. Exit code 1: not trustworthy.
+
+    \b
+    Examples:
+      scanchain check runs/log
+      scanchain check runs/log --strict --json
+      scanchain check --trajectory kiss.tum log.mcap
+      scanchain check --trajectory other.tum part_0.mcap part_1.mcap --topic /lidar_front/points
+    """
+    from scanchain.verdict import Verdict
+
+    settings = overrides(ctx, part_of(shortcuts))
+    if trajectory is None:
+        if len(sources) != 1 or not isinstance(sources[0], Path) or settings:
+            raise InputError("check takes one run directory; to check a log, name a --trajectory FILE.tum")
+        from scanchain.runs.vouching import judge_run
+
+        judged = judge_run(sources[0])
+    else:
+        from scanchain.runs.foreign import judge_trajectory
+        from scanchain.words import counted
+
+        judged, missing = judge_trajectory(trajectory, sources, settings)
+        if missing:
+            click.echo(
+                f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
+            )
+    click.echo(_json(judged) if as_json else _text(judged))
+    if judged.verdict is Verdict.NOT_TRUSTWORTHY or (strict and judged.verdict is not Verdict.TRUSTWORTHY):
+        ctx.exit(1)
+
+
+def _text(judged: Judged) -> str:
+    return "\n".join([judged.sentence, *(f"  {stretch.text}" for stretch in judged.stretches)])
+
+
+def _json(judged: Judged) -> str:
+    import msgspec
+
+    tree = {"verdict": judged.verdict, "verdict_reason": judged.reason, "stretches": judged.stretches}
+    return msgspec.json.format(msgspec.json.encode(tree), indent=2).decode()

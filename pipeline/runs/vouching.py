@@ -1,0 +1,106 @@
+"""The verdict on a run, from steps.parquet and loops.parquet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix, State, Trajectory
+from scanchain.errors import InputError
+from scanchain.runs.closures import VERIFICATION
+from scanchain.verdict import Closures, Evidence, Judged, check_velocity, check_wheels, judge
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
+
+
+def judge_run(folder: Path) -> Judged:
+    """The verdict on the tables of a run directory. Raises InputError where it has none."""
+    import pyarrow.parquet as pq
+
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
+    try:
+        steps = pq.ParquetFile(folder / "steps.parquet").read()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
+    loops_file = folder / "loops.parquet"
+    return judge(evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None))
+
+
+def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
+    """What the tables of a run say about each scan."""
+    dimension = 2 if steps.schema.field("covariance").type.list_size == 9 else 3
+    poses = _poses(steps, "", dimension)
+    states = np.array(steps["state"].to_pylist())
+    stamps_ns, log_times_ns = steps["stamp_ns"].to_numpy(), steps["log_time_ns"].to_numpy()
+    wheels = _poses(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
+    return Evidence(
+        seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
+        poses=poses,
+        is_lost=states == State.LOST,
+        is_degenerate=states == State.DEGENERATE,
+        fit=steps["fit"].to_numpy(),
+        starts_segment=np.array([NEW_MAP in reason for reason in steps["reason"].to_pylist()]),
+        points=steps["scan_points"].to_numpy(),
+        wheels=check_wheels(poses, wheels),
+        velocity=check_velocity(stamps_ns, log_times_ns, poses),
+        closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
+    )
+
+
+def evidence_of_trajectory(
+    trajectory: Trajectory, log_times_ns: NDArray[np.int64], wheels: Matrix, points: NDArray[np.int64]
+) -> Evidence:
+    """What can be checked of any trajectory: (N, d+1, d+1) wheels, NaN where unknown, at the same scans."""
+    n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
+    return Evidence(
+        seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
+        poses=trajectory.poses,
+        is_lost=unknown,
+        is_degenerate=unknown,
+        fit=np.full(n, np.nan),
+        starts_segment=unknown,
+        points=points,
+        wheels=check_wheels(trajectory.poses, wheels),
+        velocity=check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses),
+        closures=_no_closures(trajectory.poses),
+    )
+
+
+def _verified(table: pa.Table, dimension: int) -> Closures:
+    """The closures that verification accepted."""
+    rejected_by = np.array(table["rejected_by"].to_pylist(), np.str_)
+    chosen = rejected_by != VERIFICATION
+    return Closures(
+        table["target_scan"].to_numpy()[chosen],
+        table["source_scan"].to_numpy()[chosen],
+        _poses(table, "", dimension)[chosen],
+        rejected_by[chosen] == "",
+    )
+
+
+def _no_closures(poses: Matrix) -> Closures:
+    nothing = np.empty(0, np.int64)
+    return Closures(nothing, nothing, poses[:0], np.empty(0, np.bool_))
+
+
+def _poses(table: pa.Table, prefix: str, dimension: int) -> Matrix:
+    """(N, d+1, d+1) of the columns whose names begin so, NaN where one is null."""
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    values = np.stack(
+        [table[f"{prefix}{name}"].to_numpy(zero_copy_only=False).astype(np.float64) for name in names], axis=1
+    ).reshape(-1, 7)
+    known = np.isfinite(values).all(axis=1)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[known, :3, :3] = lie.from_quaternion(values[known, 3:])
+    poses[known, :3, 3] = values[known, :3]
+    poses = lie.flatten(poses) if dimension == 2 else poses
+    poses[~known] = np.nan
+    return poses

@@ -1,0 +1,188 @@
+"""Stretches of a trajectory that a check contradicts or that no measurement constrains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from scanchain.data import LEAST_FIT, Matrix
+from scanchain.verdict.checks import Floats, WheelCheck
+from scanchain.verdict.loops import Closures, contradicting_groups
+
+WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
+_GAP_SCANS = 10  # longest gap within a stretch
+_SMALL_RAD = 0.1  # difference of headings that is not worth a word
+_PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
+_PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
+_MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
+
+
+class Kind(StrEnum):
+    """Finding of a stretch."""
+
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+    CONTRADICTED = "contradicted"
+    WHEELS = "wheels disagree"
+    ACCELERATION = "impossible acceleration"
+    LOOPS = "loop closures disagree"
+    DISCONNECTED = "disconnected"
+
+
+class Stretch(Struct, frozen=True):
+    """Consecutive suspicious scans.
+
+    Attributes
+    ----------
+    first, last : scans, from 0; start_s, end_s : since the first scan of the run
+    scans : of this kind among them
+    size_m, size_rad : the contradiction; null where it is not measured
+    """
+
+    kind: Kind
+    first: int
+    last: int
+    scans: int
+    start_s: float
+    end_s: float
+    size_m: float | None = None
+    size_rad: float | None = None
+
+    @property
+    def text(self) -> str:
+        """The stretch in words."""
+        size = "" if self.size_m is None else f" by {self.size_m:.1f} m"
+        turn_rad = self.size_rad or 0.0
+        if turn_rad > _SMALL_RAD:
+            size += f" and {np.degrees(turn_rad):.0f} deg"
+        place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
+        return f"{place} ({self.start_s:.1f} to {self.end_s:.1f} s): {self.kind}{size}"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What is known of every scan of a trajectory, (N,) each.
+
+    Attributes
+    ----------
+    seconds : since the first scan, by the log
+    poses : (N, d+1, d+1) final
+    is_lost, is_degenerate : states; False where unknown
+    fit : as in ``Match``; NaN where unknown
+    starts_segment : scans whose motion from the one before is unknown
+    points : valid returns
+    wheels, velocity : checks
+    closures : those that verification accepted
+    """
+
+    seconds: Floats
+    poses: Matrix
+    is_lost: NDArray[np.bool_]
+    is_degenerate: NDArray[np.bool_]
+    fit: Floats
+    starts_segment: NDArray[np.bool_]
+    points: NDArray[np.int64]
+    wheels: WheelCheck
+    velocity: Floats
+    closures: Closures
+
+    @property
+    def is_contradicted(self) -> NDArray[np.bool_]:
+        """(N,) scans whose pose is observable, but contradicted by their correspondences."""
+        return (self.fit < LEAST_FIT) & ~self.is_lost & ~self.is_degenerate
+
+    @property
+    def is_held_by_wheels(self) -> NDArray[np.bool_]:
+        """(N,) scans around which the wheels agree with the trajectory."""
+        return self.wheels.innovation <= WHEEL_LIMIT
+
+    def __len__(self) -> int:
+        return len(self.seconds)
+
+
+def find_stretches(evidence: Evidence) -> list[Stretch]:
+    """Every stretch, by kind and time."""
+    found = [
+        *_of_states(evidence, Kind.LOST, evidence.is_lost),
+        *_of_states(evidence, Kind.DEGENERATE, evidence.is_degenerate),
+        *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & _fits_badly(evidence)),
+        *_of_wheels(evidence),
+        *_of_acceleration(evidence),
+        *_of_loops(evidence),
+        *_of_segments(evidence),
+    ]
+    return sorted(found, key=lambda stretch: (stretch.first, stretch.last))
+
+
+def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> Iterator[Stretch]:
+    """Stretches that are too long to be passed by the predicted motion."""
+    positions, is_held = evidence.poses[:, :-1, -1], evidence.is_held_by_wheels
+    for part in merged(is_marked):
+        entered = positions[max(part.start - 1, 0)]
+        extent_m = float(np.linalg.norm(positions[part] - entered, axis=1).max())
+        passed_m = _PASSED_BY_WHEELS_M if is_held[part].all() else _PASSED_M
+        if extent_m > passed_m:
+            yield _stretch(evidence, kind, part.start, part.stop - 1, int(is_marked[part].sum()))
+
+
+def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
+    """(N,) scans around which most contradict their pose."""
+    return median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest") < LEAST_FIT
+
+
+def _of_wheels(evidence: Evidence) -> Iterator[Stretch]:
+    is_marked = evidence.wheels.innovation > WHEEL_LIMIT
+    for part in merged(is_marked):
+        sizes = [float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)]
+        yield _stretch(evidence, Kind.WHEELS, part.start, part.stop - 1, int(is_marked[part].sum()), *sizes)
+
+
+def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
+    is_new = evidence.starts_segment
+    is_marked = (evidence.velocity > VELOCITY_LIMIT) & ~is_new & ~np.concatenate([[False], is_new[:-1]])
+    jumps_m = np.zeros(len(evidence))
+    jumps_m[2:] = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], n=2, axis=0), axis=1)
+    for part in merged(is_marked):
+        size_m = float(jumps_m[part][is_marked[part]].max())
+        yield _stretch(evidence, Kind.ACCELERATION, part.start, part.stop - 1, int(is_marked[part].sum()), size_m)
+
+
+def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
+    for group in contradicting_groups(evidence.closures, evidence.poses):
+        yield _stretch(evidence, Kind.LOOPS, group.first, group.last, group.closures, group.size_m)
+
+
+def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
+    """Segments that no accepted closure joins to those before."""
+    segment = np.cumsum(evidence.starts_segment)
+    closures = evidence.closures
+    ends = np.stack([segment[closures.target], segment[closures.source]], axis=1)[closures.is_accepted]
+    label = np.arange(segment[-1] + 1)
+    for low, high in np.sort(ends, axis=1).tolist():
+        label[label == label[high]] = label[low]
+    for number in np.flatnonzero(label != label[0]).tolist():
+        scans = np.flatnonzero(segment == number)
+        yield _stretch(evidence, Kind.DISCONNECTED, int(scans[0]), int(scans[-1]), len(scans))
+
+
+def merged(is_marked: NDArray[np.bool_]) -> list[slice]:
+    """Runs of marked scans, joined over gaps of a few scans."""
+    places = np.flatnonzero(is_marked)
+    if not len(places):
+        return []
+    parts = np.split(places, np.flatnonzero(np.diff(places) > _GAP_SCANS + 1) + 1)
+    return [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
+
+
+def _stretch(
+    evidence: Evidence, kind: Kind, first: int, last: int, scans: int, size_m: float | None = None,
+    size_rad: float | None = None,
+) -> Stretch:  # fmt: skip
+    start_s, end_s = float(evidence.seconds[first]), float(evidence.seconds[last])
+    return Stretch(kind, first, last, scans, start_s, end_s, size_m, size_rad)

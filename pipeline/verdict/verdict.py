@@ -1,0 +1,133 @@
+"""The verdict of a run: whether its trajectory can be relied on, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from scanchain.data import LEAST_FIT
+from scanchain.verdict.stretches import Evidence, Kind, Stretch, find_stretches
+from scanchain.words import counted
+
+MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
+_MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and confirmed by nothing
+_LARGE_M = 1.0  # impossible change of the motion above which the trajectory is wrong
+_EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
+_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)
+_SHOWN = 3  # stretches that the sentence lists
+
+
+class Verdict(StrEnum):
+    """Reliability of a trajectory as a whole."""
+
+    TRUSTWORTHY = "trustworthy"
+    CHECK = "check these stretches"
+    NOT_TRUSTWORTHY = "not trustworthy"
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A verdict, its reasons in words, and the suspicious stretches."""
+
+    verdict: Verdict
+    reason: str
+    stretches: tuple[Stretch, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Verdict and reasons."""
+        return f"{self.verdict}: {self.reason}"
+
+
+def judge(evidence: Evidence) -> Judged:
+    """The verdict on a trajectory.
+
+    Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
+    impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
+    contradict at the same place by about the same distance.
+    """
+    stretches = tuple(find_stretches(evidence))
+    reasons = list(_grave(evidence, stretches))
+    if reasons:
+        return Judged(Verdict.NOT_TRUSTWORTHY, "; ".join(reasons), stretches)
+    if stretches:
+        return Judged(Verdict.CHECK, _listed(stretches), stretches)
+    return Judged(Verdict.TRUSTWORTHY, f"no contradiction in {counted(len(evidence), 'scan')}{_by(evidence)}", ())
+
+
+def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    yield from _many_contradicted(evidence)
+    yield from _mostly_predicted(evidence)
+    jumps = [each for each in stretches if each.kind is Kind.ACCELERATION and (each.size_m or 0.0) > _LARGE_M]
+    if jumps:
+        yield _listed(jumps)
+    slips = [each for each in stretches if each.kind is Kind.WHEELS]
+    for slip in slips:
+        cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
+        if cause is not None:
+            yield f"{slip.text}, where scans are {cause.kind}"
+    for loop in (each for each in stretches if each.kind is Kind.LOOPS):
+        slip = next((each for each in slips if _confirms(each, loop)), None)
+        if slip is not None:
+            yield (
+                f"{slip.text}, and {counted(loop.scans, 'loop closure')} between scans {loop.first:,} and "
+                f"{loop.last:,} by {loop.size_m:.1f} m"
+            )
+            return
+
+
+def _overlap(a: Stretch, b: Stretch) -> bool:
+    return a.first <= b.last and b.first <= a.last
+
+
+def _confirms(slip: Stretch, loop: Stretch) -> bool:
+    """True if the loops span the slip, and contradict the trajectory by no more than it explains."""
+    return _overlap(slip, loop) and (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
+
+
+def _many_contradicted(evidence: Evidence) -> Iterator[str]:
+    count = int((evidence.is_contradicted & ~evidence.is_held_by_wheels).sum())
+    if count > MOST_CONTRADICTED * len(evidence):
+        yield (
+            f"{count:,} of {len(evidence):,} scans contradict the map where they were placed (fit below "
+            f"{LEAST_FIT:g}): the motion between scans may be larger than the search (scanchain doctor; "
+            "--matching.wide_max_distance_m), or the log is at fault"
+        )
+
+
+def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
+    is_open = evidence.is_degenerate & ~evidence.is_held_by_wheels
+    if (is_open | evidence.is_lost).sum() <= _MOST_PREDICTED * len(evidence):
+        return
+    line = (
+        f"{int(evidence.is_degenerate.sum()):,} of {len(evidence):,} scans are degenerate and "
+        f"{int(evidence.is_lost.sum()):,} lost: most poses are predicted, not measured, in at least one direction"
+    )
+    points = float(np.median(evidence.points))
+    if points < _FEW_POINTS:
+        few = f"scans have {points:.0f} valid points (median)"
+        yield f"{line}; {few}, as a radar's have: choose a lidar with --topic"
+    else:
+        yield f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
+
+
+def _listed(stretches: Sequence[Stretch]) -> str:
+    """The largest stretches in words, and how many more there are."""
+    largest = sorted(stretches, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
+    more = len(stretches) - len(largest)
+    return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
+
+
+def _by(evidence: Evidence) -> str:
+    """What the trajectory was checked by."""
+    checks = [
+        *(["fit"] if np.isfinite(evidence.fit).any() else []),
+        *(["constant velocity"] if np.isfinite(evidence.velocity).any() else []),
+        *(["wheels"] if np.isfinite(evidence.wheels.innovation).any() else []),
+        *(["loop closures"] if len(evidence.closures.target) else []),
+    ]
+    return f" (checked by {', '.join(checks)})" if checks else ""

@@ -1,0 +1,214 @@
+"""The verdict on made-up trajectories: right ones are trustworthy; slips, jumps and wrong loops are named."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.verdict import Closures, Evidence, Kind, Verdict, check_velocity, check_wheels, judge
+
+N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
+
+
+def course(dimension=2, slip=(0, 0), seed=0):
+    """True poses around a block, twice, and those of a matching that stands still over the scans of ``slip``."""
+    rng = np.random.default_rng(seed)
+    k = 3 if dimension == 2 else 6
+    motions = np.zeros((N - 1, k))
+    motions[:, 0] = STEP_M
+    motions[np.arange(N - 1) % 150 >= 140, k - 1] = np.pi / 20.0
+    slipped = motions.copy()
+    slipped[slice(*slip), 0] *= 0.1
+    return chained(motions, rng, 0.002), chained(slipped, rng, 0.002)
+
+
+def chained(motions, rng, noise_m=0.0):
+    poses = [lie.identity(2 if motions.shape[1] == 3 else 3)]
+    noise = rng.normal(0.0, noise_m, motions.shape) * (np.arange(motions.shape[1]) < 2)
+    for motion in motions + noise:
+        poses.append(poses[-1] @ lie.exp(motion))
+    return np.array(poses)
+
+
+def wheels_of(poses, seed=1, *, scale=1.0, drift_rad_m=0.0, share=0.02):
+    """Wheel odometry with errors of scale and heading, and noise."""
+    rng = np.random.default_rng(seed)
+    motions = lie.log(lie.between(poses[:-1], poses[1:])) * scale
+    motions[:, -1] += drift_rad_m * STEP_M
+    return chained(motions * rng.normal(1.0, share, motions.shape), rng)
+
+
+def evidence(poses, *, wheels=None, closures=(), **changes):
+    n = len(poses)
+    seconds = INTERVAL_S * np.arange(n)
+    stamps_ns = (1e9 * seconds).astype(np.int64)
+    unknown = np.full_like(poses, np.nan)
+    ends = np.array([pair for pair, _ in closures], np.int64).reshape(-1, 2)
+    T = np.array([T for _, T in closures]).reshape(-1, *poses.shape[1:])
+    known = {
+        "is_lost": np.zeros(n, bool),
+        "is_degenerate": np.zeros(n, bool),
+        "fit": np.full(n, 0.9),
+        "starts_segment": np.zeros(n, bool),
+        "points": np.full(n, 500),
+    }
+    return Evidence(
+        seconds=seconds,
+        poses=poses,
+        wheels=check_wheels(poses, unknown if wheels is None else wheels),
+        velocity=check_velocity(stamps_ns, stamps_ns, poses),
+        closures=Closures(ends[:, 0], ends[:, 1], T, np.zeros(len(ends), bool)),
+        **known | changes,
+    )
+
+
+def marked(first, last):
+    return (np.arange(N) >= first) & (np.arange(N) <= last)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    "errors", [{}, {"scale": 0.97}, {"scale": 1.05}, {"drift_rad_m": 0.02}, {"share": 0.1}], ids=str
+)
+def test_wheels_with_errors_of_scale_heading_and_noise_doubt_nothing(dimension, errors):
+    poses, _ = course(dimension)
+    judged = judge(evidence(poses, wheels=wheels_of(poses, **errors)))
+    assert judged.verdict is Verdict.TRUSTWORTHY and judged.stretches == ()
+    assert "wheels" in judged.reason
+
+
+def test_wheels_on_a_robot_whose_lidar_is_turned_doubt_nothing():
+    poses, _ = course()
+    turned = lie.pose_2d(0.3, 0.0, 0.04)
+    assert judge(evidence(poses @ turned, wheels=wheels_of(poses))).verdict is Verdict.TRUSTWORTHY
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_slip_along_a_corridor_is_named_though_every_scan_is_ok(dimension):
+    truth, slipped = course(dimension, slip=(500, 530))
+    judged = judge(evidence(slipped, wheels=wheels_of(truth)))
+    assert judged.verdict is Verdict.CHECK
+    (stretch,) = judged.stretches
+    assert stretch.kind is Kind.WHEELS and 480 <= stretch.first <= 505 and 525 <= stretch.last <= 550
+    assert 2.0 < stretch.size_m < 3.2 and f"wheels disagree by {stretch.size_m:.1f} m" in judged.sentence
+    assert stretch.start_s == pytest.approx(INTERVAL_S * stretch.first)
+
+
+def test_wheels_that_stall_and_catch_up_doubt_nothing():
+    poses, _ = course()
+    wheels = wheels_of(poses)
+    for first in (300, 700, 900):
+        wheels[first : first + 4] = wheels[first]
+    assert judge(evidence(poses, wheels=wheels)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_slip_where_scans_are_degenerate_is_not_trustworthy():
+    truth, slipped = course(slip=(500, 530))
+    judged = judge(evidence(slipped, wheels=wheels_of(truth), is_degenerate=marked(480, 550)))
+    assert judged.verdict is Verdict.NOT_TRUSTWORTHY and "where scans are degenerate" in judged.reason
+
+
+def test_a_turn_that_the_matching_did_not_see_is_named():
+    truth, _ = course()
+    turned = truth.copy()
+    turned[600:] = truth[600] @ lie.pose_2d(0.0, 0.0, 0.9) @ lie.inverse(truth[600]) @ truth[600:]
+    (stretch,) = (each for each in judge(evidence(turned, wheels=wheels_of(truth))).stretches if each.size_rad)
+    assert stretch.kind is Kind.WHEELS and 0.8 < stretch.size_rad < 1.0 and "deg" in stretch.text
+    assert stretch.first <= 600 <= stretch.last
+
+
+def test_a_slip_that_agreeing_loops_confirm_is_not_trustworthy():
+    truth, slipped = course(slip=(500, 530))
+    pairs = [(10 + 5 * k, 610 + 5 * k) for k in range(4)]
+    closures = [(pair, lie.between(truth[pair[0]], truth[pair[1]])) for pair in pairs]
+    judged = judge(evidence(slipped, wheels=wheels_of(truth), closures=closures))
+    assert judged.verdict is Verdict.NOT_TRUSTWORTHY
+    assert "wheels disagree" in judged.reason and "4 loop closures between scans 25 and 610" in judged.reason
+
+
+@pytest.mark.parametrize(("count", "verdict"), [(2, Verdict.TRUSTWORTHY), (3, Verdict.CHECK)])
+def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_on(count, verdict):
+    poses, _ = course()
+    wrong = lie.pose_2d(2.0, 0.0, 0.0)
+    pairs = [(10 + 5 * k, 610 + 5 * k) for k in range(count)]
+    closures = [((i, j), lie.between(poses[i], poses[j] @ wrong)) for i, j in pairs]
+    judged = judge(evidence(poses, closures=closures))
+    assert judged.verdict is verdict
+    assert [each.kind for each in judged.stretches] == [Kind.LOOPS] * (count > 2)
+    assert all(each.size_m == pytest.approx(2.0) for each in judged.stretches)
+
+
+def test_rejected_closures_that_disagree_with_each_other_are_noise():
+    poses, _ = course()
+    closures = [
+        ((10 + 5 * k, 610 + 5 * k), lie.pose_2d(*np.random.default_rng(k).uniform(-9.0, 9.0, 3))) for k in range(8)
+    ]
+    assert judge(evidence(poses, closures=closures)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_jump_is_an_impossible_acceleration():
+    poses, _ = course()
+    moved = poses.copy()
+    moved[400:] = lie.pose_2d(2.5, 0.0, 0.0) @ poses[400:]
+    judged = judge(evidence(moved))
+    assert judged.verdict is Verdict.NOT_TRUSTWORTHY
+    assert [each.kind for each in judged.stretches] == [Kind.ACCELERATION]
+    assert 399 <= judged.stretches[0].first <= 401
+    starts = np.zeros(N, bool)
+    starts[400] = True
+    judged = judge(evidence(moved, starts_segment=starts))
+    assert judged.verdict is Verdict.CHECK and Kind.DISCONNECTED in {each.kind for each in judged.stretches}
+
+
+def test_stamps_that_jitter_and_step_back_accelerate_nothing():
+    motions = np.tile([2.0, 0.0, 0.0], (300, 1))  # 10 m/s
+    poses = chained(motions, np.random.default_rng(0))
+    log_times_ns = (1e9 * INTERVAL_S * np.arange(301)).astype(np.int64)
+    jitter_ns = np.random.default_rng(1).normal(0.0, 0.15e9, 301).astype(np.int64)
+    assert np.nanmax(check_velocity(log_times_ns + jitter_ns, log_times_ns, poses)) < 1.0
+    assert np.nanmax(check_velocity(log_times_ns, log_times_ns + jitter_ns, poses)) < 1.0
+
+
+def test_missing_scans_accelerate_nothing():
+    poses = chained(np.tile([2.0, 0.0, 0.0], (300, 1)), np.random.default_rng(0))
+    stamps_ns = (1e9 * INTERVAL_S * np.arange(301)).astype(np.int64)
+    there = np.delete(np.arange(301), slice(100, 112))
+    assert np.nanmax(check_velocity(stamps_ns[there], stamps_ns[there], poses[there])) < 0.1
+
+
+@pytest.mark.parametrize("kind", [Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED])
+def test_a_stretch_of_doubtful_scans_is_to_be_checked_and_most_of_a_run_is_not_trustworthy(kind):
+    poses, _ = course()
+
+    def of(is_marked):
+        changes = {
+            Kind.DEGENERATE: {"is_degenerate": is_marked},
+            Kind.LOST: {"is_lost": is_marked},
+            Kind.CONTRADICTED: {"fit": np.where(is_marked, 0.4, 0.9)},
+        }
+        return judge(evidence(poses, **changes[kind]))
+
+    assert of(marked(300, 303)).verdict is Verdict.TRUSTWORTHY  # 0.4 m
+    judged = of(marked(300, 330))
+    assert judged.verdict is Verdict.CHECK
+    assert [(each.kind, each.first, each.last) for each in judged.stretches] == [(kind, 300, 330)]
+    assert of(marked(300, 1000)).verdict is Verdict.NOT_TRUSTWORTHY
+
+
+def test_a_corridor_that_the_wheels_hold_is_to_be_checked_and_not_wrong():
+    poses, _ = course()
+    wheels = wheels_of(poses)
+    judged = judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 1000)))
+    assert judged.verdict is Verdict.CHECK and judged.stretches[0].scans == 701
+    assert judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 330))).verdict is Verdict.TRUSTWORTHY
+
+
+def test_segments_that_a_closure_joins_are_not_told():
+    poses, _ = course()
+    starts = marked(600, 600)
+    parts = evidence(poses, starts_segment=starts)
+    (stretch,) = judge(parts).stretches
+    assert (stretch.kind, stretch.first, stretch.last) == (Kind.DISCONNECTED, 600, N - 1)
+    closures = Closures(np.array([10]), np.array([610]), lie.between(poses[[10]], poses[[610]]), np.array([True]))
+    joined = evidence(poses, starts_segment=starts)
+    object.__setattr__(joined, "closures", closures)
+    assert judge(joined).verdict is Verdict.TRUSTWORTHY

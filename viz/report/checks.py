@@ -1,0 +1,51 @@
+"""Section of a report with the independent checks of a run, and the stretches that they found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from scanchain.runs.metrics import Metrics
+from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain.viz.pictures.trajectory_figures import color_of, innovations
+from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
+
+_CURVES = {
+    "wheel_innovation": ("wheels", WHEEL_LIMIT),
+    "velocity_innovation": ("constant velocity", VELOCITY_LIMIT),
+}
+_SHADE = "#d6308f"
+_MAX_ROWS = 100  # largest number of stretches in the table; the longest
+
+
+def verdict_section(metrics: Metrics, steps: pa.Table) -> Section:
+    """Innovations along the log, and every suspicious stretch."""
+    curves = {
+        name: (steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
+        for place, (column, (name, limit)) in enumerate(_CURVES.items())
+        if column in steps.column_names
+    }
+    shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
+    chips = (
+        *(Chip(name, color) for name, (_, color) in curves.items()),
+        *((Chip("stretches to check", _SHADE),) if shaded else ()),
+    )
+    drawing = Drawing(
+        "Innovations",
+        "Normalized innovations over their limits, largest of neighboring scans; above 1 (dotted) is a finding.",
+        innovations("innovations", curves, shaded),
+    )
+    heads = (
+        Head("finding"), Head("first"), Head("last"), Head("scans"), Head("start", "s"), Head("end", "s"),
+        Head("size", "m"),
+    )  # fmt: skip
+    longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
+    rows = tuple(_row(each) for each in sorted(longest, key=lambda each: each.first))
+    return Section("Checks", "", chips, (drawing,), Grid(heads, rows) if rows else None)
+
+
+def _row(stretch: Stretch) -> Row:
+    size = "–" if stretch.size_m is None else f"{stretch.size_m:.2f}"
+    scans = (f"{value:,}" for value in (stretch.first, stretch.last, stretch.scans))
+    cells = (*scans, f"{stretch.start_s:.1f}", f"{stretch.end_s:.1f}")
+    return Row(str(stretch.kind), (*map(Cell, cells), Cell(size)))
