@@ -16,7 +16,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 def duration(time_s: float) -> str:
     """A time in the largest unit of which it is more than one."""
-    for unit, seconds in (("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):
+    for unit, seconds in (("years", 31_557_600.0), ("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if time_s > seconds:
             return f"{time_s / seconds:.1f} {unit}"
     return f"{time_s:.1f} s"

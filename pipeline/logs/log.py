@@ -19,7 +19,14 @@ from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import chosen_span, count_scans, notes_on, whole_span
+from scanchain.logs.mcap.selection import (
+    check_one_log,
+    chosen_span,
+    count_scans,
+    gap_notes,
+    notes_on,
+    whole_span,
+)
 from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
@@ -87,6 +94,7 @@ class Log:
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
+        check_one_log(indexes, config)
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(
             indexes,
@@ -130,6 +138,11 @@ class Log:
     def damage(self) -> list[str]:
         """Damage that was met; complete once ``scans`` is through or closed."""
         return grouped(self._damage)
+
+    @property
+    def gaps(self) -> list[str]:
+        """Those of the notes that are of long gaps."""
+        return gap_notes(self.indexes, self.config)
 
     @property
     def has_odometry(self) -> bool:
