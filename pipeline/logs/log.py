@@ -45,6 +45,7 @@ from scanchain.logs.mounting import (
 from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.settings import load_settings, overrides_of
 from scanchain.source import Source, source_of
 from scanchain.words import counted, grouped
 
@@ -55,10 +56,20 @@ _POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start
 _WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 
 
-def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
-    """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+def open_log(
+    sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS, **changes: object
+) -> Log:
+    """A file, folder or address, or several as one log, topics chosen.
+
+    changes : keys of ``[log]`` on top of ``config``, such as topic="/lidar_front/points" or end_s=60.0
+    Raises InputError for what is no log, or no key.
+    """
     named = sources_of(sources)
-    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
+    instance(config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"')
+    if changes:
+        short = {name.removeprefix("log__"): value for name, value in changes.items()}
+        changed = load_settings(overrides=overrides_of({f"log__{name}": short[name] for name in short})).config.log
+        config = replace(config, **{name: getattr(changed, name) for name in short})
     return Log(index_files(named, config), config)
 
 
