@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 
@@ -12,6 +13,11 @@ FREEDOM = ("degree of freedom", "degrees of freedom")
 def counted(number: int, noun: str, plural: str = "") -> str:
     """A number and what it counts: "1 scan", "2,000 scans"; ``plural`` where that is not the noun and s."""
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
+
+
+def below(value: float) -> str:
+    """A value that is below a limit, two digits rounded down: it never reads like the limit."""
+    return f"{math.floor(100.0 * value) / 100.0:.2f}"
 
 
 def duration(time_s: float) -> str:

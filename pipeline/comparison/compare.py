@@ -76,6 +76,11 @@ class Compared:
         """Names of the methods that started and failed."""
         return [row.name for row in self.table.rows if row.status.is_failure]
 
+    @property
+    def unreliable(self) -> list[str]:
+        """Names of the methods whose result is unreliable."""
+        return [row.name for row in self.table.rows if row.unreliable]
+
 
 def compare(comparison: Comparison, present: Callable[[Path], None], progress: Progress) -> Compared:
     """Run the comparison and write its directory; ``present`` adds report and recording to what lies there.

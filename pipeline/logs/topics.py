@@ -98,7 +98,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
-            found.append(OtherSensor("poses", topic, "not used; --log.ground_truth_topic takes them as the truth"))
+            found.append(OtherSensor("poses", topic, f"not used; --gt {topic} takes them as the truth"))
     return found
 
 
@@ -135,6 +135,6 @@ def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> s
     for channel in channels[:_MOST_LISTED]:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         file = f" in {indexes[channel.key[0]].path.name}" if len(indexes) > 1 else ""
-        names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual}){file}")
+        names.append(f"{channel.topic} ({kind(channel) or 'no schema'}{unusual}){file}")
     names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
     return ", ".join(names) or "none"

@@ -140,7 +140,7 @@ def test_several_logs_with_a_lidar_each_are_all_named_with_their_topics(tmp_path
         for name in ("front", "rear", "top")
     ]
     says(complaint(*paths[:2]), f"{paths[0]} and {paths[1]}, read as one log: has several lidar topics")
-    says(complaint(*paths[:2]), "/front (sensor_msgs/msg/LaserScan) in front.mcap, /rear", ") in rear.mcap")
+    says(complaint(*paths[:2]), "/front (sensor_msgs/LaserScan) in front.mcap, /rear", ") in rear.mcap")
     for config, complained in (
         ({"topic": "/nope"}, "has no topic /nope"),
         ({"odometry_topic": "/nope", "topic": "/top"}, "/nope"),

@@ -551,7 +551,7 @@ def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_pat
     for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
         assert main([str(word) for word in words]) == 2
         assert capfd.readouterr().err == f"error: {caught.value}\n"
-    assert main(["info", str(path)]) == 0
+    assert main(["info", str(path)]) == 1
     assert f"problem   {caught.value}" in capfd.readouterr().out
 
 

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -19,6 +20,7 @@ from scanchain.api import open_recorder
 from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.metrics import summary
 from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
@@ -248,7 +250,7 @@ def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office
 
 def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_path, office):
     with pytest.raises(
-        PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then"
+        PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then are in"
     ) as e:
         run(job(office, tmp_path / "a"), open_recorder, Watcher(20, RuntimeError("boom")))
     folder = partial_in(tmp_path)
@@ -278,7 +280,9 @@ def test_what_ends_a_run_before_its_first_scan_leaves_nothing(tmp_path, office, 
 
 
 def test_a_bug_before_the_first_scan_leaves_its_traceback_alone(tmp_path, office):
-    with pytest.raises(PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans"):
+    with pytest.raises(
+        PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans until then are in"
+    ):
         run(job(office, tmp_path / "a"), open_recorder, Watcher(0, ZeroDivisionError("boom")))
     folder = partial_in(tmp_path)
     assert "ZeroDivisionError" in (folder / "traceback.txt").read_text()
@@ -378,7 +382,10 @@ def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
 
 
 def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
-    text = run(job(office, tmp_path / "a"), open_recorder, Watcher(3)).summary
+    finished = run(job(office, tmp_path / "a"), open_recorder, Watcher(3))
+    text = finished.summary
+    slow = msgspec.structs.replace(finished.metrics, scans_per_s=1.2)
+    assert ", 1 scan/s, " in summary(slow, "", "", ())
     assert "1 keyframe\n" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 
