@@ -108,7 +108,7 @@ def test_no_files_at_all():
 
 def test_a_log_without_lidar_lists_what_it_holds(tmp_path):
     path = write(tmp_path / "a.mcap", [odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0))])
-    says(complaint(path), "lidar", "/odom", "nav_msgs/msg/Odometry")
+    says(complaint(path), "lidar", "/odom", "nav_msgs/Odometry")
 
 
 def test_a_log_without_messages(tmp_path):
@@ -118,12 +118,12 @@ def test_a_log_without_messages(tmp_path):
 
 def test_a_topic_that_is_absent_lists_what_there_is(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
-    says(complaint(path, topic="/velodyne"), "/velodyne", "--topic", "/scan", "sensor_msgs/msg/LaserScan")
+    says(complaint(path, topic="/velodyne"), "/velodyne", "--topic", "/scan", "sensor_msgs/LaserScan")
 
 
 def test_a_topic_that_is_no_lidar_says_what_it_is(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
-    says(complaint(path, topic="/odom"), "/odom", "nav_msgs/msg/Odometry", "/scan")
+    says(complaint(path, topic="/odom"), "/odom", "nav_msgs/Odometry", "/scan")
 
 
 def test_several_lidars_are_listed(tmp_path):
