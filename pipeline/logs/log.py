@@ -44,7 +44,7 @@ from scanchain.logs.mounting import (
 )
 from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
-from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.source import Source, source_of
 from scanchain.words import counted, grouped
@@ -105,7 +105,7 @@ class Log:
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
-        check_one_log(indexes, config)
+        check_one_log(indexes, files_with_scans(indexes), config)
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(
             indexes,

@@ -117,6 +117,15 @@ def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
     return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
 
 
+def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
+    """Numbers of the files that hold messages of a lidar."""
+    return {
+        place
+        for place, index in enumerate(indexes)
+        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
+    }
+
+
 def is_lidar(channel: Channel) -> bool:
     """True if its messages are scans or clouds of a supported type."""
     return is_scan(channel) or is_cloud(channel)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -89,9 +89,12 @@ def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     return notes
 
 
-def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
-    """Refuse files that lie too far apart in time to be parts of one log. Raises InputError."""
-    for gap in _long_gaps(indexes, config):
+def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config: LogConfig) -> None:
+    """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
+
+    scanned : numbers of the files with scans; others, as of a calibration, may be of any time
+    """
+    for gap in _long_gaps(indexes, config, scanned):
         if gap.before != gap.behind and gap.span.end_ns - gap.span.begin_ns > _LONGEST_GAP_NS:
             before, behind = (indexes[number].path for number in (gap.before, gap.behind))
             raise InputError(
@@ -100,12 +103,14 @@ def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
             )
 
 
-def _long_gaps(indexes: Sequence[FileIndex], config: LogConfig) -> Iterator[Gap]:
-    """Gaps of more than a minute in the chosen part."""
+def _long_gaps(
+    indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
+) -> Iterator[Gap]:
+    """Gaps of more than a minute in the chosen part, or in that of some files."""
     span = chosen_span(whole_span(indexes), config)
     end_ns, before = None, 0
     for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
-        if not span.meets(block):
+        if not span.meets(block) or (files is not None and block.file not in files):
             continue
         if end_ns is not None and block.start_ns - end_ns > _LONG_GAP_NS:
             yield Gap(Span(end_ns, block.start_ns), before, block.file)
