@@ -165,7 +165,7 @@ class OdometryConfig(Section, frozen=True, forbid_unknown_fields=True):
     velocity_sigma_rad : the same of a rotation
     max_speed_m_s : speed of the robot, which limits how far a planar scan that matched badly is searched for,
         and any scan after a gap
-    max_turn_rad_s : turn rate of the robot, which limits that search in the plane
+    max_turn_rad_s : turn rate of the robot, which limits the heading of searches in the plane and from above
     keyframe_distance_m : a keyframe is made once the lidar has moved this far since the last one
     keyframe_angle_rad : a keyframe is made once the lidar has turned this far
     edge_sigma_m : translational standard deviation added to that of an odometry edge of the pose graph

@@ -113,11 +113,13 @@ class Prior(NamedTuple):
     T_target_source : (d+1, d+1) the expected pose
     covariance : (k, k) of a twist ξ in the source's own frame, T exp(ξ); m², rad m, rad²
     widest : (k,) standard deviations that hold whatever happens, as when the vehicle brakes
+    is_measured : True where another sensor measured the motion, False where it is extrapolated
     """
 
     T_target_source: Pose
     covariance: Matrix
     widest: NDArray[np.float64]
+    is_measured: bool = False
 
     @property
     def information(self) -> Matrix:

@@ -16,7 +16,6 @@ from scanchain.data import (
     Closure,
     GraphState,
     Keyframe,
-    Match,
     Matrix,
     Pose,
     RawPoints,
@@ -222,7 +221,7 @@ class Slam:
                 last.index,
                 keyframe.index,
                 lie.between(last.T_odom_lidar, keyframe.T_odom_lidar),
-                edge_information(tracked.match, *sigmas),
+                edge_information(located.information, *sigmas),
             )
             self.lost_scans = 0
         self.keyframes.append(keyframe)
@@ -242,7 +241,7 @@ class Slam:
     def _add(self, closure: Closure) -> Closure:
         """Make an edge of a closure; returns the closure with its innovation in the graph before."""
         config = self.config.loops
-        information = edge_information(closure.match, config.edge_sigma_m, config.edge_sigma_rad)
+        information = edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
         Z_ij = closure.match.T_target_source
         expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
         error = lie.log(lie.between(Z_ij, expected))
@@ -272,12 +271,12 @@ class Slam:
         return state
 
 
-def edge_information(match: Match, sigma_m: float, sigma_rad: float) -> Matrix:
-    """Information (k, k) of a pose-graph edge: the matcher's, with a floor under its variances.
+def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:
+    """Information (k, k) of a pose-graph edge: that of the motion (k, k), with a floor under its variances.
 
     Residuals share the map's errors and are far from independent, so that H alone is overconfident.
     """
-    floor = lie.by_component(len(match.information), sigma_m, sigma_rad) ** 2
-    covariance = np.linalg.inv(match.information + np.diag(1e-6 / floor)) + np.diag(floor)
-    information = np.linalg.inv(covariance)
-    return 0.5 * (information + information.T)
+    floor = lie.by_component(len(information), sigma_m, sigma_rad) ** 2
+    covariance = np.linalg.inv(information + np.diag(1e-6 / floor)) + np.diag(floor)
+    result = np.linalg.inv(covariance)
+    return 0.5 * (result + result.T)

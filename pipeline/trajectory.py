@@ -11,7 +11,7 @@ import numpy as np
 
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, remedy_of
 from scanchain.words import counted
 
 _NS_PER_S = 1_000_000_000
@@ -140,7 +140,8 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
+        reason = remedy_of(error) or f"{path} cannot be read ({error.strerror}); check the path"
+        raise InputError(reason) from None
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.replace(",", " ").replace(";", " ").split()
         if words and not words[0].startswith("#"):

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Points, Pose, Scan, State
+from scanchain.data import Matrix, Points, Pose, Scan, State
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
 
@@ -18,6 +18,7 @@ class Located:
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
+    ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame;
     ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
     """
 
@@ -25,6 +26,7 @@ class Located:
     is_keyframe: bool
     scale: float
     local_map: Points
+    information: Matrix
     first_points: Points
 
 
@@ -35,6 +37,9 @@ class FrontEnd:
         self.config = config.odometry
         self.odometry = Odometry(config, T_base_lidar)
         self.T_odom_keyframe = lie.identity(self.odometry.dimension)
+        self.T_odom_last = lie.identity(self.odometry.dimension)
+        self.covariance = np.zeros((lie.twist_size(T_base_lidar),) * 2)
+        self.since_keyframe = 0
         self.scans = 0
 
     def locate(self, scan: Scan) -> Located:
@@ -42,16 +47,38 @@ class FrontEnd:
         tracked = self.odometry.process(scan)
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
+        information = self._add_motion(tracked)
         if is_keyframe:
             self.T_odom_keyframe = tracked.T_odom_lidar
+            self.covariance, self.since_keyframe = np.zeros_like(self.covariance), 0
         local_map = self.odometry.local_map
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=local_map.scale,
             local_map=local_map.points() if is_keyframe else np.empty((0, local_map.dimension)),
+            information=information,
             first_points=self.odometry.first_points,
         )
+
+    def _add_motion(self, tracked: Tracked) -> Matrix:
+        """Information of the motion since the last keyframe: of the match, and of the wheels over all scans since.
+
+        The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances.
+        """
+        self.since_keyframe += 1
+        n, T_last_current = self.since_keyframe, lie.between(self.T_odom_last, tracked.T_odom_lidar)
+        self.T_odom_last = tracked.T_odom_lidar
+        if not tracked.prior.is_measured:
+            return tracked.match.information
+        predicted = n * tracked.prior.covariance
+        if n > 1:
+            Ad = lie.adjoint(lie.inverse(T_last_current))
+            predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
+        matched = np.zeros_like(predicted) if tracked.state is State.LOST else tracked.match.information
+        information = np.linalg.inv(predicted) + matched
+        self.covariance = np.linalg.inv(information)
+        return information
 
     def _moved_enough(self, tracked: Tracked) -> bool:
         distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)

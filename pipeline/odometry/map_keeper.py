@@ -10,6 +10,7 @@ from scanchain.data import Points, Pose
 from scanchain.registration import VoxelMap
 
 _RECENT = 20  # number of last scans from which a map with other voxels is built
+_ENOUGH = 10  # number of scans inserted of a lidar that stands
 
 
 class MapKeeper:
@@ -20,12 +21,18 @@ class MapKeeper:
         self.surfaces = VoxelMap(dimension, config)
         self.recent: deque[tuple[Points, Pose]] = deque(maxlen=_RECENT)
         self.T_odom_inserted = lie.identity(dimension)
+        self.standing_scans = 0
 
-    def extend(self, points: Points, T_odom_lidar: Pose) -> None:
-        """Insert a scan (N, d) that moved far enough from the last one inserted."""
+    def extend(self, points: Points, T_odom_lidar: Pose, *, is_standing: bool = False) -> None:
+        """Insert a scan (N, d) that moved far enough from the last one inserted.
+
+        Of a lidar that stands only the first few, whose mean is less noisy than one of them: more would bring
+        nothing new but what moves past it.
+        """
+        self.standing_scans = self.standing_scans + 1 if is_standing else 0
         distance_m, angle_rad = lie.apart(self.T_odom_inserted, T_odom_lidar)
         is_far = distance_m >= self.config.insert_distance_m or angle_rad >= self.config.insert_angle_rad
-        if is_far or not len(self.surfaces):
+        if (is_far and self.standing_scans <= _ENOUGH) or not len(self.surfaces):
             self.insert(points, T_odom_lidar)
 
     def insert(self, points: Points, T_odom_lidar: Pose) -> None:

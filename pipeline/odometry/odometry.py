@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose, Prior, RawPoints, Scan, State
+from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.live_stamps import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import Recovery
+from scanchain.odometry.standstill import Standstill
 from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import VoxelMap, create_matcher
@@ -28,7 +29,7 @@ from scanchain.settings import check_dimension, check_order, load_settings
 class _Registered:
     """The match of a scan, the points (N, d) that were aligned, deskewed to the middle, and the prediction.
 
-    ``elsewhere_m`` as in ``Tracked``.
+    ``elsewhere_m`` as in ``Tracked``; ``is_standing`` if the lidar did not move since the scan before.
     """
 
     points: Points
@@ -37,6 +38,7 @@ class _Registered:
     reason: str
     prediction: Prediction
     elsewhere_m: float = 0.0
+    is_standing: bool = False
 
 
 class Odometry:
@@ -59,6 +61,7 @@ class Odometry:
         self.predictor = Predictor(config.odometry, T_base_lidar)
         self.matcher = create_matcher(config.matching)
         self.recovery = Recovery(config.matching)
+        self.standstill = Standstill(self.dimension)
         self.map = MapKeeper(self.dimension, config.local_map)
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
@@ -104,15 +107,16 @@ class Odometry:
         aligned = working_s()
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
         points = sweep.from_middle(self.predictor.velocity)
-        self._extend(points, registered.state)
+        self._extend(points, registered)
         tracked = Tracked(
             scan=scan,
             points=points,
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
             match=registered.match,
-            state=registered.state,
+            state=State.LOST if registered.elsewhere_m > 0.0 else registered.state,
             reason=registered.reason,
+            prior=prediction.prior,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
             map_s=working_s() - aligned,
@@ -131,10 +135,17 @@ class Odometry:
             self.first_sweep, self.first_points = sweep, sweep.points
             return _Registered(points, match, State.OK, match.reason, prediction)
         usual_cost = self.recovery.usual_cost
-        match = self.recovery.align(self.matcher, points, self.local_map, prediction)
-        if sparse.is_distorted and match.inlier_share >= self.config.matching.min_inlier_share:
+        match = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
+        is_placed = match.inlier_share >= self.config.matching.min_inlier_share
+        is_measured = prediction.prior.is_measured
+        if is_placed and not is_measured and self.standstill.confirms(match):
+            match = replace(match, T_target_source=self.standstill.T_odom_lidar)
+            return _Registered(points, match, self._judge(match), match.reason, prediction, is_standing=True)
+        if sparse.is_distorted and is_placed:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
+        if state is not State.LOST and not is_measured:
+            self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             return self._reset_map(points, prediction)
         return _Registered(points, match, state, match.reason, prediction)
@@ -149,7 +160,7 @@ class Odometry:
         if prediction.is_second:
             T_moved = self._restart(velocity)
             T_odom_middle = T_moved @ T_odom_middle
-            prior = Prior(T_moved @ prior.T_target_source, prior.covariance, prior.widest)
+            prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
             prediction = replace(prediction, T_odom_last=T_moved)
         points = sparse.from_middle(velocity)
         match = self.matcher.align(points, self.local_map, T_odom_middle, prior)
@@ -167,9 +178,11 @@ class Odometry:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()
-        match = first_match(prediction.T_odom_last, points, self.config.matching)
+        self.standstill.begin(prediction.T_odom_last)
         away_m = prediction.reach_m
         reason = f"may be {away_m:.0f} m away after a time without scans: a new map begins"
+        match = first_match(prediction.T_odom_last, points, self.config.matching)
+        match = replace(match, converged=False, reason=reason)
         return _Registered(points, match, State.OK, reason, prediction, away_m)
 
     def _judge(self, match: Match) -> State:
@@ -179,13 +192,14 @@ class Odometry:
             return State.LOST
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 
-    def _extend(self, points: Points, state: State) -> None:
+    def _extend(self, points: Points, registered: _Registered) -> None:
         """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
-        self.recovery.take(state)
-        if state is not State.LOST:
-            self.map.extend(points, self.predictor.T_odom_lidar)
+        self.recovery.take(registered.state)
+        T_odom_lidar = self.predictor.T_odom_lidar
+        if registered.state is not State.LOST:
+            self.map.extend(points, T_odom_lidar, is_standing=registered.is_standing)
         elif self.recovery.has_given_up:
-            self.map.insert(points, self.predictor.T_odom_lidar)
+            self.map.insert(points, T_odom_lidar)
 
     def _at_stamp(self, tracked: Tracked, sweep: Sweep, prediction: Prediction) -> Tracked:
         """A scan that was aligned as seen from its middle, as seen from its stamp.

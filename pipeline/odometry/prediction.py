@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Pose, Prior, Scan, State
 from scanchain.errors import InputError
-from scanchain.kernels.registration.observability import definite_inverse
+from scanchain.kernels.registration.observability import WEAK, definite_inverse
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import MotionFilter
@@ -20,6 +20,8 @@ from scanchain.odometry.motion_filter import MotionFilter
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
+_ACCELERATION_M_S2 = 4.0  # of a car, which limits the distance in space from the predicted pose
+_FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,7 @@ class Prediction:
     @property
     def is_out_of_reach(self) -> bool:
         """True if the scan may be outside any search window, after so long a gap."""
-        return self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
+        return not self.prior.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
     def window(self) -> tuple[float, float]:
         """Half widths of the search window around the predicted pose in the plane, meters and radians."""
@@ -80,6 +82,20 @@ class Prediction:
             min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),
             min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
         )
+
+    def windows_in_space(self) -> tuple[tuple[float, float], ...]:
+        """Half widths of the search windows in space, the likeliest first, meters and radians.
+
+        By the acceleration that a vehicle may have and, where nothing is found there, by its speed.
+        """
+        elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
+        half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
+        fastest_m_s = max(self.config.max_speed_m_s, _FASTEST_M_S)
+        by_speed = min(elapsed_s * fastest_m_s, _LARGEST_REACH_M), half_width_rad
+        if self.is_second or self.is_guess:
+            return (by_speed,)
+        by_acceleration = min(max(elapsed_s**2 * _ACCELERATION_M_S2, 1.0), by_speed[0]), half_width_rad
+        return by_acceleration, by_speed
 
     def alternatives(self) -> tuple[Pose, ...]:
         """Other initial poses.
@@ -150,15 +166,18 @@ class Predictor:
         interval_s = times.to(scan)
         wheel, is_guess = self._wheel_motion(scan), False
         if wheel is not None:
-            motion, covariance, statistics = wheel, np.diag(self.by_wheels.variances), self.by_wheels
+            motion, statistics = wheel, self.by_wheels
+            share = interval_s / times.usual_s if times.has_gap_before(scan) else 1.0
+            covariance = share**2 * np.diag(self.by_wheels.variances)
         elif times.has_gap_before(scan):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
         else:
             covariance = self.filter.predicted_covariance(self.by_velocity.variances)
             motion, statistics = self.filter.motion, self.by_velocity
+        T_predicted = lie.normalize(self.T_odom_lidar @ motion)
         return Prediction(
-            prior=Prior(lie.normalize(self.T_odom_lidar @ motion), covariance, statistics.first_sigma),
+            prior=Prior(T_predicted, covariance, statistics.first_sigma, statistics is self.by_wheels),
             statistics=statistics,
             is_guess=is_guess,
             velocity=self.velocity,
@@ -196,7 +215,8 @@ class Predictor:
                 self.filter.correct(innovation, match.information, self.by_velocity.variances)
             else:
                 self.filter.begin(self.T_previous_current)
-            if state is State.OK and not prediction.is_second:
+            is_independent = not prediction.prior.is_measured or match.observability >= WEAK
+            if state is State.OK and is_independent and not prediction.is_second:
                 prediction.statistics.update(innovation, np.diag(definite_inverse(match.information)))
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:

@@ -8,15 +8,21 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import MatchingConfig
-from scanchain.data import Match, Points, Pose, State
+from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
-from scanchain.registration import CorrelativeMap, Matcher, VoxelMap
+from scanchain.preprocess import Sweep
+from scanchain.registration import BirdsEye, CorrelativeMap, Matcher, VoxelMap
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
 _UNCERTAIN = 2.0  # cost per point over its running mean, from which on other initial poses are tried
 _ELSEWHERE = 3.0  # cost per point over its running mean, from which on a scan after a gap does not fit the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is uncertain
+_UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradicted pose in space is searched
+_CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
+_SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
+_SEEDS = 3  # number of poses from the bird's-eye search that are aligned
+_NEAR_PERCENT = 95.0  # share of the points within the radius of the bird's-eye image
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
 
@@ -28,18 +34,29 @@ class Recovery:
         self.usual_cost = 0.0
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
+        self.rough_cost = _ROUGH * 0.5 * config.kernel_scale_m**2  # of a point
 
-    def align(self, matcher: Matcher, points: Points, surfaces: VoxelMap, prediction: Prediction) -> Match:
-        """The alignment from the predicted pose or, where that one is uncertain, the best of several."""
+    def align(
+        self, matcher: Matcher, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
+    ) -> Match:
+        """The alignment from the predicted pose or, where that one is uncertain, the best of several.
+
+        points : (N, d) those to be aligned; sweep : all of the scan
+        """
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
-        if self._is_uncertain(best.cost / len(points), prediction):
+        is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
+        if is_contradicted:
+            best = self._searched(best, matcher, points, sweep, surfaces, prediction)
+        is_found = is_contradicted and _is_sound(best)
+        if not is_found and self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
                 if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
-        cost = best.cost / len(points)
-        self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
+        if surfaces.dimension == 2 or _is_sound(best):
+            cost = best.cost / len(points)
+            self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return best
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
@@ -47,8 +64,7 @@ class Recovery:
 
         usual_cost : before this scan
         """
-        least = _ROUGH * 0.5 * self.config.kernel_scale_m**2
-        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, least)
+        return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, self.rough_cost)
 
     def take(self, state: State) -> None:
         """Count lost scans and those to search wide."""
@@ -65,19 +81,63 @@ class Recovery:
         """True if so many scans were lost that the map has to be extended at the prediction."""
         return self.lost_scans >= _PATIENCE
 
+    def _is_contradicted(self, match: Match) -> bool:
+        """True if correspondences contradict the pose, and the cost per point is not as usual either."""
+        return (
+            match.fit < LEAST_FIT and match.cost > max(_UNUSUAL * self.usual_cost, self.rough_cost) * match.points
+        )
+
     def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
         """True if the cost per point is far above the usual one, and above a share of the greatest possible."""
         if not self.usual_cost:
             return False
         if prediction.is_guess:
             return cost > self.usual_cost
-        return cost > max(_UNCERTAIN * self.usual_cost, _ROUGH * 0.5 * self.config.kernel_scale_m**2)
+        return cost > max(_UNCERTAIN * self.usual_cost, self.rough_cost)
+
+    def _searched(
+        self,
+        best: Match,
+        matcher: Matcher,
+        points: Points,
+        sweep: Sweep,
+        surfaces: VoxelMap,
+        prediction: Prediction,
+    ) -> Match:
+        """The best alignment in space from where upright structure fits, or the one that there was."""
+        structure = sweep.from_middle(prediction.velocity)
+        tried = [best]
+        for half_width_m, half_width_rad in prediction.windows_in_space():
+            radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
+            seeds = BirdsEye(surfaces, prediction.T_odom_lidar, radius_m).seeds(
+                structure, half_width_m=half_width_m, half_width_rad=half_width_rad, answers=_SEEDS
+            )
+            for seed in seeds:
+                if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
+                    tried.append(matcher.align(points, surfaces, seed, wide=True))
+            found = min(tried, key=lambda match: self._cost(match, prediction))
+            if found.observability >= 1.0 and found.cost < _CLEARLY * best.cost:
+                best = found
+            if _is_sound(best):
+                break
+        return best
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""
         prior = prediction.prior
         away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
         return match.cost + 0.5 * self.config.sensor_noise_m**2 * float(away @ away)
+
+
+def _is_sound(match: Match) -> bool:
+    """True if the correspondences determine the pose and agree with it."""
+    return match.fit >= LEAST_FIT and match.observability >= 1.0
+
+
+def _is_near(T: Pose, T_other: Pose, size_m: float) -> bool:
+    """True if matching from one pose ends where it does from the other."""
+    away_m, away_rad = lie.apart(T, T_other)
+    return away_m < size_m and away_rad < _SAME_RAD
 
 
 def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tuple[Pose, ...]:

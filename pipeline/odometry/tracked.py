@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MatchingConfig, PreprocessConfig
-from scanchain.data import Match, Points, Pose, Scan, State
+from scanchain.data import Match, Points, Pose, Prior, Scan, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import with_source_frame
 
@@ -20,6 +20,7 @@ class Tracked:
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
     from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
+    ``prior`` is that of its pose at the middle of the scan;
     ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
     """
 
@@ -30,6 +31,7 @@ class Tracked:
     match: Match
     state: State
     reason: str
+    prior: Prior
     preprocess_s: float
     match_s: float
     map_s: float

@@ -138,11 +138,6 @@ def _problem(result: Result, points: int, target: VoxelMap, observability: float
             f"motion along [{direction}] is undetermined: observability {observability:.1e} < 1, by "
             f"matching.min_signal ({config.min_signal:g}) or matching.min_information ({config.min_information:g})"
         )
-    if result.surface_signal < config.min_signal:
-        return (
-            "motion along the weakest direction is undetermined: signal-to-noise ratio "
-            f"{result.surface_signal:.1g} below matching.min_signal ({config.min_signal:g})"
-        )
     if result.ending != icp.CONVERGED:
         return _ENDINGS[result.ending]
     return _contradiction(result, config) or _chance(result, points, target)
@@ -193,4 +188,5 @@ def _expected(prior: Prior | None, T_first: Pose) -> Prior:
         k = lie.twist_size(T_first)
         return Prior(np.ascontiguousarray(T_first), np.zeros((k, k)), np.full(k, np.inf))
     checks.instance(prior, Prior, "prior", "Prior(T_target_source, covariance, widest), or None")
-    return Prior(*map(np.ascontiguousarray, prior))
+    arrays = map(np.ascontiguousarray, (prior.T_target_source, prior.covariance, prior.widest))
+    return Prior(*arrays, is_measured=bool(prior.is_measured))

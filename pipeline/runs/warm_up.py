@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Points, Pose, Scan, State
+from scanchain.data import Points, Pose, Prior, Scan, State
 from scanchain.odometry import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.runs.results import cloud_of, grid_of
@@ -41,8 +41,9 @@ def warm_up(dimension: int) -> None:
 def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Located:
     scan = Scan(index, index, index, points.astype(np.float32), np.empty(0, np.float32), 0, None)
     match = first_match(T_odom_lidar, points, slam.config.matching)
-    tracked = Tracked(scan, points, points, T_odom_lidar, match, State.OK, "", 0.0, 0.0, 0.0)
-    return Located(tracked, is_keyframe=True, scale=1.0, local_map=points, first_points=points)
+    prior = Prior(T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
+    tracked = Tracked(scan, points, points, T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
+    return Located(tracked, True, 1.0, points, match.information, points)
 
 
 if __name__ == "__main__":

@@ -59,15 +59,16 @@ def test_the_spectrum_counts_turns_as_lengths(k):
 @pytest.mark.parametrize("k", [3, 6])
 @pytest.mark.parametrize("min_information", [1e-9, 1e-4, 1e-2, 1.0])
 @pytest.mark.parametrize("signal", [0.5, 2.9, 3.1, 29.0, 31.0, np.inf])
-def test_weak_directions_have_a_prior_and_no_others(k, min_information, signal):
+@pytest.mark.parametrize("is_fused", [False, True])
+def test_weak_directions_have_a_prior_and_no_others(k, min_information, signal, is_fused):
     H, expected = definite(k, 1.5), definite(k, 0.5, seed=1)
     settings = settings_of(
         MatchingConfig(min_information=min_information, min_signal=3.0), VoxelMap(3, LocalMapConfig()), wide=False
     )
     found = observability.spectrum_of(H, 2.0, 5.0)
     found.signals[1] = signal
-    prior = observability.weak_prior(found, 2.0, expected, settings)
-    wanted = weak_prior(H, 2.0, 5.0, expected, found.signals, (min_information, 3.0))
+    prior = observability.weak_prior(found, 2.0, expected, is_fused, settings)
+    wanted = weak_prior(H, 2.0, 5.0, expected, found.signals, (min_information, 3.0), is_fused)
     np.testing.assert_allclose(prior, wanted, rtol=1e-9, atol=1e-9)
 
 

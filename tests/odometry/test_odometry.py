@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scanchain import baselines, lie
-from scanchain.config import Config
+from scanchain.config import Config, LogConfig
 from scanchain.data import Scan, State, Trajectory, Verdict
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
@@ -95,6 +95,16 @@ def test_the_second_scan_tells_how_the_first_one_was_distorted(town):
 def test_a_drive_that_starts_at_speed_drifts_by_centimeters(town):
     scans, T_base_lidar, truth = town
     assert ate_m(trajectory(tracked(scans[40:], T_base_lidar, configured(3))), truth) < 0.02
+
+
+def test_a_drive_at_one_hertz_is_held_from_its_second_scan_on(town):
+    scans, T_base_lidar, truth = town
+    config = configured(3, {"odometry.prior": "constant-velocity"})
+    steps = tracked(scans[39::10], T_base_lidar, config)
+    motion = lie.between(truth.poses[39], truth.poses[49])
+    away_m, _ = lie.apart(motion, lie.between(steps[0].T_odom_lidar, steps[1].T_odom_lidar))
+    assert np.linalg.norm(motion[:3, 3]) > 6.0
+    assert away_m < 0.2
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -275,6 +285,13 @@ def test_kitti_stays_within_its_error_of_the_gps(matcher, limit_m):
     steps = tracked(log.scans(), log.T_base_lidar, configured(3, {"matching.matcher": matcher}))
     truth = log.ground_truth()
     assert ate_m(trajectory(steps), truth) < limit_m
+
+
+@pytest.mark.parametrize(("every", "limit_m"), [(2, 0.12), (3, 0.15), (5, 0.5)])
+def test_kitti_is_held_at_a_fraction_of_its_scans(every, limit_m):
+    log = open_log([shared_data("3d/kitti_0001_first54.mcap")], LogConfig(every=every))
+    steps = tracked(log.scans(), log.T_base_lidar, configured(3))
+    assert ate_m(trajectory(steps), log.ground_truth()) < limit_m
 
 
 def test_every_motion_agrees_with_kiss_icp_to_two_centimeters():

@@ -6,7 +6,8 @@ import pytest
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.search.branch_and_bound import draw_hits, fill_pyramid, search
-from scanchain.registration import CorrelativeMap, VoxelMap
+from scanchain.registration import BirdsEye, CorrelativeMap, VoxelMap
+from scanchain.registration.birds_eye import upright_columns
 from tests.support import naive_search
 
 
@@ -46,7 +47,7 @@ def test_no_pose_of_the_window_scores_better_than_the_one_found(seed):
     T = lie.pose_2d(*rng.uniform(1.0, 4.0, 2), rng.uniform(-3.0, 3.0))
     points = lie.transform(lie.inverse(T), walls(rng, 3, 5.0))
     every = naive_search.scores(pyramid[0], origin, 0.25, points, T, 7, 4, 0.05)
-    x, y, yaw, share, rival = search(pyramid, origin, 0.25, points, T, 7, 4, 0.05, 0.0)
+    (x, y, yaw, share), *others = search(pyramid, origin, 0.25, points, T, 7, 4, 0.05, 0.0, 1.0, 0.8, 2)
     assert share == pytest.approx(max(every.values()))
     found = (round((yaw - float(lie.yaw(T))) / 0.05), round((x - T[0, 2]) / 0.25), round((y - T[1, 2]) / 0.25))
     assert every[found] == pytest.approx(share)
@@ -55,7 +56,28 @@ def test_no_pose_of_the_window_scores_better_than_the_one_found(seed):
         for (turn, dx, dy), value in every.items()
         if abs(turn - found[0]) * 0.05 >= 0.1 or max(abs(dx - found[1]), abs(dy - found[2])) * 0.25 >= 1.0
     ]
-    assert rival == pytest.approx(max(elsewhere) if max(elsewhere) >= 0.8 * share else 0.0)
+    rivals = [max(elsewhere)] if max(elsewhere) >= 0.8 * share else []
+    assert [other[3] for other in others] == pytest.approx(rivals)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_further_answer_is_the_best_that_lies_apart_from_those_before(seed):
+    rng = np.random.default_rng(seed)
+    pyramid, origin = pyramid_of(walls(rng, 6, 5.0), 0.25, 4)
+    points = walls(rng, 3, 5.0)
+    every = naive_search.scores(pyramid[0], origin, 0.25, points, np.eye(3), 7, 4, 0.05)
+    answers = search(pyramid, origin, 0.25, points, np.eye(3), 7, 4, 0.05, 0.0, 0.7, 0.5, 4)
+    assert len(answers) > 1
+    for x, y, yaw, share in answers:
+        assert share == pytest.approx(max(every.values()))
+        near = [
+            pose
+            for pose in every
+            if abs(pose[0] * 0.05 - yaw) < 0.1 - 1e-9
+            and max(abs(pose[1] * 0.25 - x), abs(pose[2] * 0.25 - y)) < 0.7
+        ]
+        for pose in near:
+            del every[pose]
 
 
 def test_below_the_least_share_nothing_is_found():
@@ -64,8 +86,9 @@ def test_below_the_least_share_nothing_is_found():
     points = rng.uniform(0.0, 5.0, (40, 2))
     every = naive_search.scores(pyramid[0], origin, 0.25, points, np.eye(3), 4, 2, 0.05)
     best = max(every.values())
-    assert search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best - 1e-6)[3] == pytest.approx(best)
-    assert search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best + 1e-6)[3] == -1.0
+    found = search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best - 1e-6, 1.0, 1.0, 1)
+    assert found[0, 3] == pytest.approx(best)
+    assert not len(search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best + 1e-6, 1.0, 1.0, 1))
 
 
 def map_of(points):
@@ -98,3 +121,37 @@ def test_an_empty_map_and_an_empty_window_give_the_first_pose_back():
     T = lie.pose_2d(1.0, 2.0, 0.3)
     points = np.random.default_rng(0).uniform(-5.0, 5.0, (30, 2))
     assert map_of(np.empty((0, 2))).best(points, T, half_width_m=1.0, half_width_rad=0.1, least=0.1).share == 0.0
+
+
+def street(rng):
+    """Points of a sloping ground of 80 x 80 m and of walls on it, dense in their height."""
+    ground = rng.uniform(-40.0, 40.0, (30_000, 2))
+    feet = walls(rng, 12, 60.0) - 30.0
+    high = np.repeat(feet, 12, axis=0)
+    ground, high = (np.column_stack([xy, 0.05 * xy[:, 0] - 1.7]) for xy in (ground, high))
+    high[:, 2] += np.tile(np.linspace(0.0, 4.0, 12), len(feet))
+    return ground, high
+
+
+def test_columns_stand_on_walls_and_not_on_the_ground():
+    ground, high = street(np.random.default_rng(3))
+    columns = upright_columns(np.concatenate([ground, high]), 1.0)
+    assert len(upright_columns(ground, 1.0)) == len(upright_columns(np.empty((0, 3)), 1.0)) == 0
+    away_m = np.linalg.norm(columns[:, None] - high[None, :, :2], axis=2).min(axis=1)
+    assert len(columns) > 100 and away_m.max() < 1.0
+
+
+def test_a_scan_in_space_is_found_meters_away_and_turned():
+    ground, high = street(np.random.default_rng(4))
+    target = VoxelMap(3, LocalMapConfig())
+    target.insert(np.concatenate([ground, high]), lie.identity(3))
+    truth = lie.lift(lie.pose_2d(9.0, -5.0, 0.6))
+    truth[2, 3] = 0.45
+    scan = lie.transform(lie.inverse(truth), np.concatenate([ground[::3], high]))
+    seeds = BirdsEye(target, lie.identity(3), 60.0).seeds(scan, half_width_m=15.0, half_width_rad=1.0, answers=3)
+    away_m, away_rad = lie.apart(truth, seeds[0])
+    assert away_m < 1.0 and away_rad < 0.1
+    assert (
+        BirdsEye(target, lie.identity(3), 60.0).seeds(ground, half_width_m=15.0, half_width_rad=1.0, answers=3)
+        == ()
+    )

@@ -163,7 +163,7 @@ def dented_corridor(dents, seed=0):
     return np.concatenate([walls, faces])
 
 
-@pytest.mark.parametrize(("dents", "is_believed"), [(20, False), (400, True)])
+@pytest.mark.parametrize(("dents", "is_believed"), [(30, False), (400, True)])
 def test_a_sure_prediction_outweighs_weak_data_and_no_others(dents, is_believed):
     """A dent that says 5 cm: a handful of points is not believed against an experience of millimeters."""
     target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))

@@ -24,15 +24,16 @@ def spectrum(H, weights, range_m):
     return scale, values, vectors
 
 
-def weak_prior(H, weights, range_m, expected, signals, limits):
+def weak_prior(H, weights, range_m, expected, signals, limits, is_fused):
     """limits : the least information and the least signal"""
     scale, values, vectors = spectrum(H, weights, range_m)
     total = np.zeros(H.shape)
     for value, signal, vector in zip(values, signals, vectors.T, strict=True):
         times = min(value / limits[0], signal / limits[1])
-        if times < 10.0:
+        if times < (1.0 if is_fused else 10.0):
             twist = vector * scale
-            strength = 1e3 * weights if times < 1.0 else twist @ expected @ twist / (1.0 - 1.0 / signal)
+            is_frozen = (value < limits[0] or signal <= 1.0) if is_fused else times < 1.0
+            strength = 1e3 * weights if is_frozen else twist @ expected @ twist / (1.0 - 1.0 / signal)
             total += min(strength, 1e3 * weights) * np.outer(vector / scale, vector / scale)
     return total
 

@@ -23,10 +23,10 @@ from scanchain.kernels.registration.observability import (
     congruent,
     definite_inverse,
     is_below,
+    remove_noise,
     seen_from_source,
     spectrum_of,
     weak_prior,
-    weakest_signal,
     worst,
 )
 
@@ -36,7 +36,6 @@ _SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first s
 class Result(NamedTuple):
     """Result of a registration; fields as in ``Match``, ``range_m`` of the points, ``ending`` a code of ``icp``.
 
-    surface_signal : along the weakest direction, where ``signal`` does not judge it; infinite where that is strong
     on_surfaces : correspondences with a plane or line
     """
 
@@ -45,7 +44,6 @@ class Result(NamedTuple):
     direction: NDArray[np.float64]
     eigenvalue: float
     signal: float
-    surface_signal: float
     fit: float
     range_m: float
     residual_m: float
@@ -61,7 +59,9 @@ def match(voxels, points, T_first, expected, settings):
     """``Result`` of points (N, d) aligned to a map from T_first (d+1, d+1), near a predicted pose.
 
     The prior counts with its largest standard deviations. Where the scan constrains a direction weakly, it is
-    aligned once more, and along that direction the prior counts with its covariance.
+    aligned once more, and along that direction the prior counts with its covariance. In the plane an extrapolated
+    motion does so only where there is no information at all: walls that look alike hold a robot that sets off
+    in a corridor better than the rest before; the motion that wheels measured is fused.
 
     expected : T_target_source (d+1, d+1), covariance (k, k) and widest (k,) as in ``Prior``; without a prediction
         T_first, zeros and infinite
@@ -77,17 +77,18 @@ def match(voxels, points, T_first, expected, settings):
     first_scale_m = min(max(settings.first_scale_m, _SIGMAS * uncertainty_m), settings.widest_scale_m)
     problem = problem_of(voxels, points, T_first, prior, settings)
     T = T_first.copy()
+    is_fused = expected.is_measured and points.shape[1] == 2
     is_remapped = False
     while True:
         fit = align(problem, T, offset, range_m, first_scale_m)
         spectrum = spectrum_of(fit.H, fit.total_weight, range_m)
-        if points.shape[1] == 3:
+        if is_fused or points.shape[1] == 3:
             add_signals(problem, T, spectrum)
-        if is_remapped or not is_below(spectrum, 0, WEAK, settings):
+        if is_remapped or not is_below(spectrum, 0, 1.0 if is_fused else WEAK, settings):
             break
         is_remapped = True
         believed = _about_target(definite_inverse(expected.covariance), T_first, settings.variance)
-        remapped = weak_prior(spectrum, fit.total_weight, believed, settings)
+        remapped = weak_prior(spectrum, fit.total_weight, believed, is_fused, settings)
         for i in range(k):
             for j in range(k):
                 prior[i, j] += remapped[i, j]
@@ -95,10 +96,11 @@ def match(voxels, points, T_first, expected, settings):
     last = fit
     if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
         last = fit_at(problem, T, fit)
-    surface_signal = np.inf
-    if points.shape[1] == 2:
-        surface_signal = weakest_signal(problem, T, spectrum)
-    return _result(problem, T, T_first, fit, last, spectrum, surface_signal, range_m)
+    if points.shape[1] == 2 and not is_fused:
+        add_signals(problem, T, spectrum)
+    if is_fused:
+        remove_noise(spectrum, fit.H, fit.total_weight, settings)
+    return _result(problem, T, T_first, fit, last, spectrum, range_m)
 
 
 @njit(cache=True, nogil=True)
@@ -113,12 +115,12 @@ def assess(voxels, points, T, fit, settings):
     problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
     last = fit_at(problem, T, fit)
     spectrum = spectrum_of(last.H, last.total_weight, range_m)
-    surface_signal = weakest_signal(problem, T, spectrum)
-    return _result(problem, T, T, fit, last, spectrum, surface_signal, range_m)
+    add_signals(problem, T, spectrum)
+    return _result(problem, T, T, fit, last, spectrum, range_m)
 
 
 @njit(cache=True, nogil=True)
-def _result(problem, T, T_first, fit, last, spectrum, surface_signal: float, range_m: float):
+def _result(problem, T, T_first, fit, last, spectrum, range_m: float):
     """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
 
     The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
@@ -137,7 +139,6 @@ def _result(problem, T, T_first, fit, last, spectrum, surface_signal: float, ran
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
-        surface_signal,
         agreement(last.H, last.unweighted, range_m),
         range_m,
         _residual_of(last),

@@ -26,7 +26,6 @@ from scanchain.kernels.voxels.voxel_shapes import (
 WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
 _FIXED = 1e3  # times the information of all residuals, of the prior along a degenerate direction
 _ROUNDING = 1e-12  # of the largest eigenvalue, below which one is zero
-_NEVER_NOISE = 0.1  # information per weight above which a direction is not noise-induced
 _OLD = 2  # insertions since a voxel's first, from which on it counts as independent of the present scan
 
 
@@ -117,18 +116,20 @@ def is_below(spectrum, m: int, times: float, settings) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def weak_prior(spectrum, total_weight: float, believed, settings):
+def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings):
     """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
 
     Along degenerate directions the pose does not move at all (solution remapping; Zhang, Kaess & Singh 2016).
     Up to WEAK times the limits the prior's own information ``believed`` (k, k) counts, against that of the
     residuals without its noise-induced part: the share 1 − 1/signal. Stronger directions have no prior: a vehicle
     that brakes may contradict any prediction.
+    is_fused : True to fuse a measured motion, along degenerate directions alone: the pose moves by as much as the
+        information that is not noise-induced says against it
     """
     k = believed.shape[0]
     prior, twist = np.zeros((k, k)), np.empty(k)
     for m in range(k):
-        if not is_below(spectrum, m, WEAK, settings):
+        if not is_below(spectrum, m, 1.0 if is_fused else WEAK, settings):
             continue
         _twist_of(spectrum, m, twist)
         strength = 0.0
@@ -136,13 +137,32 @@ def weak_prior(spectrum, total_weight: float, believed, settings):
             for j in range(k):
                 strength += twist[i] * believed[i, j] * twist[j]
         real = 1.0 - 1.0 / max(spectrum.signals[m], 1e-300)
-        if is_below(spectrum, m, 1.0, settings) or strength > real * _FIXED * total_weight:
+        is_frozen = is_below(spectrum, m, 1.0, settings)
+        if is_fused:
+            is_frozen = spectrum.values[m] < settings.min_information or real <= 0.0
+        if is_frozen or strength > real * _FIXED * total_weight:
             strength, real = _FIXED * total_weight, 1.0
         for i in range(k):
             for j in range(k):
                 along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
                 prior[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
     return prior
+
+
+@njit(cache=True, nogil=True)
+def remove_noise(spectrum, H, total_weight: float, settings):
+    """Take the noise-induced part along weak directions from the information H (k, k) of residuals.
+
+    Along a direction of signal-to-noise ratio s, the share 1/s of the information is noise-induced.
+    """
+    for m in range(H.shape[0]):
+        if not is_below(spectrum, m, WEAK, settings):
+            continue
+        noise = total_weight * spectrum.values[m] / max(spectrum.signals[m], 1.0)
+        for i in range(H.shape[0]):
+            for j in range(H.shape[0]):
+                along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
+                H[i, j] -= noise * along / (spectrum.scale[i] * spectrum.scale[j])
 
 
 @njit(cache=True, inline="always")
@@ -154,16 +174,6 @@ def add_signals(problem, T, spectrum):
         spectrum.signals[m] = signal_along(problem, T, twist)
         if not is_below(spectrum, m, WEAK, problem.settings):
             break
-
-
-@njit(cache=True, inline="always")
-def weakest_signal(problem, T, spectrum) -> float:
-    """Signal-to-noise ratio along the direction of least information; infinite where that is far from weak."""
-    if spectrum.values[0] > _NEVER_NOISE:
-        return np.inf
-    twist = np.empty(spectrum.values.shape[0])
-    _twist_of(spectrum, 0, twist)
-    return signal_along(problem, T, twist)
 
 
 @njit(cache=True, nogil=True)

@@ -7,8 +7,7 @@ import numpy as np
 from numba import njit
 
 HIT, NEAR = 2, 1  # score of a point in a cell with a surface, and in one beside it
-APART_M, APART_RAD = 1.0, 0.1  # least difference of two distinct poses
-RIVAL = 0.8  # share of the best score, from which on a distinct pose is returned as its rival
+APART_RAD = 0.1  # least angle between two distinct poses
 
 
 @njit(cache=True, nogil=True)
@@ -49,43 +48,57 @@ def fill_pyramid(pyramid):
 
 @njit(cache=True, nogil=True)
 def search(
-    pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float
-):
-    """The best-scoring pose around T, within so many shifts of a cell and turns, and the best one apart from it.
+    pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float,
+    apart_m: float, rival: float, answers: int,
+):  # fmt: skip
+    """The best-scoring poses around T, within so many shifts of a cell and turns, each apart from the others.
 
     A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
     bound is split until one of a single shift comes first: nothing that is left can beat it. The search goes on
-    to the best pose elsewhere, more than APART_M or APART_RAD away, with at least RIVAL of that score.
+    to the best pose elsewhere, ``apart_m`` or APART_RAD away from those found, with at least the share ``rival``
+    of the best score.
 
     pyramid : of ``fill_pyramid``; its first 2ᵗᵒᵖ − 1 rows and columns are empty
     points : (N, 2) meters, lidar frame; T : (3, 3)
     least : share of the highest score possible, below which nothing counts
-    Returns x, y (m), yaw, the share of the best pose (−1 for none) and that of its rival (0 for none).
+    Returns (A ≤ answers, 4), the best first: x, y (m), yaw, share of the highest score possible.
     """
     full = HIT * points.shape[0]
     cells = _cells(points, T, origin, resolution_m, turns, turn_rad)
     heap = _roots(pyramid, cells, shifts, least * full)
-    best, best_turn, best_x, best_y = -1, 0, 0, 0
-    rival = 0
-    while len(heap):
+    found, count = np.empty((answers, 4)), 0
+    taken = np.empty((answers, 3), np.int64)
+    best = 0
+    while len(heap) and count < answers:
         negative, level, turn, dx, dy = heapq.heappop(heap)
-        if -negative < RIVAL * best:
+        if -negative < rival * best:
             break
-        if best >= 0 and abs(turn - best_turn) * turn_rad < APART_RAD:
-            size = (1 << level) - 1
-            away = max(abs(dx - best_x), abs(dx + size - best_x), abs(dy - best_y), abs(dy + size - best_y))
-            if away * resolution_m < APART_M:
-                continue
+        if _is_taken(taken[:count], level, turn, dx, dy, resolution_m, turn_rad, apart_m):
+            continue
         if level > 0:
             _split(heap, pyramid[level - 1], cells[turn], level - 1, turn, dx, dy, shifts, least * full)
-        elif best < 0:
-            best, best_turn, best_x, best_y = -negative, turn, dx, dy
-        else:
-            rival = -negative
-            break
-    yaw = math.atan2(T[1, 0], T[0, 0]) + (best_turn - turns) * turn_rad
-    x, y = T[0, 2] + best_x * resolution_m, T[1, 2] + best_y * resolution_m
-    return x, y, yaw, best / full if best >= 0 else -1.0, rival / full
+            continue
+        best = max(best, -negative)
+        taken[count, 0], taken[count, 1], taken[count, 2] = turn, dx, dy
+        found[count, 0], found[count, 1] = T[0, 2] + dx * resolution_m, T[1, 2] + dy * resolution_m
+        found[count, 2] = math.atan2(T[1, 0], T[0, 0]) + (turn - turns) * turn_rad
+        found[count, 3] = -negative / full
+        count += 1
+    return found[:count]
+
+
+@njit(cache=True, inline="always")
+def _is_taken(
+    taken, level: int, turn: int, dx: int, dy: int, resolution_m: float, turn_rad: float, apart_m: float
+) -> bool:
+    """True if a window lies near one of the (A, 3) turns and shifts that were found."""
+    size = (1 << level) - 1
+    for a in range(taken.shape[0]):
+        x, y = taken[a, 1], taken[a, 2]
+        away = max(abs(dx - x), abs(dx + size - x), abs(dy - y), abs(dy + size - y))
+        if abs(turn - taken[a, 0]) * turn_rad < APART_RAD and away * resolution_m < apart_m:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)

@@ -26,6 +26,7 @@ from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.motion_filter import MotionFilter
 from scanchain.odometry.prediction import Predictor
 from scanchain.odometry.recovery import Recovery
+from scanchain.odometry.standstill import Standstill
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
@@ -62,9 +63,9 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
-        Recovery, MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser,
-        PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift,
-        PoseGraph, GrowingArray, PointStore, StoredPoints,
+        Recovery, Standstill, MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser,
+        ProximityCloser, PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier,
+        Segments, Drift, PoseGraph, GrowingArray, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
