@@ -14,7 +14,7 @@ from scanchain.preprocess import downsample as first_per_voxel
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
-from scanchain.settings import Override, load_settings
+from scanchain.settings import load_settings, overrides_of
 
 if TYPE_CHECKING:
     from scanchain.comparison.compare import Compared
@@ -50,7 +50,7 @@ def run(
         logs=sources_of(log),
         out=checks.path(out, "out"),
         config_file=None if config is None else checks.path(config, "config"),
-        overrides=_overrides(overrides),
+        overrides=overrides_of(overrides),
         sinks=frozenset({"save"}) if recording else frozenset(),
         ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         force=force,
@@ -81,7 +81,7 @@ def compare(
         logs=sources_of(log),
         out=checks.path(out, "out"),
         methods=(methods,) if isinstance(methods, str) else tuple(methods),
-        overrides=_overrides(overrides),
+        overrides=overrides_of(overrides),
         ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         repeat=repeat,
         force=force,
@@ -97,7 +97,7 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     Raises InputError if the graph is disconnected.
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
-    changes = _overrides({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
+    changes = overrides_of({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
 
@@ -130,10 +130,3 @@ def present_comparison(directory: Path) -> None:
 
     write_compare_report(directory)
     record_comparison(directory)
-
-
-def _overrides(values: dict[str, object]) -> tuple[Override, ...]:
-    return tuple(
-        Override(name.replace("__", "."), str(value).lower() if isinstance(value, bool) else str(value), name)
-        for name, value in values.items()
-    )

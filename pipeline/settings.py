@@ -42,6 +42,14 @@ class Override:
     flag: str
 
 
+def overrides_of(values: Mapping[str, object]) -> tuple[Override, ...]:
+    """Keyword arguments as overrides, two underscores for the dot: ``loops__drift=0.02``."""
+    return tuple(
+        Override(name.replace("__", "."), str(value).lower() if isinstance(value, bool) else str(value), name)
+        for name, value in values.items()
+    )
+
+
 def named(overrides: Sequence[Override], key: str) -> str:
     """Text that flags set a key to, the last of several; empty where none does."""
     return next((change.text for change in reversed(overrides) if change.key == key), "")

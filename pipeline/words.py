@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 
@@ -14,9 +15,14 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
 
 
+def below(value: float) -> str:
+    """A value that is below a limit, two digits rounded down: it never reads like the limit."""
+    return f"{math.floor(100.0 * value) / 100.0:.2f}"
+
+
 def duration(time_s: float) -> str:
     """A time in the largest unit of which it is more than one."""
-    for unit, seconds in (("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):
+    for unit, seconds in (("years", 31_557_600.0), ("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if time_s > seconds:
             return f"{time_s / seconds:.1f} {unit}"
     return f"{time_s:.1f} s"

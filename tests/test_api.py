@@ -31,6 +31,21 @@ def test_odometry_of_arrays_is_that_of_the_log_bit_by_bit():
     assert tracked.state is sc.State.OK
 
 
+def test_a_log_is_opened_with_keys_of_its_section(office):
+    log = sc.open_log(office, topic="/scan", end_s=1.05)
+    assert log.topic == "/scan" and log.scan_count == 10
+    assert sc.open_log(office, log.config, log__every=2).scan_count == 5
+    for changes, words in (
+        ({"topic": "/nowhere"}, "has no topic /nowhere"),
+        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean log.topic"),
+        ({"end_s": "soon"}, "log.end_s is 'soon'"),
+    ):
+        with pytest.raises(InputError, match=words):
+            sc.open_log(office, **changes)
+    with pytest.raises(InputError, match='a topic is chosen by topic="/points"'):
+        sc.open_log(office, "/scan")
+
+
 def test_slam_of_arrays_places_every_scan():
     scans = list(islice(sc.open_log(shared_data("2d/mit_csail.mcap")).scans(), 120))
     slam = sc.Slam(dimension=2)

@@ -88,7 +88,7 @@ def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
 
 
 def _first_warning(row: Row) -> str:
-    first = "" if row.metrics is None else row.metrics.warnings[0]
+    first = "" if row.metrics is None else row.metrics.warnings[0].replace(f"{row.log}: ", "")
     return first + (f" (and {row.warnings - 1:,} more)" if row.warnings > 1 else "")
 
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: str | None) -> None:
     """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
+    Exit code 1: such a run would be refused, for the reason named as problem.
+
     \b
     Examples:
       scanchain info log.mcap
@@ -40,6 +42,8 @@ def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: st
     idle = load_settings(found.dimension or None, overrides=chosen, idle=found.idle_keys).without_effect
     found = replace(found, notes=(*found.notes, *idle))
     click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
+    if found.problem:
+        ctx.exit(1)
 
 
 def _text(log: LogInfo) -> str:

@@ -121,11 +121,12 @@ def run(
     )
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
+    is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     verdict = finished.metrics.verdict
     fails = verdict is Verdict.NOT_TRUSTWORTHY or (strict and verdict is not Verdict.TRUSTWORTHY)
-    if fails:
+    if fails and not is_seen:
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
-    for warning in finished.warnings:
+    for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:
         click.echo(f"warning: {warning}", err=True)
     click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
     if finished.stopped:

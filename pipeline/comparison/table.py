@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -132,19 +132,31 @@ def text(table: Table) -> str:
     """The summary for a terminal, the best of each column starred; then failures with their reasons."""
     columns = columns_of(table.figures, "summary")
     shown = [column.cells(table.figures) for column in columns]
-    names = [row.name if row.status is Status.OK else f"{row.name}: {row.status}" for row in table.rows]
+    tried = [place for place, row in enumerate(table.rows) if row.status is not Status.MISSING]
+    rows = [table.rows[place] for place in tried]
+    names = [row.name if row.status is Status.OK else f"{row.name}: {row.status}" for row in rows]
     names = ["method", "", *names]
     lines = [f"{name:<{max(map(len, names))}}" for name in names]
     for column, cells in zip(columns, shown, strict=True):
+        cells = [cells[place] for place in tried]
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
-    verdicts = ["verdict", "", *(row.verdict for row in table.rows)]
+    verdicts = ["verdict", "", *(row.verdict for row in rows)]
     lines = [f"{line}  {verdict}" for line, verdict in zip(lines, verdicts, strict=True)]
-    endings = [f"{row.name}: {row.status}: {row.reason}" for row in table.rows if row.status is not Status.OK]
+    endings = [f"{row.name}: {row.status}: {row.reason}" for row in rows if row.status is not Status.OK]
+    endings += _not_installed(table)
     endings += [f"{row.name}: {row.verdict}: {row.verdict_reason}" for row in table.rows if row.is_doubted]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
+
+
+def _not_installed(table: Table) -> Iterator[str]:
+    """A line for all methods that are not installed, with the command that installs each."""
+    missing = [row for row in table.rows if row.status is Status.MISSING]
+    commands = dict.fromkeys(row.reason.rpartition(": ")[2] for row in missing)
+    if missing:
+        yield f"not installed: {', '.join(row.name for row in missing)}; {' and '.join(commands)}"
 
 
 def _csv(table: Table) -> str:

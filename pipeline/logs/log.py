@@ -19,7 +19,14 @@ from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, shown
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import chosen_span, count_scans, notes_on, whole_span
+from scanchain.logs.mcap.selection import (
+    check_one_log,
+    chosen_span,
+    count_scans,
+    gap_notes,
+    notes_on,
+    whole_span,
+)
 from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
@@ -37,7 +44,8 @@ from scanchain.logs.mounting import (
 )
 from scanchain.logs.opening import HAS_STAMPS, index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
-from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
+from scanchain.settings import load_settings, overrides_of
 from scanchain.source import Source, source_of
 from scanchain.words import counted, grouped
 
@@ -48,10 +56,20 @@ _POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start
 _WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 
 
-def open_log(sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS) -> Log:
-    """A file, folder or address, or several as one log, topics chosen. Raises InputError for what is no log."""
+def open_log(
+    sources: Source | str | Sequence[Source | str], config: LogConfig = _DEFAULTS, **changes: object
+) -> Log:
+    """A file, folder or address, or several as one log, topics chosen.
+
+    changes : keys of ``[log]`` on top of ``config``, such as topic="/lidar_front/points" or end_s=60.0
+    Raises InputError for what is no log, or no key.
+    """
     named = sources_of(sources)
-    instance(config, LogConfig, "config", "load_settings().config.log, or LogConfig()")
+    instance(config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"')
+    if changes:
+        short = {name.removeprefix("log__"): value for name, value in changes.items()}
+        changed = load_settings(overrides=overrides_of({f"log__{name}": short[name] for name in short})).config.log
+        config = replace(config, **{name: getattr(changed, name) for name in short})
     return Log(index_files(named, config), config)
 
 
@@ -87,6 +105,7 @@ class Log:
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
+        check_one_log(indexes, files_with_scans(indexes), config)
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(
             indexes,
@@ -130,6 +149,11 @@ class Log:
     def damage(self) -> list[str]:
         """Damage that was met; complete once ``scans`` is through or closed."""
         return grouped(self._damage)
+
+    @property
+    def gaps(self) -> list[str]:
+        """Those of the notes that are of long gaps."""
+        return gap_notes(self.indexes, self.config)
 
     @property
     def has_odometry(self) -> bool:

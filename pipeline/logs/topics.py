@@ -98,7 +98,7 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
-            found.append(OtherSensor("poses", topic, "not used; --log.ground_truth_topic takes them as the truth"))
+            found.append(OtherSensor("poses", topic, f"not used; --gt {topic} takes them as the truth"))
     return found
 
 
@@ -115,6 +115,15 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
 
 def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
     return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
+
+
+def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
+    """Numbers of the files that hold messages of a lidar."""
+    return {
+        place
+        for place, index in enumerate(indexes)
+        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
+    }
 
 
 def is_lidar(channel: Channel) -> bool:
@@ -135,6 +144,6 @@ def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> s
     for channel in channels[:_MOST_LISTED]:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         file = f" in {indexes[channel.key[0]].path.name}" if len(indexes) > 1 else ""
-        names.append(f"{channel.topic} ({channel.type_name or 'no schema'}{unusual}){file}")
+        names.append(f"{channel.topic} ({kind(channel) or 'no schema'}{unusual}){file}")
     names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
     return ", ".join(names) or "none"

@@ -18,6 +18,7 @@ from scanchain.kernels.registration.association import associate
 from scanchain.loops.submaps import Submap, VoxelSubmaps
 from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
+from scanchain.words import below
 
 _MIN_OVERLAP_ALONE = 0.8  # least overlap of a match that no expected pose supports
 _MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized place, as loops.min_… of others
@@ -93,7 +94,7 @@ class ScanVerifier:
         if not match.is_fit:
             return match.reason
         if overlap < min_overlap:
-            return f"overlap {overlap:.2f} < loops.min_overlap ({min_overlap:g})"
+            return f"overlap {below(overlap)} < loops.min_overlap ({min_overlap:g})"
         if information < limits.min_information:
             return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
         if moved_m > limits.max_radius_m:
@@ -140,11 +141,13 @@ class SubmapVerifier:
         if not match.is_fit:
             return match.reason
         if overlap < _MIN_PLACE_OVERLAP:
-            return f"overlap {overlap:.2f} < the least of a recognized place ({_MIN_PLACE_OVERLAP:g})"
+            return f"overlap {below(overlap)} < the least of a recognized place ({_MIN_PLACE_OVERLAP:g})"
         if information < _MIN_PLACE_INFORMATION:
             return f"information {information:.1e} < the least of a recognized place ({_MIN_PLACE_INFORMATION:g})"
         if agreement < _MIN_AGREEMENT:
-            return f"free-space agreement {agreement:.2f} < the least of a recognized place ({_MIN_AGREEMENT:g})"
+            return (
+                f"free-space agreement {below(agreement)} < the least of a recognized place ({_MIN_AGREEMENT:g})"
+            )
         return ""
 
 

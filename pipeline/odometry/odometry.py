@@ -225,10 +225,12 @@ class Odometry:
         """Refuse a first scan without a point at a distance that is used."""
         if len(sparse.points):
             return
+        if not len(scan.points):
+            raise InputError(f"scan {scan.index}, the first one, has no points; begin with one that has some")
         raise InputError(
             f"scan {scan.index} has none of its {len(scan.points)} points between preprocess.min_range_m "
             f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
-            f"({self.config.preprocess.max_range_m:g}); widen them"
+            f"({self.config.preprocess.max_range_m:g}); give meters, or widen them"
         )
 
 

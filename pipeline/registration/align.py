@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -111,7 +112,7 @@ def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> 
     units = lie.by_component(len(match.information), unit_m, 1.0)
     scaled = replace(
         match,
-        reason=match.reason if match.converged else f"{match.reason} (lengths in units of {unit_m:.3g} m)",
+        reason=match.reason if match.converged else _in_units_of(match.reason, unit_m),
         T_target_source=at_target @ _scaled(match.T_target_source, unit_m),
         information=match.information / np.outer(units, units),
         cost=match.cost * unit_m**2,
@@ -119,6 +120,13 @@ def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> 
         degeneracy_direction=units * match.degeneracy_direction,
     )
     return with_source_frame(scaled, at_source)
+
+
+def _in_units_of(reason: str, unit_m: float) -> str:
+    """A reason, its lengths in the unit of the clouds that came; without keys, which ``align`` does not take."""
+    named = re.sub(r"matching\.kernel_scale_m \((\S+)\)", r"the kernel scale of \1 m", reason)
+    named = re.sub(r"local_map\.voxel_size_m \((\S+)\)", r"voxel_size_m (\1 m)", named).replace("matching.", "")
+    return re.sub(r"([\d.e+-]*\d) m\b", lambda length: f"{float(length[1]) * unit_m:.3g}", named)
 
 
 def with_source_frame(match: Match, T_new_old: Pose) -> Match:

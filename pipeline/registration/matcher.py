@@ -7,6 +7,7 @@ from typing import Protocol
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
+from scanchain.registration.own_matcher import CheckedMatcher
 from scanchain.registration.voxel_map import VoxelMap
 
 
@@ -32,6 +33,8 @@ class Matcher(Protocol):
 
 
 def create_matcher(config: MatchingConfig) -> Matcher:
-    """The matcher that the configuration names. Raises InputError where a user's class cannot be loaded."""
+    """The matcher that the configuration names. Raises InputError where a user's class cannot be had."""
     checks.instance(config, MatchingConfig, "config", "load_settings(dimension).config.matching")
-    return plugins.load(MATCHERS.get(config.matcher, config.matcher), "align")(config)
+    name = config.matcher
+    kind = plugins.load(MATCHERS.get(name, name), "align")
+    return kind(config) if name in MATCHERS else CheckedMatcher(name, kind, config)

@@ -15,7 +15,7 @@ from scanchain.kernels.registration.icp import Settings
 from scanchain.kernels.registration.match import Result, match
 from scanchain.kernels.registration.optimizers import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from scanchain.registration.voxel_map import VoxelMap
-from scanchain.words import counted
+from scanchain.words import below, counted
 
 OPTIMIZERS = {
     "gradient-descent": GRADIENT_DESCENT,
@@ -147,8 +147,8 @@ def _contradiction(result: Result, config: MatchingConfig) -> str:
     """Reason why the correspondences contradict the pose, empty if they agree with it."""
     if result.fit < LEAST_FIT:
         return (
-            f"the correspondences contradict the pose: fit {result.fit:.2f} < {LEAST_FIT:g}, residuals along one "
-            f"direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})"
+            f"the correspondences contradict the pose: fit {below(result.fit)} < {LEAST_FIT:g}, residuals along "
+            f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})"
         )
     if result.residual_m > config.kernel_scale_m:
         return f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})"

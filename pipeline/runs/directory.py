@@ -106,8 +106,9 @@ class RunDirectory:
             self.destination.rename(self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}"))
         self.path.rename(self.destination)
         self.path = self.destination
-        for old in self.destination.parent.glob(f"{escape(self.destination.name)}.replaced-*"):
-            shutil.rmtree(old, ignore_errors=True)  # also one that a killed process left
+        left = [path for path in _partial(self.destination) if not _writer(path)]
+        for old in (*left, *self.destination.parent.glob(f"{escape(self.destination.name)}.replaced-*")):
+            shutil.rmtree(old, ignore_errors=True)  # also what a killed process left
 
 
 def left_behind(destination: Path) -> Path | None:
@@ -158,8 +159,9 @@ def _is_written_by(pid: int, run_file: Path) -> bool:
     """True if that process existed when the file was written; a later one has its number by chance."""
     try:
         process = psutil.Process(pid)
-        return process.status() != psutil.STATUS_ZOMBIE and process.create_time() < run_file.stat().st_mtime
-    except psutil.Error:
+        folder_or_file = run_file if run_file.exists() else run_file.parent  # which has just been made
+        return process.status() != psutil.STATUS_ZOMBIE and process.create_time() < folder_or_file.stat().st_mtime
+    except (psutil.Error, FileNotFoundError):
         return False
 
 

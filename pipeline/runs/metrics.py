@@ -238,7 +238,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         f"time           {m.run_s:.1f} s{m.compiling}, "
-        f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} x real time",
+        f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
         "  95th perc.   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),

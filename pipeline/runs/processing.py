@@ -73,8 +73,7 @@ def process(
             journal.append(steps.append(step))
             if checkpoints.are_due():
                 checkpoints.write(slam, recording.secure())
-        if progress.stopped:
-            checkpoints.write(slam, recording.secure())
+        checkpoints.write(slam, recording.secure())  # an interruption from here on loses no scan
         result = slam.finish(progress.say)
         final = final_verdicts(result.closures, result.state)
         progress.say("building the maps and writing the results")

@@ -43,6 +43,7 @@ from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _RECORDING_KEYS = RecordingConfig.__struct_fields__
+_FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
 
@@ -82,6 +83,8 @@ def run(
     _check_prior(log, settings.config)
     _check_truth(job, log, truth_file)
     progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
+    for gap in log.gaps:
+        progress.announce(f"warning: {gap}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
     started -= 0.0 if left is None else left.checkpoint.run_s
@@ -99,7 +102,8 @@ def run(
             with directory.results() as folder:
                 source = str(job.ground_truth or log.ground_truth_topic)
                 truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
-                warnings = (*log.damage, *settings.without_effect, *done.warnings, *note)
+                few = _few_scans(len(steps))
+                warnings = (*log.damage, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.final, judge_run(directory.path),
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
@@ -121,7 +125,8 @@ def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
         progress.announce(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")
     elif (idle := resumable(job.out)) is not None:
         progress.announce(
-            f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over"
+            f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
+            "removes it once complete"
         )
     elif job.resume and (partial_names := left_without_checkpoint(job.out)):
         progress.announce(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
@@ -184,6 +189,13 @@ def _judge(
     except InputError as error:
         return None, (f"no accuracy against {source}: {error}",)
     return truth, tuple(filter(None, (truth.complaint, *misleading)))
+
+
+def _few_scans(count: int) -> tuple[str, ...]:
+    """Warning about a trajectory of one or two scans."""
+    if count > _FEW_SCANS:
+        return ()
+    return (f"a trajectory of {counted(count, 'scan')} says nothing about the log; check --start, --end, --every",)
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:

@@ -736,7 +736,7 @@ def test_truth_at_another_rate_judges_every_scan_that_it_spans(call, tmp_path, o
     says(output, found["missing"], "interpolated (position linear, rotation by SLERP, gaps up to 0.6 s)")
 
 
-def test_a_truth_of_few_scans_is_a_warning_that_says_why(call, tmp_path, office):
+def test_a_truth_of_few_scans_is_a_warning_that_says_why(call, tmp_path, office, monkeypatch):
     truth = read_tum(office.with_suffix(".tum"))
     write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[10:30], truth.poses[10:30]))
     words = ["run", office, "--out", tmp_path / "a", "--rerun", "off", "--gt", tmp_path / "part.tum"]
@@ -745,6 +745,9 @@ def test_a_truth_of_few_scans_is_a_warning_that_says_why(call, tmp_path, office)
     assert code == 0 and errors.startswith(f"warning: {few}")
     says(output, f"warning        {few}")
     assert metrics(tmp_path / "a")["warnings"] == [errors.removeprefix("warning: ").strip()]
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    code, output, errors = call(*words, "--force")
+    assert output.count(few) == 1 and errors == ""  # a terminal shows both, and the summary has it
 
 
 def interpolated_at(truth, stamps_ns):

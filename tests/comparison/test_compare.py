@@ -4,13 +4,14 @@ import csv
 import itertools
 import json
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from scanchain import lie
 from scanchain.__main__ import main
-from scanchain.comparison.compare import Comparison, compare
+from scanchain.comparison.compare import Compared, Comparison, compare
 from scanchain.comparison.figures import COLUMNS, Figures
 from scanchain.comparison.methods import OURS, default_names, resolve
 from scanchain.comparison.outcome import EndReport, Outcome, Status
@@ -161,6 +162,25 @@ def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(offic
     assert "pip install 'scanchain[baselines]'" in row(table, "kiss-icp").reason
     assert row(table, "plicp").status is Status.OK
     assert "not installed" in text(table) and "pip install" in markdown(table)
+    missing = row(table, "kiss-icp")
+    lines = text(
+        msgspec.structs.replace(table, rows=[*table.rows, msgspec.structs.replace(missing, name="genz-icp")])
+    ).splitlines()
+    (line,) = [each for each in lines if "-icp" in each]
+    assert line == "not installed: kiss-icp, genz-icp; pip install 'scanchain[baselines]'"
+
+
+def test_an_unreliable_result_is_exit_code_1(office, good, monkeypatch, capfd):
+    table, folder = good
+    doubted = [
+        msgspec.structs.replace(each, verdict="not trustworthy", verdict_reason="most are lost")
+        for each in table.rows[:1]
+    ]
+    for rows, code in ((table.rows, 0), ([*doubted, *table.rows[1:]], 1)):
+        compared = Compared(folder, msgspec.structs.replace(table, rows=rows))
+        monkeypatch.setattr("scanchain.comparison.compare.compare", lambda *_, done=compared: done)
+        assert main(["compare", str(office), "--out", str(folder)]) == code
+    assert "error: not trustworthy: plicp; see the table for the reason" in capfd.readouterr().err
 
 
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):

@@ -108,7 +108,7 @@ def test_no_files_at_all():
 
 def test_a_log_without_lidar_lists_what_it_holds(tmp_path):
     path = write(tmp_path / "a.mcap", [odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0))])
-    says(complaint(path), "lidar", "/odom", "nav_msgs/msg/Odometry")
+    says(complaint(path), "lidar", "/odom", "nav_msgs/Odometry")
 
 
 def test_a_log_without_messages(tmp_path):
@@ -118,12 +118,12 @@ def test_a_log_without_messages(tmp_path):
 
 def test_a_topic_that_is_absent_lists_what_there_is(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
-    says(complaint(path, topic="/velodyne"), "/velodyne", "--topic", "/scan", "sensor_msgs/msg/LaserScan")
+    says(complaint(path, topic="/velodyne"), "/velodyne", "--topic", "/scan", "sensor_msgs/LaserScan")
 
 
 def test_a_topic_that_is_no_lidar_says_what_it_is(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
-    says(complaint(path, topic="/odom"), "/odom", "nav_msgs/msg/Odometry", "/scan")
+    says(complaint(path, topic="/odom"), "/odom", "nav_msgs/Odometry", "/scan")
 
 
 def test_several_lidars_are_listed(tmp_path):
@@ -140,7 +140,7 @@ def test_several_logs_with_a_lidar_each_are_all_named_with_their_topics(tmp_path
         for name in ("front", "rear", "top")
     ]
     says(complaint(*paths[:2]), f"{paths[0]} and {paths[1]}, read as one log: has several lidar topics")
-    says(complaint(*paths[:2]), "/front (sensor_msgs/msg/LaserScan) in front.mcap, /rear", ") in rear.mcap")
+    says(complaint(*paths[:2]), "/front (sensor_msgs/LaserScan) in front.mcap, /rear", ") in rear.mcap")
     for config, complained in (
         ({"topic": "/nope"}, "has no topic /nope"),
         ({"odometry_topic": "/nope", "topic": "/top"}, "/nope"),

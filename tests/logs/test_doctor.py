@@ -111,10 +111,11 @@ def test_a_slow_log_without_wheels_is_noted_and_searched_wide_in_space(tmp_path)
     said = [cloud_said(STAMP_NS + k * SECOND, point_cloud(STAMP_NS + k * SECOND, sweep(k))) for k in range(5)]
     path = saved(tmp_path, said)
     finding = diagnose(path)["rate"]
-    assert finding.remedy == "--matching.wide_max_distance_m 8"
+    assert finding.remedy == "--matching.wide_max_distance_m 8" and finding.severity == "warning"
     wide = configured(3, {"matching.wide_max_distance_m": 8.0})
     findings = examine([path], lambda _: wide, LogConfig()).findings
-    assert next(each for each in findings if each.check == "rate").remedy == ""
+    rate = next(each for each in findings if each.check == "rate")
+    assert rate.remedy == "" and rate.severity == "note"  # with the flag the warning is gone
 
 
 def test_the_scans_looked_at_are_those_that_a_run_would_take(tmp_path):
@@ -133,9 +134,14 @@ def test_a_gap_is_found_where_it_is(tmp_path):
         and finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
     )
     assert finding.remedy == "--end 1.9" and "at constant velocity" in finding.effect
-    assert "--start 4, apart" in finding.effect
+    assert "run what comes before it, as below, and the rest, --start 4, apart" in finding.effect
     on_wheels = diagnose(saved(tmp_path, drive(stamp=hole, log=hole, wheels=True)))["gaps"]
     assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
+    unused = configured(2, {"odometry.prior": "constant-velocity"})
+    path = saved(tmp_path, drive(stamp=hole, log=hole, wheels=True))
+    findings = examine([path], lambda _: unused, LogConfig()).findings
+    without = next(each for each in findings if each.check == "gaps")
+    assert (without.severity, without.effect) == (finding.severity, finding.effect)
     later = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)), start_s=1.0)["gaps"]
     assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
@@ -446,10 +452,11 @@ def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, cap
     said = drive(wheels=True)
     other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
     truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
-    path = saved(tmp_path, [*said, *other, truth])
-    assert main(["info", str(path)]) == 0
+    path = saved(tmp_path, [*said, *other, truth, odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/gps")])
+    assert main(["info", str(path)]) == 1
     text = capfd.readouterr().out
-    assert "several lidar topics" in text and "wheels    /odom\n" in text
+    assert "several lidar topics" in text
+    assert "sensor    poses /gps: not used; --gt /gps takes them as the truth\n" in text
     assert "sensor    ground truth /ground_truth: evaluates the result, is not used for it\n" in text
 
 

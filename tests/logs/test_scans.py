@@ -15,6 +15,7 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from scanchain.logs.info import describe
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.opening import index_files
 from scanchain.simulation import simulate
@@ -180,14 +181,30 @@ def test_a_long_gap_between_two_files_of_a_log_is_a_note(tmp_path):
     hour_ns = 3600 * SECOND
     paths = [
         write(tmp_path / name, office(40, begin_ns=begin_ns))
-        for name, begin_ns in (("a.mcap", STAMP_NS + 26 * hour_ns), ("b.mcap", STAMP_NS))
+        for name, begin_ns in (("a.mcap", STAMP_NS + 23 * hour_ns), ("b.mcap", STAMP_NS))
     ]
     note = next(note for note in open_log(paths).notes if note.startswith("no message for "))
-    assert note.startswith("no message for 1.1 days from 3.9 s on between b.mcap and a.mcap: read as one log ")
-    for config in (LogConfig(end_s=3.0), LogConfig(start_s=26 * 3600.0)):
+    assert note.startswith("no message for 23.0 h from 3.9 s on between b.mcap and a.mcap: read as one log ")
+    for config in (LogConfig(end_s=3.0), LogConfig(start_s=23 * 3600.0)):
         assert not any("no message" in note for note in open_log(paths, config).notes)
     write(paths[0], office(40, begin_ns=STAMP_NS + 10 * SECOND))
     assert not any("no message" in note for note in open_log(paths).notes)
+
+
+def test_files_more_than_a_day_apart_are_not_read_as_one_log(tmp_path):
+    year_ns = round(365.25 * 86_400) * SECOND
+    for name, begin_ns in (("intel.mcap", STAMP_NS + 2 * year_ns), ("aces.mcap", STAMP_NS)):
+        write(tmp_path / name, office(40, begin_ns=begin_ns))
+    line = (
+        r"aces.mcap ends 2.0 years before .*intel.mcap begins: they are not parts of one log; run each by itself"
+    )
+    with pytest.raises(InputError, match=line):
+        open_log(tmp_path)
+    assert line[:9] in describe([tmp_path]).problem
+    assert open_log(tmp_path, LogConfig(end_s=3.0)).scan_count < 40
+    mounts = transforms_said(STAMP_NS - year_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))
+    calibration = write(tmp_path / "calibration.mcap", [mounts])  # which holds no scan
+    assert open_log([calibration, tmp_path / "aces.mcap"]).scan_count == 40
 
 
 def test_opening_decodes_no_scan_twice(tmp_path, monkeypatch):
@@ -537,7 +554,7 @@ def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_pat
     for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
         assert main([str(word) for word in words]) == 2
         assert capfd.readouterr().err == f"error: {caught.value}\n"
-    assert main(["info", str(path)]) == 0
+    assert main(["info", str(path)]) == 1
     assert f"problem   {caught.value}" in capfd.readouterr().out
 
 

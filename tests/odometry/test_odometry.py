@@ -223,8 +223,10 @@ def test_in_a_blank_corridor_the_wheels_lead_along_it_and_the_scans_across(corri
 
 def test_a_scan_with_nothing_in_range_names_the_limits(office):
     scans, T_base_lidar, _ = office
-    with pytest.raises(InputError, match=r"scan 0 has none of its \d+ points .*preprocess\.max_range_m"):
+    with pytest.raises(InputError, match=r"scan 0 has none of its \d+ points .*; give meters, or widen"):
         tracked(scans[:1], T_base_lidar, configured(2, {"preprocess.max_range_m": 0.06}))
+    with pytest.raises(InputError, match="the first one, has no points; begin with one that has some"):
+        Odometry(dimension=3).track(np.empty((0, 3)), 0.0)
 
 
 def test_wheels_asked_for_but_absent_are_named(office):

@@ -10,6 +10,8 @@ from scanchain import lie
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
+from scanchain.registration.align import _in_units_of
+from scanchain.words import below
 from tests.support.scenes import configured, kitti_scans, shared_data
 
 CSAIL, KITTI = "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"
@@ -81,7 +83,16 @@ def test_another_place_and_too_far_a_motion_do_not_converge():
     for target, source in ((sweeps[0], elsewhere), (sweeps[0], sweeps[6])):
         match = scanchain.align(target, source)
         assert not match.converged
-        assert "units of" in match.reason
+        assert "matching." not in match.reason and "units of" not in match.reason
+
+
+def test_a_reason_is_in_the_unit_of_the_clouds_and_never_reads_like_its_limit():
+    reason = (
+        "residuals are far above matching.kernel_scale_m (0.2); lower local_map.voxel_size_m (1), spread over 3 m"
+    )
+    told = "residuals are far above the kernel scale of 0.4; lower voxel_size_m (2), spread over 6"
+    assert _in_units_of(reason, 2.0) == told
+    assert (below(0.5999), below(0.12)) == ("0.59", "0.12")
 
 
 CLOUD = np.random.default_rng(0).normal(size=(500, 3))

@@ -9,9 +9,9 @@ import pytest
 from scanchain.comparison.methods import resolve
 from scanchain.comparison.outcome import Status
 from scanchain.comparison.table import read_table
-from scanchain.config import MatchingConfig
+from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.errors import InputError
-from scanchain.registration import create_matcher
+from scanchain.registration import VoxelMap, create_matcher
 from scanchain.simulation import simulate
 from tests.support.killing import same_result, wait_for_steps
 
@@ -152,6 +152,37 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, n
     with pytest.raises(InputError) as raised:
         create_matcher(MatchingConfig(matcher=name))
     assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "def __init__(self, config):",
+            "def __init__(self):",
+            r"cannot be made with a MatchingConfig \(TypeError",
+        ),
+        (
+            "return Match(",
+            "return T; Match(",
+            r"align returned an array of the shape \(3, 3\); wanted a scanchain.Match",
+        ),
+        ("information=np.eye(k)", "information=np.eye(6)", r"information has the shape \(6, 6\); wanted \(3, 3\)"),
+        ("T_target_source=T,", "T_target_source=2.0 * T,", "T_target_source is no rigid transformation"),
+        ("inliers=inliers,", "inliers=None,", "inliers is None; wanted a whole number"),
+        ("fit=1.0,", "fit='good',", "fit is 'good'; wanted a number"),
+    ],
+)
+def test_one_that_returns_something_else_is_one_line_that_names_it(folder, monkeypatch, old, new, words):
+    module = f"own_{abs(hash(new))}"
+    (folder / f"{module}.py").write_text(MATCHER.replace(old, new))
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    wall = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
+    target = VoxelMap(2, LocalMapConfig())
+    target.insert(wall, np.eye(3))
+    with pytest.raises(InputError, match=f"^{module}:PointToPoint.*{words}"):
+        create_matcher(MatchingConfig(matcher=f"{module}:PointToPoint")).align(wall, target, np.eye(3))
 
 
 def test_the_working_directory_comes_last(folder, monkeypatch):

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -19,6 +20,7 @@ from scanchain.api import open_recorder
 from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.metrics import summary
 from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
@@ -248,7 +250,7 @@ def test_a_run_that_the_user_stops_says_that_it_used_the_wheels(tmp_path, office
 
 def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback(tmp_path, office):
     with pytest.raises(
-        PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then"
+        PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then are in"
     ) as e:
         run(job(office, tmp_path / "a"), open_recorder, Watcher(20, RuntimeError("boom")))
     folder = partial_in(tmp_path)
@@ -278,7 +280,9 @@ def test_what_ends_a_run_before_its_first_scan_leaves_nothing(tmp_path, office, 
 
 
 def test_a_bug_before_the_first_scan_leaves_its_traceback_alone(tmp_path, office):
-    with pytest.raises(PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans"):
+    with pytest.raises(
+        PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans until then are in"
+    ):
         run(job(office, tmp_path / "a"), open_recorder, Watcher(0, ZeroDivisionError("boom")))
     folder = partial_in(tmp_path)
     assert "ZeroDivisionError" in (folder / "traceback.txt").read_text()
@@ -329,15 +333,44 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_
         InputError, match=rf"{left.name}: exists; .*: --out {tmp_path / 'a'} --resume continues it"
     ):
         RunDirectory(left, force=False)
-    told = Telling()
-    run(job(office, tmp_path / "a"), open_recorder, told)
-    assert f"{left.name} is of a run that was stopped; --resume would continue it" in "\n".join(told.lines)
+    an_old_run(tmp_path / "a")
     with pytest.raises(
         InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume continues"
     ):
         RunDirectory(tmp_path / "a", force=False)
     resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Unwatched())
     assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
+
+
+def test_a_complete_run_removes_what_earlier_ones_left_but_not_what_another_process_writes(tmp_path, office):
+    for name in (f"a.partial-{_NO_PROCESS}", f"a.partial-{os.getppid()}", f"b.partial-{_NO_PROCESS}"):
+        an_old_run(tmp_path / name)
+    (tmp_path / f"a.partial-{_NO_PROCESS}" / "state.checkpoint").touch()
+    told = Telling()
+    run(job(office, tmp_path / "a"), open_recorder, told)
+    assert "--resume would continue it, this run starts over and removes it once complete" in "\n".join(told.lines)
+    assert names(tmp_path) == ["a", f"a.partial-{os.getppid()}", f"b.partial-{_NO_PROCESS}"]
+
+
+def test_interrupted_while_it_optimizes_a_run_can_be_resumed(tmp_path, office):
+    class Interrupted(Unwatched):
+        def say(self, line):
+            if line.startswith("optimizing"):
+                raise KeyboardInterrupt
+
+    with pytest.raises(PartialRunError, match=r"interrupted; 60 scans until then are in .*; to resume: "):
+        run(job(office, tmp_path / "a"), open_recorder, Interrupted())
+    told = Telling()
+    run(job(office, tmp_path / "a", resume=True), open_recorder, told)
+    assert any(line.startswith("resuming after 60 scans") for line in told.lines)
+
+
+def test_a_trajectory_of_a_few_scans_is_warned_of(tmp_path, office):
+    for scans, words in ((1, "trajectory of 1 scan says"), (2, "trajectory of 2 scans says"), (3, "")):
+        few = (Override("log.every", str(60 // scans), "--every"),)
+        finished = run(job(office, tmp_path / str(scans), overrides=few), open_recorder, Unwatched())
+        warnings = " ".join(finished.warnings)
+        assert words in warnings and ("nothing about the log" in warnings) == (scans < 3)
 
 
 def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
@@ -349,7 +382,10 @@ def test_every_stage_after_the_last_scan_is_told_as_it_begins(tmp_path, office):
 
 
 def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
-    text = run(job(office, tmp_path / "a"), open_recorder, Watcher(3)).summary
+    finished = run(job(office, tmp_path / "a"), open_recorder, Watcher(3))
+    text = finished.summary
+    slow = msgspec.structs.replace(finished.metrics, scans_per_s=1.2)
+    assert ", 1 scan/s, " in summary(slow, "", "", ())
     assert "1 keyframe\n" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 

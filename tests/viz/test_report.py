@@ -6,9 +6,11 @@ import re
 import subprocess
 from base64 import b64decode, b64encode
 from hashlib import sha256
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -23,6 +25,7 @@ from scanchain.simulation import simulate
 from scanchain.viz.pictures.map_figures import surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
 from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.sections import loop_section
 from scanchain.viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
 from tests.support.browser import find_browser, look
 from tests.support.scenes import ROOT
@@ -111,6 +114,18 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
     for column in COLUMNS:
         for cell in column.cells(table.figures):
             assert cell.text in seen["text"], column.key
+
+
+def test_without_a_loop_closure_the_report_says_why_none_was_tried(tmp_path):
+    schema = pa.schema([("target_scan", pa.int64())])
+    pq.write_table(schema.empty_table(), tmp_path / "loops.parquet")
+    for length_m, reason in (
+        (9.0, "the trajectory is 9.0 m long, and a loop has more than 30 m"),
+        (90.0, "the trajectory did not return to a place visited more than 30 m before"),
+    ):
+        trajectory = SimpleNamespace(distance_m=np.array([0.0, length_m]))
+        (section,) = loop_section(trajectory, tmp_path / "loops.parquet", "Loop closures", 30.0)
+        assert section.text == f"None was tried: {reason} (loops.min_travel_m)."
 
 
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):

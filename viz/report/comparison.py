@@ -148,11 +148,13 @@ def _sections(
         yield from time_section(drawn)
         yield from uncertainty_section(drawn, is_planar=is_planar)
         yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
+    settings = {row.name: row.settings for row in table.rows}
     for trajectory in trajectories:
         yield from loop_section(
             trajectory,
             method_folder(directory, trajectory.name) / CLOSURES_FILE,
             f"Loop closures of {trajectory.name}",
+            float(settings[trajectory.name].get("loops", {}).get("min_travel_m", 0.0)),
         )
     if len(table.rows) > 1:
         yield _disagreement(table)

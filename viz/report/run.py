@@ -86,7 +86,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     )
     yield "map", counted(m.map_points, "point")
     yield "configuration", made.configuration
-    yield "speed", f"{m.scans_per_s:.0f} scans/s, {m.times_real_time:.1f} × real time{m.compiling}"
+    yield "speed", f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"
 
 
@@ -122,7 +122,9 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     yield trajectory_section(trajectories[0], tables, true_path, points, grain_m)
     yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
-        yield from loop_section(trajectories[0], loops_file, "Loop closures")
+        yield from loop_section(
+            trajectories[0], loops_file, "Loop closures", float(str(config["loops.min_travel_m"]))
+        )
     text = (
         "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."
         if truth is not None

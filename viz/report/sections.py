@@ -137,13 +137,17 @@ def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) ->
         )
 
 
-def loop_section(trajectory: DrawnTrajectory, path: Path, title: str) -> Iterator[Section]:
-    """Every loop closure tried, and the number of each verdict."""
+def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel_m: float) -> Iterator[Section]:
+    """Every loop closure tried, and the number of each verdict; ``min_travel_m`` is ``loops.min_travel_m``."""
     if not path.exists():
         return
     table = pq.ParquetFile(path).read()  # read_table imports much more
     if not table.num_rows:
-        yield Section(title, "None was tried: the trajectory did not return to a place visited before.")
+        length_m = float(trajectory.distance_m[-1])
+        reason = f"the trajectory did not return to a place visited more than {min_travel_m:g} m before"
+        if length_m <= min_travel_m:
+            reason = f"the trajectory is {length_m:.1f} m long, and a loop has more than {min_travel_m:g} m"
+        yield Section(title, f"None was tried: {reason} (loops.min_travel_m).")
         return
     ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
     rejected_by = np.array(table["rejected_by"].to_pylist())

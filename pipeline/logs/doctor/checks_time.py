@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.config import MatchingConfig
+from scanchain.config import Config, MatchingConfig
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import Survey
 from scanchain.logs.messages.point_times import UNITS_S
@@ -29,10 +29,11 @@ _SURE = 0.9  # least share of the scans that turn alike, and least agreement of 
 _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 
 
-def check_time(seen: Survey, matching: MatchingConfig) -> Iterator[Finding]:
-    """Every finding about time. ``matching`` is what a run of this log would use."""
-    yield _rate(seen, matching)
-    yield _gaps(seen)
+def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
+    """Every finding about time. ``config`` is what a run of this log would use."""
+    is_on_wheels = bool(seen.wheels) and config.odometry.prior != "constant-velocity"
+    yield _rate(seen, config.matching, is_on_wheels)
+    yield _gaps(seen, is_on_wheels)
     yield _jitter(seen)
     yield _order(seen)
     yield _clock(seen)
@@ -41,19 +42,20 @@ def check_time(seen: Survey, matching: MatchingConfig) -> Iterator[Finding]:
         yield _point_times(seen)
 
 
-def _rate(seen: Survey, matching: MatchingConfig) -> Finding:
+def _rate(seen: Survey, matching: MatchingConfig, is_on_wheels: bool) -> Finding:
     rate_hz = 1.0 / seen.period_s if seen.period_s else 0.0
     found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
-    if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not seen.wheels:
+    if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not is_on_wheels:
         effect = "the motion between two scans is long and predicted without wheels; the first ones may be missed"
         remedy = f"--matching.wide_max_distance_m {_WIDE_M}"
         is_wide = matching.wide_max_distance_m >= _WIDE_M
         is_of_use = seen.log.dimension == 3 and not is_wide  # the plane is searched by correlation instead
-        return Finding("rate", Severity.NOTE, found, effect, remedy if is_of_use else "")
+        severity = Severity.WARNING if is_of_use else Severity.NOTE
+        return Finding("rate", severity, found, effect, remedy if is_of_use else "")
     return Finding("rate", Severity.OK, found)
 
 
-def _gaps(seen: Survey) -> Finding:
+def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     steps_s = np.diff(seen.log_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
     periods, off_s = _periods(seen)
@@ -71,12 +73,13 @@ def _gaps(seen: Survey) -> Finding:
         f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
         f"{at_s:.1f} s into the log{absent}"
     )
-    predicted = f"the motion over a gap is predicted {'by the wheels' if seen.wheels else 'at constant velocity'}"
-    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if seen.wheels else _LONG_GAP_S):
+    predicted = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
+    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
         return Finding("gaps", Severity.NOTE, found, predicted)
     until_s, again_s = math.ceil(10.0 * at_s) / 10.0, math.floor(10.0 * (at_s + steps_s[longest])) / 10.0
     effect = (
-        f"{predicted}; after a long one the match may settle elsewhere: run the rest, --start {again_s:g}, apart"
+        f"{predicted}; after a long one the match may settle elsewhere: run what comes before it, as below, and "
+        f"the rest, --start {again_s:g}, apart"
     )
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
 

@@ -46,7 +46,7 @@ def examine(
     notes = tuple(log.notes)
     seen = survey(log, progress)
     config = config_of(log.dimension)
-    findings = [*check_time(seen, config.matching), *check_scans(seen, config.preprocess), _sensors(log)]
+    findings = [*check_time(seen, config), *check_scans(seen, config.preprocess), _sensors(log)]
     ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())
 

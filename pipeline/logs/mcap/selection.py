@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -38,6 +38,7 @@ class Span(NamedTuple):
 
 
 _LONG_GAP_NS = 60_000_000_000  # without any message
+_LONGEST_GAP_NS = 86_400_000_000_000  # without any message between two files of one log
 
 EVERYTHING = Span(0, (1 << 64) - 1)
 
@@ -58,27 +59,63 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
     return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
 
 
+class Gap(NamedTuple):
+    """A part of a log without any message, and the numbers of the files before and behind it."""
+
+    span: Span
+    before: int
+    behind: int
+
+
 def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
-    whole = whole_span(indexes)
-    span, notes = chosen_span(whole, config), []
-    if whole.duration_s < config.end_s < inf:
-        notes.append(f"--end {config.end_s:g} s has no effect: the log ends at {whole.duration_s:.1f} s")
-    end_ns, before = None, None
-    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
-        if not span.meets(block):
-            continue
-        if end_ns is not None and before is not None and block.start_ns - end_ns > _LONG_GAP_NS:
-            files = [indexes[number].path.name for number in (before, block.file)]
-            where = f" between {files[0]} and {files[1]}" if files[0] != files[1] else ""
-            notes.append(
-                f"no message for {duration(1e-9 * (block.start_ns - end_ns))} from "
-                f"{1e-9 * (end_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
-                "--start and --end choose a part"
+    whole_s = whole_span(indexes).duration_s
+    is_beyond = whole_s < config.end_s < inf
+    beyond = f"--end {config.end_s:g} s has no effect: the log ends at {whole_s:.1f} s"
+    return [*([beyond] if is_beyond else []), *gap_notes(indexes, config)]
+
+
+def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
+    """Warnings about gaps of more than a minute in the chosen part."""
+    whole, notes = whole_span(indexes), []
+    for gap in _long_gaps(indexes, config):
+        files = [indexes[number].path.name for number in (gap.before, gap.behind)]
+        where = f" between {files[0]} and {files[1]}" if gap.before != gap.behind else ""
+        notes.append(
+            f"no message for {duration(gap.span.duration_s)} from "
+            f"{1e-9 * (gap.span.begin_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
+            "--start and --end choose a part"
+        )
+    return notes
+
+
+def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config: LogConfig) -> None:
+    """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
+
+    scanned : numbers of the files with scans; others, as of a calibration, may be of any time
+    """
+    for gap in _long_gaps(indexes, config, scanned):
+        if gap.before != gap.behind and gap.span.end_ns - gap.span.begin_ns > _LONGEST_GAP_NS:
+            before, behind = (indexes[number].path for number in (gap.before, gap.behind))
+            raise InputError(
+                f"{before} ends {duration(gap.span.duration_s)} before {behind} begins: they are not parts of one "
+                "log; run each by itself, or all of them with scanchain batch"
             )
+
+
+def _long_gaps(
+    indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
+) -> Iterator[Gap]:
+    """Gaps of more than a minute in the chosen part, or in that of some files."""
+    span = chosen_span(whole_span(indexes), config)
+    end_ns, before = None, 0
+    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
+        if not span.meets(block) or (files is not None and block.file not in files):
+            continue
+        if end_ns is not None and block.start_ns - end_ns > _LONG_GAP_NS:
+            yield Gap(Span(end_ns, block.start_ns), before, block.file)
         if end_ns is None or block.end_ns > end_ns:
             end_ns, before = block.end_ns, block.file
-    return notes
 
 
 def _timed(indexes: Sequence[FileIndex]) -> list[Block]:

@@ -42,15 +42,15 @@ def rescued(
         error.filename = str(directory.destination)
     reason = _reason(error)
     what = "traceback.txt and the " if is_bug else ""
-    until = f"{counted(len(steps), 'scan')} until then {'is' if len(steps) == 1 else 'are'}"
-    where = f"{what}{until} in {directory.path}"
+    until, is_or_are = f"{counted(len(steps), 'scan')} until then", "is" if len(steps) == 1 else "are"
+    where = f"{what}{until} {'are' if is_bug else is_or_are} in {directory.path}"
     try:
         _keep(
             error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
         )
     except OSError as failure:
         why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
-        where = f"{until} in {directory.path / JOURNAL_FILE} alone{why}"
+        where = f"{until} {is_or_are} in {directory.path / JOURNAL_FILE} alone{why}"
     if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
         where += f"; {how_to_resume(provenance.command)}"
     if isinstance(error, InputError):
