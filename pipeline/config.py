@@ -134,7 +134,7 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
     sensor_noise_m : standard deviation of a range, which scales information and covariance
     min_inlier_share : share of the points with a correspondence below which a scan is lost
     min_information : information per inlier, 0 to 1, below which a direction is degenerate
-    min_signal : signal-to-noise ratio of the information below which a direction of a 3D scan is degenerate,
+    min_signal : signal-to-noise ratio of the information below which a direction is degenerate,
         noise being what errors of the map's normals alone would induce
     """
 
