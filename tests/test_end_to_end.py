@@ -56,7 +56,8 @@ class Drive:
 
     @property
     def steps(self):
-        return {name: np.array(rows) for name, rows in self.table("steps").to_pydict().items()}
+        columns = self.table("steps").to_pydict()
+        return {name: np.array(rows) for name, rows in columns.items() if None not in rows}
 
     @property
     def truth(self):
