@@ -101,6 +101,7 @@ class State(StrEnum):
     """Reliability of a pose."""
 
     OK = "ok"
+    CONTRADICTED = "contradicted"
     DEGENERATE = "degenerate"
     LOST = "lost"
 

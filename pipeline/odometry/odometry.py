@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Match, Points, Pose, RawPoints, Scan, State
+from scanchain.data import LEAST_FIT, Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.live_stamps import LiveStamps
@@ -114,7 +114,7 @@ class Odometry:
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
             match=registered.match,
-            state=State.LOST if registered.elsewhere_m > 0.0 else registered.state,
+            state=_reported(registered),
             reason=registered.reason,
             prior=prediction.prior,
             preprocess_s=prepared - started,
@@ -232,6 +232,14 @@ class Odometry:
             f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
             f"({self.config.preprocess.max_range_m:g}); give meters, or widen them"
         )
+
+
+def _reported(registered: _Registered) -> State:
+    """State of a scan as it is reported: of a new map, lost; of a pose that its correspondences contradict, so."""
+    if registered.elsewhere_m > 0.0:
+        return State.LOST
+    is_contradicted = registered.state is State.OK and registered.match.fit < LEAST_FIT
+    return State.CONTRADICTED if is_contradicted else registered.state
 
 
 def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: int | None) -> tuple[Config, Pose]:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from scanchain.data import LEAST_FIT, State, Trajectory, fit_text
+from scanchain.data import State, Trajectory, fit_text
 from scanchain.errors import InputError
 from scanchain.evaluation import Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.absolute import far_off, path_length
@@ -167,7 +167,6 @@ def measure(
     matches = [row.match for row in steps.rows]
     residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
-    contradicted = sum(row.state is State.OK and row.match.fit < LEAST_FIT for row in steps.rows)
     stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
@@ -182,8 +181,8 @@ def measure(
         traveled_m=float(path_length(result.trajectory.poses)[-1]),
         scan_points=sum(row.points for row in steps.rows),
         dropped_points=sum(row.dropped for row in steps.rows),
-        ok=states[State.OK] - contradicted,
-        contradicted=contradicted,
+        ok=states[State.OK],
+        contradicted=states[State.CONTRADICTED],
         degenerate=states[State.DEGENERATE],
         lost=states[State.LOST],
         keyframes=len(result.keyframes),

@@ -243,3 +243,19 @@ def test_a_map_forgets_what_is_far_and_what_is_old():
     for _ in range(80):
         standing.insert(np.array([[1.0, 1.0]]), lie.identity(2))
     assert len(standing) == 1
+
+
+@pytest.mark.parametrize("is_measured", [True, False])
+def test_along_a_bare_corridor_of_the_plane_a_measured_motion_holds_and_any_is_degenerate(is_measured):
+    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.2))
+    for seed in range(6):
+        target.insert(dented_corridor(0, seed), lie.identity(2))
+    expected = lie.pose_2d(0.05, 0.0, 0.0)
+    prior = Prior(expected, np.diag([0.01, 0.01, 0.005]) ** 2, np.array([0.5, 0.5, 0.2]), is_measured=is_measured)
+    config = MatchingConfig(max_distance_m=0.5, kernel_scale_m=0.1, min_information=0.0)
+    match = create_matcher(config).align(dented_corridor(0, seed=99), target, expected, prior)
+    assert match.observability < 1.0 and not match.converged
+    assert abs(match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
+    sigma_m = np.sqrt(np.linalg.inv(match.information + 1e-6 * np.eye(3))[0, 0])
+    if is_measured:  # stays where the wheels have it, and does not claim to have measured it
+        assert match.T_target_source[0, 2] == pytest.approx(0.05, abs=0.005) and sigma_m > 0.01

@@ -272,7 +272,7 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
 
 
 def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_told_apart():
-    states = ["ok"] * 10 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
+    states = ["contradicted"] * 2 + ["ok"] * 8 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
     keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
     fits = [0.3] * 2 + [0.9] * 38
     steps = pa.table({"state": states, "keyframe": keyframes, "fit": fits})
@@ -297,7 +297,9 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
 
 
 def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
-    ranges_m = np.random.default_rng(0).normal(3.0, 0.01, 181)
+    angles = np.linspace(-np.pi / 2.0, np.pi / 2.0, 181)  # of a square room: a round one leaves the heading open
+    ranges_m = 3.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    ranges_m += np.random.default_rng(0).normal(0.0, 0.01, 181)
     with LogWriter(tmp_path / "still.mcap") as log:
         for k in range(8):
             stamp_ns = 10**18 + k * 10**8

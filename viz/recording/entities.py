@@ -112,7 +112,7 @@ def _series() -> list[Message]:
         OBSERVABILITY: "log10 observability",
         ITERATIONS: "iterations",
     }
-    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, ORANGE, RED])
+    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
     return [
         Message(TIME, rr.SeriesLines(names=stages, colors=colors)),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from scanchain.data import LEAST_FIT, Points, State
+from scanchain.data import Points, State
 from scanchain.runs.closures import BACK_END
 from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures import trajectory_figures as figures
@@ -24,11 +24,11 @@ from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTraj
 from scanchain.viz.report.page import Chip, Drawing, Section
 from scanchain.words import counted
 
-_CONTRADICTED, _DISPUTED = "contradicted", "at closures rejected by the back end"
+_DISPUTED = "at closures rejected by the back end"
 _COLORS = {
     State.DEGENERATE: "#d98200",
     State.LOST: "#d6453d",
-    _CONTRADICTED: "#a55bd6",
+    State.CONTRADICTED: "#a55bd6",
     _DISPUTED: "#075e70",
     Kind.WHEELS: "#d6308f",
     Kind.ACCELERATION: "#8a1c1c",
@@ -122,7 +122,6 @@ def _states(tables: Tables) -> NDArray[np.int64]:
     names = list(_COLORS)
     states = tables.steps["state"].to_pylist()
     marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
-    marks[(marks < 0) & (tables.steps["fit"].to_numpy() < LEAST_FIT)] = names.index(_CONTRADICTED)
     if tables.closures is None or not tables.closures.num_rows:
         return marks
     keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
