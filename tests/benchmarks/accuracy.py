@@ -29,21 +29,25 @@ MATCHERS = ("plicp", "svd")
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A log, how it is run, and what it is measured against (a .tum or a .relations file)."""
+    """A log, which of its scans are run and how, and its reference (a .tum or a .relations file)."""
 
     name: str
     log: Path
     reference: Path
     overrides: tuple[Override, ...] = ()
+    every: int = 1
 
 
 def cases(folder: Path) -> Iterator[Case]:
     """The real logs that are there, then the simulated ones, made in the folder."""
     no_wheels = (Override("odometry.prior", "constant-velocity", "--odometry.prior"),)
-    intel = Case("Intel, wheels", DATA / "2d/intel.mcap", DATA / "2d/intel.relations")
-    yield intel
-    yield Case("Intel, no wheels", intel.log, intel.reference, no_wheels)
-    yield Case("KITTI 0001, 54 scans", DATA / "3d/kitti_0001_first54.mcap", DATA / "3d/kitti_0001_first54.tum")
+    for name in ("Intel", "ACES"):
+        log = DATA / f"2d/{name.lower()}.mcap"
+        yield Case(f"{name}, wheels", log, log.with_suffix(".relations"))
+        yield Case(f"{name}, no wheels", log, log.with_suffix(".relations"), no_wheels)
+    kitti = DATA / "3d/kitti_0001_first54.mcap"
+    for every in (1, 2, 3, 5):
+        yield Case(f"KITTI 0001, every {every} of 54 scans", kitti, kitti.with_suffix(".tum"), every=every)
     for world, duration_s in (("office", 240.0), ("town", 30.0)):
         log = folder / f"{world}.mcap"
         simulate(world, log, duration_s=duration_s, seed=1)
@@ -53,7 +57,7 @@ def cases(folder: Path) -> Iterator[Case]:
 def run(case: Case, matcher: str) -> tuple[SlamResult, float]:
     """The result, and seconds per scan, reading included."""
     overrides = (*case.overrides, Override("matching.matcher", matcher, "--matching.matcher"))
-    log = open_log([case.log], load_settings().config.log)
+    log = open_log([case.log], every=case.every)
     slam = Slam(load_settings(log.dimension, overrides=overrides).config, log.T_base_lidar)
     started = perf_counter()
     for scan in log.scans():
