@@ -94,8 +94,8 @@ def _many_contradicted(evidence: Evidence) -> Iterator[str]:
     if count > MOST_CONTRADICTED * len(evidence):
         yield (
             f"{count:,} of {len(evidence):,} scans contradict the map where they were placed (fit below "
-            f"{LEAST_FIT:g}): the motion between scans may be larger than the search (scanchain doctor; "
-            "--matching.wide_max_distance_m), or the log is at fault"
+            f"{LEAST_FIT:g}): the motion between scans may be larger than the search, or the log is "
+            "at fault (scanchain doctor)"
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.config import Config, MatchingConfig
+from scanchain.config import Config
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import Survey
 from scanchain.logs.messages.point_times import UNITS_S
@@ -24,7 +24,6 @@ _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
-_WIDE_M = 8  # least radius of a search for motions of meters between scans
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
 _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 
@@ -32,7 +31,7 @@ _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel readin
 def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
     """Every finding about time. ``config`` is what a run of this log would use."""
     is_on_wheels = bool(seen.wheels) and config.odometry.prior != "constant-velocity"
-    yield _rate(seen, config.matching, is_on_wheels)
+    yield _rate(seen, is_on_wheels)
     yield _gaps(seen, is_on_wheels)
     yield _jitter(seen)
     yield _order(seen)
@@ -42,16 +41,12 @@ def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
         yield _point_times(seen)
 
 
-def _rate(seen: Survey, matching: MatchingConfig, is_on_wheels: bool) -> Finding:
+def _rate(seen: Survey, is_on_wheels: bool) -> Finding:
     rate_hz = 1.0 / seen.period_s if seen.period_s else 0.0
     found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
     if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not is_on_wheels:
-        effect = "the motion between two scans is long and predicted without wheels; the first ones may be missed"
-        remedy = f"--matching.wide_max_distance_m {_WIDE_M}"
-        is_wide = matching.wide_max_distance_m >= _WIDE_M
-        is_of_use = seen.log.dimension == 3 and not is_wide  # the plane is searched by correlation instead
-        severity = Severity.WARNING if is_of_use else Severity.NOTE
-        return Finding("rate", severity, found, effect, remedy if is_of_use else "")
+        effect = "motions between scans are long and predicted without wheels; searched where matching fails"
+        return Finding("rate", Severity.NOTE, found, effect)
     return Finding("rate", Severity.OK, found)
 
 
