@@ -32,7 +32,7 @@ def check(
     as_json: bool,
     **shortcuts: str | bool | None,
 ) -> None:
-    """Print the verdict on a run directory, computed anew, or on any trajectory of a log.
+    """Recompute the verdict on a run directory, or check any trajectory of a log.
 
     A trajectory of another tool is checked at the scans whose stamps it has: against wheel odometry and constant
     velocity, and by aligning each scan to a map of those before. Exit code 1: not trustworthy.
@@ -44,8 +44,6 @@ def check(
       scanchain check --trajectory kiss.tum log.mcap
       scanchain check --trajectory other.tum part_0.mcap part_1.mcap --topic /lidar_front/points
     """
-    from scanchain.verdict import Verdict
-
     settings = overrides(ctx, part_of(shortcuts))
     if trajectory is None:
         if len(sources) != 1 or not isinstance(sources[0], Path) or settings:
@@ -63,7 +61,7 @@ def check(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
     click.echo(_json(judged) if as_json else _text(judged))
-    if judged.verdict is Verdict.NOT_TRUSTWORTHY or (strict and judged.verdict is not Verdict.TRUSTWORTHY):
+    if judged.verdict.fails(strict=strict):
         ctx.exit(1)
 
 

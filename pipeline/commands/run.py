@@ -103,7 +103,6 @@ def run(
     from scanchain.runs.job import Job
     from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
-    from scanchain.verdict import Verdict
 
     truth_file, truth_topic = ground_truth(gt)
     job = Job(
@@ -122,8 +121,7 @@ def run(
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
-    verdict = finished.metrics.verdict
-    fails = verdict is Verdict.NOT_TRUSTWORTHY or (strict and verdict is not Verdict.TRUSTWORTHY)
+    fails = finished.metrics.verdict.fails(strict=strict)
     if fails and not is_seen:
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
     for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:

@@ -19,7 +19,7 @@ from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import Standstill
-from scanchain.odometry.tracked import Tracked, blurred, first_match, nothing_to_match, seen_from
+from scanchain.odometry.tracked import NEW_MAP, Tracked, blurred, first_match, nothing_to_match, seen_from
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
@@ -180,7 +180,7 @@ class Odometry:
         self.recovery.forget()
         self.standstill.begin(prediction.T_odom_last)
         away_m = prediction.reach_m
-        reason = f"may be {away_m:.0f} m away after a time without scans: a new map begins"
+        reason = f"may be {away_m:.0f} m away after a time without scans: {NEW_MAP}"
         match = first_match(prediction.T_odom_last, points, self.config.matching)
         match = replace(match, converged=False, reason=reason)
         return _Registered(points, match, State.OK, reason, prediction, away_m)

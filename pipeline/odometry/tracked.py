@@ -13,6 +13,8 @@ from scanchain.data import Match, Points, Pose, Prior, Scan, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import with_source_frame
 
+NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
+
 
 @dataclass(frozen=True, slots=True)
 class Tracked:

@@ -13,8 +13,8 @@ from scanchain.registration.voxel_map import VoxelMap
 
 _TALL = 0.75  # voxels between the lowest and the highest point of a column, from which on it is upright structure
 _POINTS = 300  # columns of the scan that are scored, evenly spread
-_APART = 3.0  # voxels, from which on two poses are different answers
-_RIVAL = 0.6  # share of the best score, from which on other answers are given
+_APART = 3.0  # least distance of two distinct poses, voxels
+_RIVAL = 0.6  # share of the best score, from which on distinct poses are returned
 
 
 class BirdsEye:

@@ -1,4 +1,4 @@
-"""A seed for matching in the plane that no basin of attraction limits."""
+"""Correlative search: initial poses for matching, beyond the basin of attraction of ICP."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from scanchain.preprocess.sweep import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
 _POINTS = 120  # of the scan that are scored, one a voxel, evenly spread
-_APART_M = 1.0  # from which on two poses are different answers
-_RIVAL = 0.8  # share of the best score, from which on another answer is told
+_APART_M = 1.0  # least distance of two distinct poses
+_RIVAL = 0.8  # share of the best score, from which on a distinct pose is returned as its rival
 _TOP = 5  # levels of the pyramid above the grid itself; windows start with 2⁵ cells
 
 
@@ -27,9 +27,9 @@ class Window:
     Attributes
     ----------
     half_width_m, half_width_rad : of the window, along x and y and in heading
-    apart_m : distance, from which on two poses are different answers
-    rival : share of the best score, from which on other answers are given
-    answers : most answers that are given
+    apart_m : least distance of two distinct poses
+    rival : share of the best score, from which on distinct poses are returned
+    answers : largest number of poses that are returned
     least : share of the highest score, below which nothing counts
     """
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
+
+import numpy as np
 
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
-from scanchain.registration.own_matcher import CheckedMatcher
+from scanchain.errors import InputError, shown
 from scanchain.registration.voxel_map import VoxelMap
+
+_COUNTS = ("inliers", "points", "iterations")
+_NUMBERS = ("cost", "residual_m", "fit", "degeneracy_eigenvalue", "observability")
 
 
 class Matcher(Protocol):
     """Scan-to-map registration; made with a MatchingConfig.
 
     Stateless: a match follows from the arguments and the configuration alone. A run that is resumed makes its
-    matcher anew from the name and the configuration.
+    matcher again from the name and the configuration.
     """
 
     def align(
@@ -30,6 +36,42 @@ class Matcher(Protocol):
         wide : search far, for a first pose that is little more than a guess
         """
         ...
+
+
+class CheckedMatcher:
+    """A class of the user's as a ``Matcher``. Raises InputError where it returns no sound Match."""
+
+    def __init__(self, name: str, kind: type, config: MatchingConfig) -> None:
+        self.name = name
+        try:
+            self.own = kind(config)
+        except Exception as error:  # of the user's own code
+            reason = " ".join(str(error).split())
+            raise InputError(
+                f"{name}: cannot be made with a MatchingConfig ({type(error).__name__}: {reason}); "
+                "wanted __init__(self, config)"
+            ) from error
+
+    def align(
+        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+    ) -> Match:
+        """The result of the user's ``align``, its arrays of the shape and dtype wanted."""
+        match = self.own.align(points, target, T_first, prior, wide=wide)
+        if not isinstance(match, Match):
+            raise InputError(f"{self.name}: align returned {shown(match)}; wanted a scanchain.Match")
+        d, of = len(T_first) - 1, f"{self.name}: of the Match that align returned,"
+        k = d * (d + 1) // 2
+        for field in (*_COUNTS, *_NUMBERS):
+            value = getattr(match, field)
+            if not isinstance(value, int | np.integer if field in _COUNTS else int | float | np.number):
+                wanted = "a whole number" if field in _COUNTS else "a number"
+                raise InputError(f"{of} {field} is {shown(value)}; wanted {wanted}")
+        return replace(
+            match,
+            T_target_source=checks.pose(match.T_target_source, f"{of} T_target_source", d),
+            information=checks.matrices(match.information, f"{of} information", (k, k)),
+            degeneracy_direction=checks.matrices(match.degeneracy_direction, f"{of} degeneracy_direction", (k,)),
+        )
 
 
 def create_matcher(config: MatchingConfig) -> Matcher:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Match, Pose, Scan, Trajectory
+from scanchain.data import Match, Matrix, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair
 from scanchain.logs import Log, open_log
@@ -52,7 +52,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     return judge(matched), len(stamps_ns) - len(pairs)
 
 
-def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Pose]:
+def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:
     """Stamps, log times, numbers of points and poses of the lidar by the wheels, NaN where unknown."""
     rows, wheels = [], []
     unknown = np.full(log.T_base_lidar.shape, np.nan)

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, State, Trajectory
 from scanchain.errors import InputError
+from scanchain.odometry.tracked import NEW_MAP
 from scanchain.runs.closures import VERIFICATION
 from scanchain.verdict import Closures, Evidence, Judged, check_velocity, check_wheels, judge
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
 
 
 def judge_run(folder: Path) -> Judged:
@@ -35,7 +34,7 @@ def judge_run(folder: Path) -> Judged:
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
-    """What the tables of a run say about each scan."""
+    """Evidence of every scan in the tables of a run."""
     dimension = 2 if steps.schema.field("covariance").type.list_size == 9 else 3
     poses = _poses(steps, "", dimension)
     states = np.array(steps["state"].to_pylist())
@@ -58,7 +57,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
 def evidence_of_trajectory(
     trajectory: Trajectory, log_times_ns: NDArray[np.int64], wheels: Matrix, points: NDArray[np.int64]
 ) -> Evidence:
-    """What can be checked of any trajectory: (N, d+1, d+1) wheels, NaN where unknown, at the same scans."""
+    """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans."""
     n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
     return Evidence(
         seconds=(log_times_ns - log_times_ns[0]) * 1e-9,

@@ -67,7 +67,7 @@ class Stretch(Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of every scan of a trajectory, (N,) each.
+    """Evidence of every scan of a trajectory, (N,) each.
 
     Attributes
     ----------

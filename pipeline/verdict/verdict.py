@@ -28,6 +28,10 @@ class Verdict(StrEnum):
     CHECK = "check these stretches"
     NOT_TRUSTWORTHY = "not trustworthy"
 
+    def fails(self, *, strict: bool) -> bool:
+        """True if a command exits with 1: not trustworthy or, if strict, anything but trustworthy."""
+        return self is Verdict.NOT_TRUSTWORTHY or (strict and self is not Verdict.TRUSTWORTHY)
+
 
 @dataclass(frozen=True, slots=True)
 class Judged:
@@ -123,7 +127,7 @@ def _listed(stretches: Sequence[Stretch]) -> str:
 
 
 def _by(evidence: Evidence) -> str:
-    """What the trajectory was checked by."""
+    """Names of the checks that were made, as text."""
     checks = [
         *(["fit"] if np.isfinite(evidence.fit).any() else []),
         *(["constant velocity"] if np.isfinite(evidence.velocity).any() else []),

@@ -22,7 +22,7 @@ from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE, Voxels
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
 SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
-SLACK = 0.02  # voxels that points may move before they are associated anew
+SLACK = 0.02  # voxels that points may move before they are associated again
 PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
 _COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
@@ -124,7 +124,7 @@ def align(problem, T, offset, range_m: float, first_scale_m: float):
     """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, ξ being the twist from the predicted
-    pose, ``offset`` (k,) at first. Points are associated anew when they have moved by more than SLACK, until
+    pose, ``offset`` (k,) at first. Points are associated again when they have moved by more than SLACK, until
     PATIENCE steps were taken with the kernel at its last scale: correspondences may alternate without end.
     range_m : root mean square of the points' ranges; first_scale_m : that the kernel's scale shrinks from
     """
@@ -180,7 +180,7 @@ def fit_at(problem, T, fit):
 
 @njit(cache=True, nogil=True)
 def correspond(problem, T, reach: int, max_distance_m: float):
-    """Number of correspondences of the problem at the pose T, which are associated and weighted anew."""
+    """Number of correspondences of the problem at the pose T, which are associated and weighted again."""
     pairs = associate(problem.voxels, problem.points, T, reach, max_distance_m, problem.correspondence)
     if pairs:
         weigh(problem.voxels, problem.points, T, problem.correspondence, problem.settings.variance, problem.weight)
@@ -252,7 +252,7 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
 
     Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
     that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more. After a step by which
-    a point moves further than slack_m, the normal equations are left as they are: the caller associates anew.
+    a point moves further than slack_m, the normal equations are left as they are: the caller associates again.
     """
     settings = problem.settings
     growth = 2.0
