@@ -27,6 +27,15 @@ MATCHERS = {
     "svd": "scanchain.registration.svd_icp:SvdMatcher",
 }
 Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
+LOSSES = {  # of loop edges
+    "none": "scanchain.graph.robust.losses:Quadratic",
+    "huber": "scanchain.graph.robust.losses:Huber",
+    "cauchy": "scanchain.graph.robust.losses:Cauchy",
+    "geman-mcclure": "scanchain.graph.robust.losses:GemanMcClure",
+    "tukey": "scanchain.graph.robust.losses:Tukey",
+    "truncated": "scanchain.graph.robust.losses:Truncated",
+}
+Loss = Annotated[str, Meta(extra={"choices": tuple(LOSSES)})]  # likewise
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
@@ -233,7 +242,7 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     )
     max_iterations: Count = 50
     tolerance: Positive = 1e-6
-    robust: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "truncated"] = "truncated"
+    robust: Loss = "truncated"
     robust_scale: Positive = 3.0
 
 

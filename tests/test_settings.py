@@ -232,7 +232,11 @@ def test_a_wrong_type_in_a_file_names_key_value_and_demand(tmp_path, key, value,
         ("matching.max_distance_m", "far", "a number > 0"),
         ("matching.max_distance_m", "", "a number > 0"),
         ("loops.enabled", "maybe", "true or false"),
-        ("graph.robust", "welsch", "one of cauchy, geman-mcclure"),
+        (
+            "graph.robust",
+            "welsch",
+            "one of none, huber, cauchy, geman-mcclure, tukey, truncated or a class of yours",
+        ),
     ],
 )
 def test_a_wrong_type_in_a_flag_names_flag_value_and_demand(key, text, demand):

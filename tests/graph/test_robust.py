@@ -1,8 +1,11 @@
+import math
+
 import numpy as np
 import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
+from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
@@ -172,3 +175,41 @@ def test_rejected_edges_have_no_weight_and_the_answer_is_the_minimum_without_the
     step = problem.cholesky
     step.factorize(equations.values)
     assert np.abs(step.solve(equations.gradient)).max() < 0.02  # m and rad, left to the tolerance
+
+
+class Welsch:
+    """A loss of the user's."""
+
+    def weight(self, chi2, s, mu):
+        return np.exp(-chi2 / s**2)
+
+    def loss(self, chi2, s, mu):
+        return s**2 * -np.expm1(-chi2 / s**2)
+
+
+class OtherSlope(Welsch):
+    """Weight and loss of two functions."""
+
+    def weight(self, chi2, s, mu):
+        return s**2 / (s**2 + chi2)
+
+
+class Scalar(Welsch):
+    """A loss that takes one residual at a time."""
+
+    def loss(self, chi2, s, mu):
+        return s**2 * -math.expm1(-chi2 / s**2)
+
+
+def test_a_loss_of_the_users_is_minimized():
+    graph, _, is_false = with_false_loops("intel", 0.03)
+    answer = graph.optimize(GraphConfig(robust=f"{__name__}:Welsch"))
+    weight = in_order_of_addition(graph, answer.state.weight)
+    assert np.median(weight[is_false]) < 1e-3 < 0.5 < np.median(weight[~is_false])
+
+
+@pytest.mark.parametrize(("name", "fault"), [("OtherSlope", "slope of loss"), ("Scalar", "fails for")])
+def test_a_loss_of_the_users_that_is_none_is_refused(name, fault):
+    graph, _, _ = with_false_loops("intel", 0.03)
+    with pytest.raises(InputError, match=fault):
+        graph.optimize(GraphConfig(robust=f"{__name__}:{name}"))

@@ -1,23 +1,29 @@
 """Robust losses of loop edges, functions of the whitened residual χ alone, and their graduation.
 
-A further one is two functions and a line in ``LOSSES``, and its name among the choices of ``graph.robust``.
+A further one is a class and a line in ``LOSSES`` (``scanchain.config``), or a user's own, ``module:Class``.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from scanchain import plugins
+from scanchain.config import LOSSES
+from scanchain.errors import InputError
+
 Array = NDArray[np.float64]
-OfResiduals = Callable[[Array, float, float], Array]  # of χ² (N,), the scale s and the control μ
 
 _TRUE_SHARE = 0.999  # share of true loops whose χ² stays below the limit, if the noise model is right
 _SHARP = 1e4  # control above which truncated least squares is as good as its limit
 _FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is all but convex; its step there
+_ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a class of the user's
 _FACTOR = 1.4  # step of the graduation (Yang et al. 2020, remark 5)
 
 
@@ -37,77 +43,19 @@ class Schedule:
     is_over: Callable[[float, Array], bool]
 
 
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """A loss by its functions.
+class Kernel(Protocol):
+    """A loss by its functions of χ² (N,), the scale s, and the control μ of its graduation.
 
-    Attributes
-    ----------
-    weight : w = dρ/dχ² in [0, 1], 1 near zero whatever the scale
-    loss : ρ(χ²), equal to χ² near zero
-    schedule : of its graduation, None where it is minimized as it is
+    One that is not convex may have an attribute ``schedule``; without it, it is minimized as it is, with μ = 1.
     """
 
-    weight: OfResiduals
-    loss: OfResiduals
-    schedule: Schedule | None = None
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
+        ...
 
-
-def _quadratic_weight(chi2: Array, s: float, mu: float) -> Array:
-    return np.ones_like(chi2)
-
-
-def _quadratic_loss(chi2: Array, s: float, mu: float) -> Array:
-    return chi2
-
-
-def _huber_weight(chi2: Array, s: float, mu: float) -> Array:
-    return s / np.sqrt(np.maximum(chi2, s**2))
-
-
-def _huber_loss(chi2: Array, s: float, mu: float) -> Array:
-    s2 = s**2
-    return np.where(chi2 <= s2, chi2, 2.0 * s * np.sqrt(np.maximum(chi2, s2)) - s2)
-
-
-def _cauchy_weight(chi2: Array, s: float, mu: float) -> Array:
-    return s**2 / (s**2 + chi2)
-
-
-def _cauchy_loss(chi2: Array, s: float, mu: float) -> Array:
-    return s**2 * np.log1p(chi2 / s**2)
-
-
-def _geman_mcclure_weight(chi2: Array, s: float, mu: float) -> Array:
-    return (mu * s**2 / (mu * s**2 + chi2)) ** 2
-
-
-def _geman_mcclure_loss(chi2: Array, s: float, mu: float) -> Array:
-    return chi2 * mu * s**2 / (mu * s**2 + chi2)
-
-
-def _tukey_weight(chi2: Array, s: float, mu: float) -> Array:
-    return np.maximum(1.0 - chi2 / (mu * s**2), 0.0) ** 2
-
-
-def _tukey_loss(chi2: Array, s: float, mu: float) -> Array:
-    share = np.minimum(chi2 / (mu * s**2), 1.0)
-    return mu * s**2 * share * (1.0 - share + share**2 / 3.0)
-
-
-def _truncated_weight(chi2: Array, s: float, mu: float) -> Array:
-    if np.isinf(mu):
-        return (chi2 <= s**2).astype(np.float64)
-    middle = s * np.sqrt(mu * (mu + 1.0) / np.maximum(chi2, 1e-300)) - mu
-    return np.clip(middle, 0.0, 1.0)
-
-
-def _truncated_loss(chi2: Array, s: float, mu: float) -> Array:
-    s2 = s**2
-    if np.isinf(mu):
-        return np.minimum(chi2, s2)
-    middle = 2.0 * s * np.sqrt(mu * (mu + 1.0) * np.maximum(chi2, 0.0)) - mu * (s2 + chi2)
-    return np.where(chi2 <= mu / (mu + 1.0) * s2, chi2, np.where(chi2 >= (mu + 1.0) / mu * s2, s2, middle))
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ(χ²), equal to χ² near zero."""
+        ...
 
 
 def _sharpened(mu: float) -> float:
@@ -127,14 +75,92 @@ _SURROGATE = Schedule(  # of truncated least squares: 0 is convex, ∞ the loss 
     is_over=lambda mu, weight: bool(np.all((weight < 1e-6) | (weight > 1.0 - 1e-6))),
 )
 
-LOSSES = {
-    "none": Kernel(_quadratic_weight, _quadratic_loss),
-    "huber": Kernel(_huber_weight, _huber_loss),
-    "cauchy": Kernel(_cauchy_weight, _cauchy_loss),
-    "geman-mcclure": Kernel(_geman_mcclure_weight, _geman_mcclure_loss, _WIDENED),
-    "tukey": Kernel(_tukey_weight, _tukey_loss, _WIDENED),
-    "truncated": Kernel(_truncated_weight, _truncated_loss, _SURROGATE),
-}
+
+class Quadratic:
+    """ρ = χ²: no robust loss."""
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = 1."""
+        return np.ones_like(chi2)
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = χ²."""
+        return chi2
+
+
+class Huber:
+    """Huber 1964: linear in χ above s."""
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = min(1, s/χ)."""
+        return s / np.sqrt(np.maximum(chi2, s**2))
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = 2 s χ − s² above s."""
+        s2 = s**2
+        return np.where(chi2 <= s2, chi2, 2.0 * s * np.sqrt(np.maximum(chi2, s2)) - s2)
+
+
+class Cauchy:
+    """Of the Cauchy distribution: grows without bound, but slowly."""
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = s² / (s² + χ²)."""
+        return s**2 / (s**2 + chi2)
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = s² log(1 + χ²/s²)."""
+        return s**2 * np.log1p(chi2 / s**2)
+
+
+class GemanMcClure:
+    """Geman and McClure 1985: bounded by s²."""
+
+    schedule = _WIDENED
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = (μ s² / (μ s² + χ²))²."""
+        return (mu * s**2 / (mu * s**2 + chi2)) ** 2
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = μ s² χ² / (μ s² + χ²)."""
+        return chi2 * mu * s**2 / (mu * s**2 + chi2)
+
+
+class Tukey:
+    """Biweight of Beaton and Tukey 1974: constant above √μ s."""
+
+    schedule = _WIDENED
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = (1 − χ²/(μ s²))² or 0."""
+        return np.maximum(1.0 - chi2 / (mu * s**2), 0.0) ** 2
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = μ s² (1 − (1 − χ²/(μ s²))³) / 3, or μ s²/3."""
+        share = np.minimum(chi2 / (mu * s**2), 1.0)
+        return mu * s**2 * share * (1.0 - share + share**2 / 3.0)
+
+
+class Truncated:
+    """Truncated least squares by its surrogates (Yang et al. 2020, eq. 14): constant above s."""
+
+    schedule = _SURROGATE
+
+    def weight(self, chi2: Array, s: float, mu: float) -> Array:
+        """w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
+        if np.isinf(mu):
+            return (chi2 <= s**2).astype(np.float64)
+        middle = s * np.sqrt(mu * (mu + 1.0) / np.maximum(chi2, 1e-300)) - mu
+        return np.clip(middle, 0.0, 1.0)
+
+    def loss(self, chi2: Array, s: float, mu: float) -> Array:
+        """ρ = min(χ², s²), and 2 s χ √(μ (μ + 1)) − μ (s² + χ²) between."""
+        s2 = s**2
+        if np.isinf(mu):
+            return np.minimum(chi2, s2)
+        middle = 2.0 * s * np.sqrt(mu * (mu + 1.0) * np.maximum(chi2, 0.0)) - mu * (s2 + chi2)
+        return np.where(chi2 <= mu / (mu + 1.0) * s2, chi2, np.where(chi2 >= (mu + 1.0) / mu * s2, s2, middle))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +169,7 @@ class RobustLoss:
 
     Attributes
     ----------
-    kernel : which of ``LOSSES``
+    kernel : which of ``LOSSES``, or module:Class
     scale : s, the χ (a pure number) at which a residual starts to count less
     control : μ of the graduation; 1, or ∞ for truncated least squares, is the loss itself
     """
@@ -154,15 +180,15 @@ class RobustLoss:
 
     def weight(self, chi2: Array) -> Array:
         """Weight in [0, 1] of residuals with these χ²."""
-        return LOSSES[self.kernel].weight(chi2, self.scale, self.control)
+        return _kernel(self.kernel).weight(chi2, self.scale, self.control)
 
     def loss(self, chi2: Array) -> Array:
         """ρ(χ²), equal to χ² near zero."""
-        return LOSSES[self.kernel].loss(chi2, self.scale, self.control)
+        return _kernel(self.kernel).loss(chi2, self.scale, self.control)
 
     def graduation(self, chi2: Array) -> Graduation | None:
         """Its graduation from the convex end, for residuals that begin at these χ²; None where it has none."""
-        schedule = LOSSES[self.kernel].schedule
+        schedule: Schedule | None = getattr(_kernel(self.kernel), "schedule", None)
         if schedule is None:
             return None
         ratio = 2.0 * float(chi2.max(initial=0.0)) / self.scale**2
@@ -191,7 +217,37 @@ def rejection_limit(scale: float, degrees: int) -> float:
 
 
 def robust_loss(kernel: str, scale: float, degrees: int) -> RobustLoss:
-    """The loss by its name; truncated least squares cuts where the verdict falls."""
+    """The loss by its name; truncated least squares cuts where the verdict falls.
+
+    Raises InputError where a class of the user's cannot be had or is no loss.
+    """
     if kernel == "truncated":
         return RobustLoss(kernel, np.sqrt(rejection_limit(scale, degrees)), np.inf)
-    return RobustLoss(kernel, scale, 1.0)
+    loss = RobustLoss(kernel, scale, 1.0)
+    if kernel not in LOSSES:
+        _check(loss)
+    return loss
+
+
+@functools.cache
+def _kernel(name: str) -> Kernel:
+    return plugins.load(LOSSES.get(name, name), "weight", "loss")()
+
+
+def _check(loss: RobustLoss) -> None:
+    """Raises InputError where a class of the user's gives no weights in [0, 1], or a loss with another slope."""
+    chi2 = loss.scale**2 * np.array([0.0, 1e-3, 0.3, 0.9, 3.0, 100.0])
+    step = 1e-6 * loss.scale**2
+    try:
+        weight = np.asarray(loss.weight(chi2), np.float64)
+        slope = (np.asarray(loss.loss(chi2 + step), np.float64) - loss.loss(chi2)) / step
+    except Exception as error:  # of the user's own code
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, mu) "
+            "and loss(self, chi2, s, mu)"
+        ) from error
+    if weight.shape != chi2.shape or not np.all((weight >= 0.0) & (weight <= 1.0)) or weight[0] < _ONE:
+        raise InputError(f"{loss.kernel}: weight returned {weight.tolist()}; wanted (N,) in [0, 1], 1 at χ² = 0")
+    if slope.shape != chi2.shape or not np.allclose(slope, weight, rtol=0.0, atol=_SLOPE):
+        raise InputError(f"{loss.kernel}: the slope of loss over χ² is not weight; both belong to one function")
