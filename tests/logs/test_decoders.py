@@ -5,6 +5,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import LogConfig
+from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.simulation import simulate
 from tests.support.naive_logs import (
@@ -64,6 +65,13 @@ def test_beams_without_return_are_dropped_with_their_times_and_counted(tmp_path)
     assert distances(scan) == pytest.approx([1.0, 2.0, 3.0])
     assert scan.times_s == pytest.approx([0.25, 1.0, 2.25])
     assert scan.dropped == 8
+
+
+@pytest.mark.parametrize("step", [1.0, -0.5])
+def test_angles_in_degrees_are_refused_and_a_turn_and_a_bit_is_not(tmp_path, step):
+    with pytest.raises(InputError, match=r"180 beams, -?\d.* rad apart, cover \d.* turns: degrees\? wanted"):
+        laser(tmp_path, np.full(180, 2.0), first=-90.0, step=step)
+    assert len(laser(tmp_path, np.full(370, 2.0), first=-np.pi, step=np.radians(1.0)).points) == 370
 
 
 def test_a_scanner_that_leaves_its_range_limits_at_zero_loses_nothing(tmp_path):

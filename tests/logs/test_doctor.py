@@ -405,6 +405,23 @@ def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
     assert finding.severity == "note" and finding.remedy.startswith("--preprocess.max_range_m 17")
 
 
+def test_ranges_in_millimeters_are_a_problem_and_not_to_be_widened_to(call, tmp_path):
+    path = saved(tmp_path, drive(ranges=lambda k: 1e3 * room(k)))
+    finding = diagnose(path)["ranges"]
+    assert (finding.severity, finding.remedy) == ("problem", "") and "100 % lie beyond" in finding.effect
+    code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off")
+    assert code == 2 and "millimeters? convert them to meters" in errors and "widen" not in errors
+
+
+def test_wheels_in_millimeters_are_a_problem_with_the_flag_that_leaves_them_out(tmp_path):
+    said = [
+        odometry_said(STAMP_NS + k * STEP_NS, odometry(STAMP_NS + k * STEP_NS, 100.0 * k, 0.0)) for k in range(40)
+    ]
+    finding = diagnose(saved(tmp_path, [*drive(), *said]))["wheels"]
+    assert (finding.severity, finding.remedy) == ("problem", "--odometry.prior constant-velocity")
+    assert "moves at 1e+03 m/s" in finding.found
+
+
 def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
     path = tmp_path / "hall.mcap"
     simulate("hall", path, seed=1, duration_s=4.0)
