@@ -72,7 +72,7 @@ def can_start_again(method: Method) -> bool:
 class _Others:
     def __init__(self, method: Method, dimension: int) -> None:
         self.baseline = _baseline(method, dimension)
-        self.description = self.baseline.description
+        self.description = str(getattr(self.baseline, "description", "")) or method.base
 
     def track(self, scan: Scan) -> Pose:
         return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)

@@ -9,8 +9,6 @@ import numpy as np
 
 
 class StandsStill:
-    description = "stands still"
-
     def __init__(self):
         self.scans = 0
 
