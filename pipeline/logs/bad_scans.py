@@ -16,6 +16,8 @@ from scanchain.words import counted
 
 _FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than meters
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
+_SPANS = 100  # number of first scans whose point times are compared with the period
+_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
@@ -81,6 +83,8 @@ class ScanCounts:
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = 0
         self.first_complaint = ""
         self.last_stamp_ns: int | None = None
+        self.spans_s: list[float] = []
+        self.log_times_ns: list[int] = []
 
     def skip(self, complaint: str) -> None:
         """Count a scan that is left out."""
@@ -96,9 +100,12 @@ class ScanCounts:
             self.backwards += scan.stamp_ns < self.last_stamp_ns
             self.repeated += scan.stamp_ns == self.last_stamp_ns
         self.last_stamp_ns = scan.stamp_ns
+        if len(self.log_times_ns) < _SPANS:
+            self.log_times_ns.append(scan.log_time_ns)
+            self.spans_s += [float(np.ptp(scan.times_s))] if len(scan.times_s) else []
 
     def losses(self) -> list[str]:
-        """Lines on scans that were left out, and on stamps that most scans do not have; none as a rule."""
+        """Lines on scans left out, stamps that most scans do not have, and odd point times; none as a rule."""
         lines = []
         if self.bad:
             were = "was" if self.bad == 1 else "were"
@@ -110,7 +117,19 @@ class ScanCounts:
                 f"{share} have the header stamp of the one before (the last {1e-9 * self.last_stamp_ns:.3f} s): "
                 "the times in the results do not tell scans apart; record with stamps"
             )
-        return lines
+        return [*lines, *self._odd_times()]
+
+    def _odd_times(self) -> list[str]:
+        """A line where the point times of the first scans span next to nothing, or more than two periods."""
+        if not self.spans_s or len(self.log_times_ns) < 2:
+            return []
+        span_s, period_s = float(np.median(self.spans_s)), 1e-9 * float(np.median(np.diff(self.log_times_ns)))
+        if period_s <= 0.0 or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
+            return []
+        return [
+            f"by their point times scans of {self.topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of "
+            "the period: of another unit? scanchain doctor names the flag, --preprocess.deskew false ignores them"
+        ]
 
     @property
     def _has_no_stamps(self) -> bool:

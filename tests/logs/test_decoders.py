@@ -286,6 +286,10 @@ def test_nanoseconds_in_a_float_are_recognized(tmp_path):
     np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S * 1e9, "<f4"), RISING_S, atol=1e-7)
 
 
+def test_whole_milliseconds_are_recognized(tmp_path):
+    np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e3, "<u4"), RISING_S, atol=1e-3)
+
+
 def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):
     rows = random_rows([*XYZ, ("time", "f8")], count=4)
     rows["time"] = [np.nan, 0.01, 0.02, 0.03]

@@ -363,6 +363,16 @@ def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
     assert diagnose(path, point_times="s")["point times"].severity == "ok"
 
 
+@pytest.mark.parametrize(("factor", "said"), [(1e-3, "0.095 ms, 0.00095 of"), (100.0, "9.5e+03 ms, 95 of")])
+def test_a_run_warns_of_point_times_that_do_not_fit_the_period(tmp_path, factor, said):
+    log = open_log(saved(tmp_path, sweeps(span=0.095 * factor)), point_times="s")
+    list(log.scans())
+    assert any(f"by their point times scans of /points last {said} the period" in line for line in log.damage)
+    log = open_log(saved(tmp_path, sweeps()), point_times="s")
+    list(log.scans())
+    assert log.damage == []
+
+
 def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
     plain = np.dtype([(name, "<f4") for name in "xyz"])
 
