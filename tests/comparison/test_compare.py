@@ -33,7 +33,7 @@ from scanchain.trajectory import read_tum, write_kitti, write_tum
 from tests.support.scenes import ROOT, shared_data
 
 SUPPORT = ROOT / "tests" / "support"
-NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself")
+NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself", "Spatial")
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,11 @@ def test_every_bad_method_is_a_row_that_says_how_it_ended(bad):
         ("dies", Status.CRASHED, "at scan 10: ended by SIGSEGV"),
         ("diesearly", Status.CRASHED, "while starting or warming up: ended by SIGSEGV"),
         ("losesitself", Status.CRASHED, "at scan 10: ValueError: a pose that is not finite"),
+        (
+            "spatial",
+            Status.CRASHED,
+            "at scan 0: ValueError: track returned an array of the shape (4, 4); wanted a pose (3, 3)",
+        ),
     ):
         assert (row(table, name).status, row(table, name).reason) == (status, reason)
         assert row(table, name).figures.ate_m is None
