@@ -29,7 +29,7 @@ def judge_run(folder: Path) -> Judged:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
     except FileNotFoundError:
         raise InputError(
-            f"{folder}: has no steps.parquet: no run directory, or that of an unfinished run (run --resume goes on)"
+            f"{folder}: has no steps.parquet: no run directory, or that of an unfinished run (--resume goes on)"
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
