@@ -102,6 +102,8 @@ def load_settings(
         raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
     if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
         raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
+    if not (isinstance(idle, Mapping) and all(isinstance(text, str) for each in idle.items() for text in each)):
+        raise InputError(f"idle is {shown(idle)}; wanted a mapping of keys without effect to the reasons")
     layer: dict[str, Value] = {}
     source = "defaults"
     if dimension is not None:

@@ -27,6 +27,10 @@ def judge_run(folder: Path) -> Judged:
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder}: has no steps.parquet: no run directory, or that of an unfinished run (--resume goes on)"
+        ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"

@@ -1,7 +1,7 @@
 """Error of vertical angles, with and without calibration: ``python -m tests.benchmarks.elevation``.
 
-Simulated sweeps as a lidar would give them whose vertical angles are off, and KITTI, which is as it was recorded. The
-errors are those of 20 m against ground truth. Prints a Markdown table.
+Simulated sweeps as a lidar would give them whose vertical angles are off, and KITTI, which is as it was recorded.
+The errors are those of 20 m against ground truth. Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def tracked(log_file, offset_deg, *, is_calibrated):
 
 
 def errors(poses, true):
-    """Share of a stretch by which it is off in z, and its pitch error per meter, degrees; means over all stretches."""
+    """Mean share of a stretch by which it is off in z, and mean pitch error per meter, degrees."""
     path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))])
     last = np.searchsorted(path_m, path_m + STRETCH_M)
     first = np.flatnonzero(last < len(path_m))
