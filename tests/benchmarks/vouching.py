@@ -1,27 +1,27 @@
-"""Whether a run vouches rightly for its own result: wrong and right motions, flagged or not, and the verdicts.
+"""Wrong and right motions of runs, flagged or not, and their verdicts: ``python -m tests.benchmarks.vouching``.
 
-    python -m tests.benchmarks.vouching [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--from FILE] [--png FILE]
+    [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--again | --judge] [--from FILE] [--png FILE]
 
 Simulated worlds and real logs (tests.benchmarks.vouching_logs), with and without wheels, at 10, 5 and 2 Hz, with
-dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories are kept in the cache, a
-row for every run in its ``results.jsonl``: what is there is not run again unless --again is given; --judge judges
+dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories stay in the cache, with
+a row for every run in ``results.jsonl``: what is there is not run again unless --again is given; --judge judges
 the runs that are there anew, without processing. --from prints the table of such a file.
 
 A motion is that from a scan to the first one a second or more later, or one of the relations that come with a real
 log, of at most 5 s. It is
 
-  wrong     if the final poses are off by more than 0.1 m or 1° in the plane, 0.2 m or 1° in space, and by more than
-            three standard deviations along the error. Those are of ``covariance`` in steps.parquet, that of a match
-            in the lidar's frame: both ends err, Σ = Σ_j + Ad(M⁻¹) Σ_i Ad(M⁻¹)ᵀ with M the motion. Where one is null
-            (degenerate) nothing is claimed of that direction, and the limits in meters and degrees decide alone
+  wrong     if the final poses are off by more than 0.1 m or 1° in the plane, 0.2 m or 1° in space, and by more
+            than three standard deviations along the error. These are of ``covariance`` in steps.parquet, that of a
+            match in the lidar's frame; both ends err: Σ = Σ_j + Ad(M⁻¹) Σ_i Ad(M⁻¹)ᵀ with M the motion. Where one
+            is null (degenerate) nothing is claimed, and the limits in meters and degrees decide alone
   flagged   if one of its scans is not ``ok`` or lies in a stretch of the verdict
   open      if the true geometry leaves a direction open: less than a thousandth of the returns speak about it.
             Right motions of this sort are not counted, flagged or not. Real logs do not say
 
 A run is good if its ATE is below 0.15 m (plane), 0.3 m (space) and no motion is wrong, bad from 1 m on; over
-relations the mean error takes the place of the ATE, 0.1 m and 1 m, and a relation more than 1 m off is bad as well.
-Good runs are doubted if they are not called trustworthy, those through open geometry if they are called
-not trustworthy.
+relations the mean error takes the place of the ATE, 0.1 m and 1 m, and one relation more than 1 m off is bad as
+well. Good runs are doubted if they are not called trustworthy, those through open geometry if they are called not
+trustworthy. Cases are split in two halves by a hash of the log's name.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.api import open_recorder
 from scanchain.data import Matrix, Trajectory
-from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.evaluation.pairing import nearest
 from scanchain.runs.job import Job, Unwatched
@@ -62,7 +61,7 @@ Row = dict[str, Any]
 LIMIT_M, LIMIT_RAD, SIGMAS = {2: 0.1, 3: 0.2}, np.radians(1.0), 3.0
 OPEN_SHARE, LONGEST_RELATION_S = 1e-3, 5.0
 GOOD_M, BAD_M, GOOD_RELATIONS_M = {2: 0.15, 3: 0.3}, 1.0, 0.1
-BARS = "Bars: 99 % of wrong motions flagged, at most 2 % of right ones; no bad run trustworthy, 3 % of good ones doubted."
+BARS = "Bars: ≥ 99 % of wrong motions flagged, ≤ 2 % of right ones, no bad run trustworthy, ≤ 3 % of good doubted"
 QUICK = 7  # every n-th case
 KEPT = ("steps.parquet", "loops.parquet", "trajectory.tum", "ground_truth.tum", "metrics.json")
 CHECKS = {
@@ -156,7 +155,7 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
 
 
 def _compared(trajectory: Trajectory, reference: Path, dimension: int) -> tuple[Motions, tuple[str, float]]:
-    """Motions with their errors, and the quality of the whole run: "good", "bad" or "", and the error in meters."""
+    """Motions with their errors; quality of the run ("good", "bad" or "") and its error in meters."""
     if reference.suffix == ".relations":
         relations = read_relations(reference)
         places, off_ns = nearest(relations.stamps_ns.ravel(), trajectory.stamps_ns)
@@ -271,9 +270,7 @@ def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDA
 
 def table(rows: Sequence[Row]) -> None:
     """Counts by kind, totals by half against the bars, and the failures by name."""
-    print(
-        "| kind | runs | wrong motions flagged | right ones flagged | open ones | bad runs trustworthy | good doubted |"
-    )
+    print("| kind | runs | wrong, flagged | right, flagged | open, flagged | bad, trustworthy | good, doubted |")
     print("|---|---|---|---|---|---|---|")
     done = [row for row in rows if "failed" not in row]
     for kind in sorted({row["kind"] for row in done}):
@@ -283,6 +280,14 @@ def table(rows: Sequence[Row]) -> None:
         _line(f"**half {half + 1}**", [row for row in done if row["half"] == half])
     _line("**all**", done)
     print(f"\n{BARS}\n")
+    _failures(done)
+    for row in rows:
+        if "failed" in row:
+            print(f"failed: {row['name']}: {row['failed']}")
+
+
+def _failures(done: Sequence[Row]) -> None:
+    """What flags right motions, and the cases with silent wrong motions or wrong verdicts."""
     causes = Counter[str]()
     for row in done:
         causes.update(row["right flagged by"])
@@ -302,9 +307,6 @@ def table(rows: Sequence[Row]) -> None:
         if _is_missed(row) or _is_doubted(row):
             word = "bad but trustworthy" if _is_missed(row) else "good but doubted"
             print(f"{word}: {row['name']}: {row['error_m']:.3f} m; half {row['half'] + 1}; {row['reason'][:160]}")
-    for row in rows:
-        if "failed" in row:
-            print(f"failed: {row['name']}: {row['failed']}")
 
 
 def _line(name: str, rows: Sequence[Row]) -> None:
