@@ -53,7 +53,7 @@ from scanchain.runs.vouching import evidence_of
 from scanchain.settings import overrides_of
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Judged, judge
-from tests.benchmarks.vouching_logs import Case, LogSpec, cases
+from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -277,8 +277,9 @@ def table(rows: Sequence[Row]) -> None:
     print("|---|---|---|---|---|---|---|")
     done = [row for row in rows if "failed" not in row]
     for kind in sorted({row["kind"] for row in done}):
-        for wheels in ("wheels", "checked", "no wheels"):
-            _line(f"{kind}, {wheels}", [row for row in done if row["kind"] == kind and row["wheels"] == wheels])
+        _line(kind, [row for row in done if row["kind"] == kind])
+    for wheels in WHEELS:
+        _line(wheels, [row for row in done if row["wheels"] == wheels])
     for half in (0, 1):
         _line(f"**half {half + 1}**", [row for row in done if row["half"] == half])
     _line("**all**", done)

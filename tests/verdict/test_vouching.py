@@ -11,7 +11,7 @@ def test_a_kidnapping_is_wrong_and_flagged_and_the_rest_right(tmp_path, capsys):
     counts = row["counts"]
     assert (counts["wrong flagged"] >= 5, counts["wrong silent"]) == (True, 0)
     assert counts["right ok"] >= 40 and row["verdict"] != "trustworthy"
-    (judged,) = vouching.measured([case], tmp_path, again=False, rejudge=True)
-    assert judged == row
+    (again,) = vouching.measured([case], tmp_path, again=False, rejudge=True)
+    assert again == row
     vouching.table([row])
-    assert f"| 2D kidnapped, no wheels | 1 | {counts['wrong flagged']} of" in capsys.readouterr().out
+    assert f"| 2D kidnapped | 1 | {counts['wrong flagged']} of" in capsys.readouterr().out
