@@ -107,6 +107,12 @@ class Evidence:
         """(N,) scans around which the wheels agree with the trajectory."""
         return self.wheels.innovation <= WHEEL_LIMIT
 
+    @property
+    def is_after_gap(self) -> NDArray[np.bool_]:
+        """(N,) scans before which the log has none for so long that the motion is not predicted."""
+        intervals_s = np.diff(self.seconds, prepend=self.seconds[0])
+        return intervals_s > _GAP * np.median(intervals_s)
+
     def __len__(self) -> int:
         return len(self.seconds)
 
@@ -140,9 +146,13 @@ def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> 
 
 
 def _extent_m(evidence: Evidence, part: slice) -> float:
-    """Largest distance from the pose before a part."""
-    positions = evidence.poses[:, :-1, -1]
-    return float(np.linalg.norm(positions[part] - positions[max(part.start - 1, 0)], axis=1).max())
+    """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
+    positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
+    extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
+    if not evidence.is_after_gap[part.start]:
+        return extent_m
+    speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / np.median(np.diff(evidence.seconds))
+    return max(extent_m, float(speed_m_s * (evidence.seconds[part.start] - evidence.seconds[last])))
 
 
 def _passed_m(evidence: Evidence, part: slice) -> float:
@@ -154,10 +164,8 @@ def _passed_m(evidence: Evidence, part: slice) -> float:
 
 def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
     """(N,) scans around which most contradict their pose, and those after a gap over which no wheels agree."""
-    intervals_s = np.diff(evidence.seconds, prepend=evidence.seconds[0])
-    is_after_gap = intervals_s > _GAP * np.median(intervals_s)
     median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
-    return (is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
+    return (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
 
 
 def _of_wheels(evidence: Evidence) -> Iterator[Stretch]:

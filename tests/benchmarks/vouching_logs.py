@@ -264,19 +264,24 @@ _PLAIN_3D = (
     ("office", "vlp-16"), ("identical", "os1-32"),
 )  # fmt: skip
 _INCIDENTS = {
-    "gap": ("office utm-30", "identical lms-270", "town vlp-16", "forest os1-32", "staircase vlp-16"),
-    "kidnapped": ("office lms-270", "identical utm-30", "town vlp-16", "hall vlp-16"),
-    "carried": ("office utm-30", "identical lms-270", "rounds vlp-16", "forest os1-32"),
+    "gap": (
+        "office utm-30", "identical lms-270", "town vlp-16", "forest os1-32", "staircase vlp-16", "turns lms-270",
+        "highway vlp-16", "field os1-32", "hall os1-32",
+    ),
+    "kidnapped": (
+        "office lms-270", "identical utm-30", "town vlp-16", "hall vlp-16", "office utm-30", "town os1-32",
+        "forest vlp-16", "staircase os1-32",
+    ),
+    "carried": (
+        "office utm-30", "identical lms-270", "rounds vlp-16", "forest os1-32", "hall lms-270", "highway vlp-16",
+        "turns vlp-16",
+    ),
     "crowd": (
-        "office lms-270",
-        "hall utm-30",
-        "town vlp-16",
-        "highway os1-32",
-        "office rosette",
-        "corridor vlp-16",
+        "office lms-270", "hall utm-30", "town vlp-16", "highway os1-32", "office rosette", "corridor vlp-16",
+        "identical lms-270", "rounds vlp-16", "forest vlp-16",
     ),
     "mounting": ("office lms-270", "turns utm-30", "town vlp-16", "hall os1-32"),
-}
+}  # fmt: skip
 
 
 def cases() -> list[Case]:

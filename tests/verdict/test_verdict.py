@@ -244,3 +244,12 @@ def test_degenerate_scans_between_which_others_measure_the_pose_are_passed():
     poses, _ = course()
     mostly = marked(300, 360) & (np.arange(N) % 8 != 0)  # 0.7 m at a time
     assert judge(evidence(poses, is_degenerate=mostly)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_lidar_that_seems_to_stand_after_a_gap_at_speed_is_to_be_checked():
+    poses, _ = course()
+    poses[316:] = poses[299] @ lie.inverse(poses[315]) @ poses[316:]  # as if the gap had lasted a moment
+    kept = ~marked(300, 315)
+    changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
+    (stretch,) = judge(evidence(poses[kept], **changes)).stretches
+    assert (stretch.kind, stretch.first) == (Kind.CONTRADICTED, 300)
