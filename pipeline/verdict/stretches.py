@@ -141,15 +141,15 @@ def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> 
     for part in merged(is_marked):
         inner = merged(is_marked[part], 0 if kind is not Kind.CONTRADICTED else _GAP_SCANS)
         runs = [slice(part.start + run.start, part.start + run.stop) for run in inner]
-        if any(_extent_m(evidence, run) > _passed_m(evidence, run) for run in runs):
+        if any(_extent_m(evidence, run, kind) > _passed_m(evidence, run) for run in runs):
             yield _stretch(evidence, kind, part.start, part.stop - 1, int(is_marked[part].sum()))
 
 
-def _extent_m(evidence: Evidence, part: slice) -> float:
+def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
     """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
     positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
     extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
-    if not evidence.is_after_gap[part.start]:
+    if kind is Kind.DEGENERATE or not evidence.is_after_gap[part.start]:
         return extent_m
     speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / np.median(np.diff(evidence.seconds))
     return max(extent_m, float(speed_m_s * (evidence.seconds[part.start] - evidence.seconds[last])))
