@@ -218,12 +218,15 @@ class Odometry:
     def _at_stamp(self, tracked: Tracked, sweep: Sweep, prediction: Prediction) -> Tracked:
         """A scan that was aligned as seen from its middle, as seen from its stamp.
 
-        The stamp lies between two middles, or just beyond; the motion between these is the last one.
+        The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
+        changes at the rate of the last two motions. In translation such a rate would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.interval_s <= 0.0:
             return tracked
-        motion = lie.log(self.predictor.T_previous_current)
-        return seen_from(tracked, lie.exp(sweep.middle_s / prediction.interval_s * motion))
+        mean = lie.log(self.predictor.T_previous_current) / prediction.interval_s
+        change = (1.0 - sweep.middle_s / prediction.interval_s) * (self.predictor.velocity - mean)
+        change[: self.dimension] = 0.0
+        return seen_from(tracked, lie.exp(sweep.middle_s * (mean + change)))
 
     def _check_dimension(self, scan: Scan) -> None:
         checks.instance(

@@ -176,6 +176,16 @@ def test_missing_scans_accelerate_nothing():
     assert np.nanmax(check_velocity(stamps_ns[there], stamps_ns[there], poses[there])) < 0.1
 
 
+def test_a_short_interval_after_a_gap_accelerates_nothing():
+    motions = np.tile([0.0, 0.0, 0.0], (60, 1))
+    motions[30] = [1.9, 0.0, 0.0]  # over 16 s without scans
+    intervals_s = np.full(60, 0.2)
+    intervals_s[30:32] = 16.0, 0.08
+    stamps_ns = (1e9 * np.concatenate([[0.0], np.cumsum(intervals_s)])).astype(np.int64)
+    poses = chained(motions, np.random.default_rng(0))
+    assert np.nanmax(check_velocity(stamps_ns, stamps_ns, poses)) < 1.0
+
+
 @pytest.mark.parametrize("kind", [Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED])
 def test_a_stretch_of_doubtful_scans_is_to_be_checked_and_most_of_a_run_is_not_trustworthy(kind):
     poses, _ = course()

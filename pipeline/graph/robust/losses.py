@@ -241,6 +241,8 @@ def _check(loss: RobustLoss) -> None:
     try:
         weight = np.asarray(loss.weight(chi2), np.float64)
         slope = (np.asarray(loss.loss(chi2 + step), np.float64) - loss.loss(chi2)) / step
+    except InputError:
+        raise
     except Exception as error:  # of the user's own code
         reason = " ".join(str(error).split())
         raise InputError(
