@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, State, Trajectory
 from scanchain.errors import InputError
-from scanchain.odometry.tracked import NEW_MAP
 from scanchain.runs.closures import VERIFICATION
 from scanchain.verdict import Closures, Evidence, Judged, check_velocity, check_wheels, judge
 
@@ -46,7 +45,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
         is_lost=states == State.LOST,
         is_degenerate=states == State.DEGENERATE,
         fit=steps["fit"].to_numpy(),
-        starts_segment=np.array([NEW_MAP in reason for reason in steps["reason"].to_pylist()]),
+        starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),

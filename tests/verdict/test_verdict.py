@@ -1,10 +1,17 @@
 """The verdict on made-up trajectories: right ones are trustworthy; slips, jumps and wrong loops are named."""
 
+from dataclasses import replace
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from scanchain import lie
+from scanchain.data import Trajectory
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of
 from scanchain.verdict import Closures, Evidence, Kind, Verdict, check_velocity, check_wheels, judge
+from tests.support.recordings import drive
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
 
@@ -212,3 +219,13 @@ def test_segments_that_a_closure_joins_are_not_told():
     joined = evidence(poses, starts_segment=starts)
     object.__setattr__(joined, "closures", closures)
     assert judge(joined).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_scan_that_starts_a_segment_is_known_from_its_column_whatever_its_reason_says(tmp_path):
+    table = StepTable()
+    for step in drive(20, 3):
+        table.append(replace(step, starts_segment=step.scan.index == 7, reason="a new map begins"))
+    poses = np.array([row.T_world_lidar for row in table.rows])
+    table.write(tmp_path / "steps.parquet", Trajectory(table.odometry.stamps_ns, poses))
+    found = evidence_of(pq.ParquetFile(tmp_path / "steps.parquet").read(), None)
+    assert np.flatnonzero(found.starts_segment).tolist() == [7]

@@ -50,7 +50,7 @@ class Kernel(Protocol):
     """
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
+        """W = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
         ...
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -80,7 +80,7 @@ class Quadratic:
     """ρ = χ²: no robust loss."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = 1."""
+        """W = 1."""
         return np.ones_like(chi2)
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -92,7 +92,7 @@ class Huber:
     """Huber 1964: linear in χ above s."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = min(1, s/χ)."""
+        """W = min(1, s/χ)."""
         return s / np.sqrt(np.maximum(chi2, s**2))
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -105,7 +105,7 @@ class Cauchy:
     """Of the Cauchy distribution: grows without bound, but slowly."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = s² / (s² + χ²)."""
+        """W = s² / (s² + χ²)."""
         return s**2 / (s**2 + chi2)
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -119,7 +119,7 @@ class GemanMcClure:
     schedule = _WIDENED
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = (μ s² / (μ s² + χ²))²."""
+        """W = (μ s² / (μ s² + χ²))²."""
         return (mu * s**2 / (mu * s**2 + chi2)) ** 2
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -133,7 +133,7 @@ class Tukey:
     schedule = _WIDENED
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = (1 − χ²/(μ s²))² or 0."""
+        """W = (1 − χ²/(μ s²))² or 0."""
         return np.maximum(1.0 - chi2 / (mu * s**2), 0.0) ** 2
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -148,7 +148,7 @@ class Truncated:
     schedule = _SURROGATE
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
+        """W = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
         if np.isinf(mu):
             return (chi2 <= s**2).astype(np.float64)
         middle = s * np.sqrt(mu * (mu + 1.0) / np.maximum(chi2, 1e-300)) - mu
