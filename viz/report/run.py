@@ -76,6 +76,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "verdict", str(m.verdict)
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
+    yield "expected ATE", m.expected_ate
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "pose graph", m.fit
