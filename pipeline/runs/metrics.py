@@ -78,7 +78,8 @@ class Metrics(Struct, frozen=True):
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
-    ``expected_ate_m`` is the ATE by the covariances of the graph; null where its edges leave poses free.
+    ``expected_ate_m`` is the ATE by the covariances of the graph; null where it has no edge or these leave
+    poses free.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``warnings`` : data lost, skipped or wrong, a line each
     """
@@ -122,10 +123,15 @@ class Metrics(Struct, frozen=True):
 
     @property
     def expected_ate(self) -> str:
-        """Expected ATE as text; what is wrong in a stretch, no covariance knows."""
+        """Expected ATE as text; no covariance knows of what the verdict doubts."""
         if self.expected_ate_m is None:
-            return "unknown: the edges of the graph leave poses free"
-        return self.expected_ate_m.text + (" if no stretch is wrong" if self.stretches else "")
+            return "unknown: the pose graph has no edge, or its edges leave poses free"
+        condition = {
+            Verdict.TRUSTWORTHY: "",
+            Verdict.CHECK: " if no stretch is wrong",
+            Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
+        }
+        return self.expected_ate_m.text + condition[self.verdict]
 
     @property
     def sentence(self) -> str:
@@ -268,6 +274,8 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
 
 def _expected_ate(result: SlamResult) -> ExpectedError | None:
     starts = [keyframe.scan_index for keyframe in result.keyframes]
+    if len(starts) < 2:
+        return None
     try:
         return expected_ate(result.graph, np.diff([*starts, len(result.trajectory)]))
     except InputError:

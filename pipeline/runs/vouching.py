@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
 def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
+    return judge(evidence_of_run(folder))
+
+
+def evidence_of_run(folder: Path) -> Evidence:
+    """Evidence of every scan in a run directory. Raises InputError where it has no tables."""
     import pyarrow.parquet as pq
 
     if not folder.is_dir():
@@ -29,7 +34,7 @@ def judge_run(folder: Path) -> Judged:
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"
-    return judge(evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None))
+    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None)
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:

@@ -163,7 +163,7 @@ class SparseCholesky:
         return result.reshape(right_side.shape)
 
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x (scalars,) of U x = z by the last factor; for white noise z of variance 1, of covariance A⁻¹."""
+        """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
         x = noise.copy()
         cholesky.solve_upper(self._fronts, self._factor, x, np.empty(self._fronts.widest))
         return x[self._places]
