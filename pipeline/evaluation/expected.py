@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scanchain.graph.between import turns
 from scanchain.graph.pose_graph import PoseGraph
 
-_SAMPLES = 200
+_BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
 _BOUNDS = (2.5, 97.5)  # percentiles
+_RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
 
 
 class ExpectedError(Struct, frozen=True):
@@ -35,14 +36,18 @@ def expected_ate(graph: PoseGraph, scans: NDArray[np.int64] | None = None) -> Ex
     scans : (K,) wᵢ, number of scans that each pose stands for, 1 where left out
     Raises InputError where the edges leave poses free.
     """
-    errors, positions = graph.position_errors(_SAMPLES), graph.poses[:, :-1, -1]
+    positions = graph.poses[:, :-1, -1]
     count, d = positions.shape
     weight = np.ones(count) if scans is None else scans.astype(np.float64)
-    lever = turns(positions - positions.mean(axis=0))
-    rigid = np.concatenate([np.broadcast_to(np.eye(d), (count, d, d)), lever], axis=2)
-    root = np.sqrt(weight / weight.sum())[:, None, None]
-    A, B = (root * rigid).reshape(count * d, -1), (root * errors.transpose(1, 2, 0)).reshape(count * d, -1)
-    left = B - A @ np.linalg.lstsq(A, B)[0]
-    ates_m = np.linalg.norm(left, axis=0)
+    root = np.sqrt(weight / weight.sum())[:, None]
+    moved = np.concatenate(
+        [np.broadcast_to(np.eye(d), (count, d, d)), turns(positions - positions.mean(axis=0))], axis=2
+    )
+    basis, size, _ = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
+    basis = basis[:, size > _RANK_TOLERANCE * size[0]]
+    ates_m = []
+    for seed in range(_BATCHES):
+        weighted = (root * graph.position_errors(_BATCH, seed)).reshape(_BATCH, -1)
+        ates_m.extend(np.linalg.norm(weighted - weighted @ basis @ basis.T, axis=1).tolist())
     low, high = np.percentile(ates_m, _BOUNDS).tolist()
-    return ExpectedError(float(ates_m.mean()), low, high)
+    return ExpectedError(float(np.mean(ates_m)), low, high)

@@ -50,11 +50,10 @@ def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: in
     """Errors (count, K, d) of all positions, drawn from their joint distribution; those of fixed poses are zero.
 
     Of the linearized problem with H = Uᵀ U: left twists ξ = U⁻¹ z of independent normal z move a position t by
-    ρ + φ × t. (Twists by exp(ξ) would bend what loops keep straight: linearly the errors come out truer.)
+    ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.)
     """
     d, random = poses.shape[-1] - 1, np.random.default_rng(seed)
-    positions = poses[problem.free, :d, d]
-    lever = turns(positions)
+    lever = turns(poses[problem.free, :d, d])
     errors = np.zeros((count, len(poses), d))
     for k in range(count):
         twists = problem.packing.spread_rows(problem.cholesky.draw(random.normal(size=problem.pattern.scalars)))

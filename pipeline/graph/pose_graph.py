@@ -283,6 +283,7 @@ class PoseGraph:
 
         Raises InputError where these leave poses free.
         """
+        count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
         return position_errors(self._factored(), self.poses, count, seed)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
