@@ -9,5 +9,6 @@ STRETCH_COLORS = {
     Kind.WHEELS: "#d6308f",
     Kind.ACCELERATION: "#8a1c1c",
     Kind.LOOPS: "#0f9bb5",
+    Kind.OVERLAP: "#b7791f",
     Kind.DISCONNECTED: "#6b7280",
 }

@@ -1,6 +1,6 @@
 """Independent checks of a trajectory, and the verdict on it."""
 
-from scanchain.verdict.checks import check_velocity, check_wheels
+from scanchain.verdict.checks import check_overlap, check_velocity, check_wheels
 from scanchain.verdict.loops import Closures
 from scanchain.verdict.stretches import VELOCITY_LIMIT, WHEEL_LIMIT, Evidence, Kind, Stretch
 from scanchain.verdict.verdict import MOST_CONTRADICTED, Judged, Verdict, judge
@@ -17,6 +17,7 @@ __all__ = [
     "Stretch",
     "Verdict",
     "WorstPlace",
+    "check_overlap",
     "check_velocity",
     "check_wheels",
     "judge",

@@ -29,6 +29,9 @@ _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third o
 _MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
 _ALIKE = 1.4  # largest ratio of two intervals that agree
 
+_FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
+_LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
+
 
 class WheelCheck(NamedTuple):
     """Trajectory against wheels around each scan, NaN where there is nothing to compare.
@@ -114,6 +117,19 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
         best = np.minimum(best, np.maximum(_lengths(change[:, :d]) / sigma_m, _lengths(change[:, d:]) / sigma_rad))
     innovation[2:] = best
     return innovation
+
+
+def check_overlap(inlier_share: Floats) -> Floats:
+    """(N,) share of the points with a correspondence over its median in the scans before, NaN for the first.
+
+    What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
+    than the map says, or something stands close before it.
+    """
+    n = len(inlier_share)
+    usual = [np.median(inlier_share[max(scan - _BEFORE, 0) : scan]) for scan in range(_FEWEST, n)]
+    ratio = np.full(n, np.nan)
+    ratio[_FEWEST:] = inlier_share[_FEWEST:] / np.maximum(usual, _LEAST_USUAL)
+    return ratio
 
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:

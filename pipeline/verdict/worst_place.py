@@ -48,5 +48,7 @@ def _contradiction(evidence: Evidence, stretch: Stretch) -> Floats:
         return np.nan_to_num(evidence.velocity[part])
     if stretch.kind is Kind.CONTRADICTED:
         return 1.0 - np.nan_to_num(evidence.fit[part], nan=1.0)
+    if stretch.kind is Kind.OVERLAP:
+        return 1.0 - np.nan_to_num(evidence.overlap[part], nan=1.0)
     steps_m = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], axis=0), axis=1)
     return np.concatenate([[0.0], steps_m])[part]

@@ -26,7 +26,12 @@ from scanchain.viz.stretch_colors import STRETCH_COLORS
 from scanchain.words import counted
 
 _DISPUTED = "at closures rejected by the back end"
-_OVER_ALL = (Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED)  # drawn over the states of single scans
+_OVER_ALL = (
+    Kind.OVERLAP,
+    Kind.WHEELS,
+    Kind.ACCELERATION,
+    Kind.DISCONNECTED,
+)  # drawn over the states of single scans
 _COLORS = {
     State.DEGENERATE: STRETCH_COLORS[Kind.DEGENERATE],
     State.LOST: STRETCH_COLORS[Kind.LOST],
