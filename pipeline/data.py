@@ -323,6 +323,7 @@ class Step:
     closures : loop closures tried at this scan
     graph : the optimized graph if this scan led to an optimization, else None
     timing : seconds by stage
+    starts_segment : True if its motion from the scan before is unknown
     """
 
     scan: Scan
@@ -337,6 +338,7 @@ class Step:
     closures: tuple[Closure, ...]
     graph: GraphState | None
     timing: Timing
+    starts_segment: bool = False
 
 
 @dataclass(frozen=True, slots=True)

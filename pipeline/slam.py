@@ -148,6 +148,7 @@ class Slam:
             closures=closures,
             graph=state,
             timing=timing,
+            starts_segment=tracked.elsewhere_m > 0.0,
         )
 
     def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:

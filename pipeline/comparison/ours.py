@@ -49,6 +49,7 @@ class OurOdometry:
                 closures=(),
                 graph=None,
                 timing=Timing(0.0, tracked.preprocess_s, tracked.match_s, tracked.map_s, 0.0),
+                starts_segment=tracked.elsewhere_m > 0.0,
             )
         )
         return tracked.T_odom_lidar

@@ -10,6 +10,7 @@ from scanchain.evaluation.absolute import (
     on_the_estimate,
 )
 from scanchain.evaluation.consistency import disagreement, motion_nees
+from scanchain.evaluation.expected import ExpectedError, expected_ate
 from scanchain.evaluation.pairing import Pairs, Statistics, during, pair
 from scanchain.evaluation.reference import TruthFile, check_overlap, read_truth
 from scanchain.evaluation.relations import (
@@ -39,6 +40,7 @@ __all__ = [
     "SHORT_LENGTHS_M",
     "AbsoluteError",
     "Alignment",
+    "ExpectedError",
     "KittiError",
     "LengthError",
     "Pairs",
@@ -54,6 +56,7 @@ __all__ = [
     "check_overlap",
     "disagreement",
     "during",
+    "expected_ate",
     "far_off",
     "kitti_error",
     "kitti_error_of_any_path",

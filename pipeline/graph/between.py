@@ -134,11 +134,11 @@ class BetweenProblem:
             R_t = np.swapaxes(T_i[:, :d, :d] @ self.measurements[self.sightings, :d, :d], 1, 2)
             jacobian[self.sightings] = 0.0
             jacobian[self.sightings, :d, :d] = R_t
-            jacobian[self.sightings, :d, d:] = R_t @ _turns(T_j[:, :d, d])
+            jacobian[self.sightings, :d, d:] = R_t @ turns(T_j[:, :d, d])
         return jacobian
 
 
-def _turns(positions: Matrix) -> Matrix:
+def turns(positions: Matrix) -> Matrix:
     """∂t/∂φ (E, d, 1 or 3) of positions (E, d) turned about the origin."""
     if positions.shape[1] == 3:
         return -lie.hat(positions)

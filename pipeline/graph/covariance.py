@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.graph.between import BetweenProblem
+from scanchain.graph.between import BetweenProblem, turns
 from scanchain.whole_file import write_whole
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
@@ -44,6 +44,21 @@ def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
             selection[problem.variable[pose]] += sign * np.eye(problem.freedom)
     flat = problem.packing.rows(selection)
     return flat.T @ problem.cholesky.solve(flat)
+
+
+def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
+    """Errors (count, K, d) of all positions, drawn from their joint distribution; those of fixed poses are zero.
+
+    Of the linearized problem with H = Uᵀ U: left twists ξ = U⁻¹ z of independent normal z move a position t by
+    ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.)
+    """
+    d, random = poses.shape[-1] - 1, np.random.default_rng(seed)
+    lever = turns(poses[problem.free, :d, d])
+    errors = np.zeros((count, len(poses), d))
+    for k in range(count):
+        twists = problem.packing.spread_rows(problem.cholesky.draw(random.normal(size=problem.pattern.scalars)))
+        errors[k, problem.free] = twists[:, :d] + (lever @ twists[:, d:, None])[..., 0]
+    return errors
 
 
 def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
-from scanchain.graph.covariance import own_covariances, relative_covariance
+from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
@@ -277,6 +277,14 @@ class PoseGraph:
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         return own_covariances(problem)
+
+    def position_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
+        """Errors (count, K, d) of all positions, drawn from their joint distribution by the edges in force.
+
+        Raises InputError where these leave poses free.
+        """
+        count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
+        return position_errors(self._factored(), self.poses, count, seed)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")

@@ -38,7 +38,9 @@ class FrontEnd:
         self.odometry = Odometry(config, T_base_lidar)
         self.T_odom_keyframe = lie.identity(self.odometry.dimension)
         self.T_odom_last = lie.identity(self.odometry.dimension)
-        self.covariance = np.zeros((lie.twist_size(T_base_lidar),) * 2)
+        self.at_keyframe = np.zeros((lie.twist_size(T_base_lidar),) * 2)
+        self.covariance: Matrix | None = self.at_keyframe  # of the motion since the keyframe, None where unknown
+        self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0
 
@@ -50,7 +52,7 @@ class FrontEnd:
         information = self._add_motion(tracked)
         if is_keyframe:
             self.T_odom_keyframe = tracked.T_odom_lidar
-            self.covariance, self.since_keyframe = np.zeros_like(self.covariance), 0
+            self.covariance, self.since_keyframe = self.at_keyframe, 0
         local_map = self.odometry.local_map
         return Located(
             tracked=tracked,
@@ -62,14 +64,18 @@ class FrontEnd:
         )
 
     def _add_motion(self, tracked: Tracked) -> Matrix:
-        """Information of the motion since the last keyframe: of the match, and of the wheels over all scans since.
+        """Information of the motion since the last keyframe: of the match, and of all predictions since.
 
-        The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances.
+        The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances; so
+        do those of scans between that have no reading. Without wheels the match is all there is.
         """
         self.since_keyframe += 1
+        self.has_wheels |= tracked.prior.is_measured
         n, T_last_current = self.since_keyframe, lie.between(self.T_odom_last, tracked.T_odom_lidar)
         self.T_odom_last = tracked.T_odom_lidar
-        if not tracked.prior.is_measured:
+        if not self.has_wheels:
+            self.covariance = None
+        if self.covariance is None:
             return tracked.match.information
         predicted = n * tracked.prior.covariance
         if n > 1:
@@ -77,7 +83,7 @@ class FrontEnd:
             predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
         matched = np.zeros_like(predicted) if tracked.state is State.LOST else tracked.match.information
         information = np.linalg.inv(predicted) + matched
-        self.covariance = np.linalg.inv(information)
+        self.covariance = np.linalg.inv(information).astype(np.float64, copy=False)
         return information
 
     def _moved_enough(self, tracked: Tracked) -> bool:

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Matrix, Scan, Step
+from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source
+from scanchain.verdict import Judged
 
 if TYPE_CHECKING:
     from scanchain.runs.closures import FinalClosure
@@ -144,6 +145,10 @@ class Recorder(Protocol):
 
     def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
         """Record the closures graph and the closures verdict on every closure."""
+        ...
+
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
+        """Record the verdict, and its stretches on the optimized trajectory."""
         ...
 
     def log_ground_truth(self, poses: Matrix) -> None:

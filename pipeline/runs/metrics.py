@@ -14,7 +14,14 @@ from msgspec import Struct
 
 from scanchain.data import State, Trajectory, fit_text
 from scanchain.errors import InputError
-from scanchain.evaluation import Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
+from scanchain.evaluation import (
+    ExpectedError,
+    Pairs,
+    absolute_error_of_any_path,
+    expected_ate,
+    kitti_error_of_any_path,
+    pair,
+)
 from scanchain.evaluation.absolute import far_off, path_length
 from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
 from scanchain.runs.results import Cloud
@@ -72,6 +79,8 @@ class Metrics(Struct, frozen=True):
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
+    ``expected_ate_m`` is the ATE by the covariances of the graph; null where it has no edge or these leave
+    poses free.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
     ``calibrated_from`` on; 0 where no error was found.
@@ -111,10 +120,23 @@ class Metrics(Struct, frozen=True):
     verdict: Verdict = Verdict.TRUSTWORTHY
     verdict_reason: str = ""
     stretches: tuple[Stretch, ...] = ()
+    expected_ate_m: ExpectedError | None = None
     stopped: str = ""
     compile_s: float = 0.0
     elevation_offset_rad: float = 0.0
     calibrated_from: int = 0
+
+    @property
+    def expected_ate(self) -> str:
+        """Expected ATE as text; no covariance knows of what the verdict doubts."""
+        if self.expected_ate_m is None:
+            return "unknown: the pose graph has no edge, or its edges leave poses free"
+        condition = {
+            Verdict.TRUSTWORTHY: "",
+            Verdict.CHECK: " if no stretch is wrong",
+            Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
+        }
+        return self.expected_ate_m.text + condition[self.verdict]
 
     @property
     def sentence(self) -> str:
@@ -209,6 +231,7 @@ def measure(
         verdict=judged.verdict,
         verdict_reason=judged.reason,
         stretches=judged.stretches,
+        expected_ate_m=_expected_ate(result),
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,
@@ -238,6 +261,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, "
         f"{m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost{dropped}",
         f"trajectory     {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
+        f"expected ATE   {m.expected_ate}",
         f"loop closures  {m.closures}",
         f"pose graph     {m.fit}",
         f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
@@ -254,6 +278,16 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         lines += _accuracy_lines(m.ground_truth)
     lines += [f"warning        {warning}" for warning in m.warnings]
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
+
+
+def _expected_ate(result: SlamResult) -> ExpectedError | None:
+    starts = [keyframe.scan_index for keyframe in result.keyframes]
+    if len(starts) < 2:
+        return None
+    try:
+        return expected_ate(result.graph, np.diff([*starts, len(result.trajectory)]))
+    except InputError:
+        return None
 
 
 def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:

@@ -19,23 +19,27 @@ from scanchain.logs import Log
 from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
+from scanchain.runs.overlay import OVERLAY_FILE, write_overlay
 from scanchain.runs.results import Cloud, record_results, results_of, write_results
 from scanchain.runs.resume.checkpoint import Checkpoints
 from scanchain.runs.resume.journal import JOURNAL_FILE, Journal
 from scanchain.runs.resume.resuming import Left, after, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of_run
 from scanchain.slam import Slam, SlamResult
+from scanchain.verdict import Judged, judge, worst_place
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 
 
 @dataclass(frozen=True, slots=True)
 class Processed:
-    """The result of a log, the warnings of the recording, and the seconds that the user kept the viewer open."""
+    """The result of a log, its verdict, warnings of the recording, seconds that the user kept the viewer open."""
 
     result: SlamResult
     cloud: Cloud
     final: tuple[FinalClosure, ...]
+    judged: Judged
     warnings: tuple[str, ...]
     held_s: float
 
@@ -80,12 +84,18 @@ def process(
         with directory.results() as folder:
             results = results_of(log, config, steps, result, final)
             write_results(folder, results)
+            evidence = evidence_of_run(folder)
+            judged = judge(evidence)
+            worst = worst_place(judged.stretches, evidence)
+            if worst is not None:
+                write_overlay(folder / OVERLAY_FILE, worst, result)
             record_results(recording, results)
+            recording.log_verdict(judged, result.trajectory)
             _record_truth(true_poses, job.max_gap_s, result, recording)
         slam.points.close()
         held_s = _hold(recording, progress)
         progress.say("writing the rest of the recording")
-    return Processed(result, results.cloud, final, (*notes, *recording.warnings), held_s)
+    return Processed(result, results.cloud, final, judged, (*notes, *recording.warnings), held_s)
 
 
 def _begin(

@@ -35,7 +35,6 @@ from scanchain.runs.resume.journal import JOURNAL_FILE
 from scanchain.runs.resume.rescue import rescued
 from scanchain.runs.resume.resuming import Left, find_left
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.vouching import judge_run
 from scanchain.settings import dump, load_settings, named
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_tum
@@ -105,7 +104,7 @@ def run(
                 few = _few_scans(len(steps))
                 warnings = (*log.damage, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
-                    steps, done.result, done.cloud, done.final, judge_run(directory.path),
+                    steps, done.result, done.cloud, done.final, done.judged,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)

@@ -39,6 +39,7 @@ class StepRow:
     keyframe: int
     timing: Timing
     T_odom_base: Pose | None = None
+    starts_segment: bool = False
 
 
 class StepTable:
@@ -68,6 +69,7 @@ class StepTable:
                 step.keyframe,
                 step.timing,
                 scan.T_odom_base,
+                step.starts_segment,
             )
         )
         return self.rows[-1]
@@ -138,6 +140,7 @@ class StepTable:
             ),
             "state": pa.array([str(row.state) for row in rows]).dictionary_encode(),
             "reason": pa.array([row.reason for row in rows]).dictionary_encode(),
+            "starts_segment": [row.starts_segment for row in rows],
             "keyframe": [row.keyframe for row in rows],
             **{f"{stage}_s": [getattr(timing, f"{stage}_s") for timing in timings] for stage in STAGES},
         }
@@ -176,6 +179,7 @@ _NOTES = {
     "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
     "null where there is nothing to compare",
     "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
+    "starts_segment": "true if the motion from the scan before is unknown: a new map begins there",
     "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
     "keyframe": "number in the graph, -1 if none was made",
 }

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, State, Trajectory
 from scanchain.errors import InputError
-from scanchain.odometry.tracked import NEW_MAP
 from scanchain.runs.closures import VERIFICATION
 from scanchain.verdict import Closures, Evidence, Judged, check_overlap, check_velocity, check_wheels, judge
 
@@ -21,6 +20,11 @@ if TYPE_CHECKING:
 
 def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
+    return judge(evidence_of_run(folder))
+
+
+def evidence_of_run(folder: Path) -> Evidence:
+    """Evidence of every scan in a run directory. Raises InputError where it has no tables."""
     import pyarrow.parquet as pq
 
     if not folder.is_dir():
@@ -34,7 +38,7 @@ def judge_run(folder: Path) -> Judged:
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"
-    return judge(evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None))
+    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None)
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
@@ -50,7 +54,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
         is_lost=states == State.LOST,
         is_degenerate=states == State.DEGENERATE,
         fit=steps["fit"].to_numpy(),
-        starts_segment=np.array([NEW_MAP in reason for reason in steps["reason"].to_pylist()]),
+        starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),

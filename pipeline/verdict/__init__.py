@@ -4,6 +4,7 @@ from scanchain.verdict.checks import check_overlap, check_velocity, check_wheels
 from scanchain.verdict.loops import Closures
 from scanchain.verdict.stretches import VELOCITY_LIMIT, WHEEL_LIMIT, Evidence, Kind, Stretch
 from scanchain.verdict.verdict import MOST_CONTRADICTED, Judged, Verdict, judge
+from scanchain.verdict.worst_place import WorstPlace, worst_place
 
 __all__ = [
     "MOST_CONTRADICTED",
@@ -15,8 +16,10 @@ __all__ = [
     "Kind",
     "Stretch",
     "Verdict",
+    "WorstPlace",
     "check_overlap",
     "check_velocity",
     "check_wheels",
     "judge",
+    "worst_place",
 ]

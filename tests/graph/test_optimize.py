@@ -5,7 +5,9 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
+from scanchain.data import Trajectory
 from scanchain.errors import InputError
+from scanchain.evaluation import absolute_error, expected_ate, pair
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.solvers.descent import Optimizer
@@ -324,6 +326,62 @@ def test_covariances_equal_those_of_gtsam(name):
         ours = found[pose][np.ix_(order, order)]
         # GTSAM linearizes its residual in another chart where the residual is large, hence a few thousandths
         assert np.abs((ours - theirs) / np.outer(spread, spread)).max() < (1e-3 if flat else 0.05)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_errors_drawn_of_positions_have_the_covariances_of_the_poses(dimension):
+    graph, _ = ring(dimension, count=9, noise=0.02)
+    graph.optimize(PLAIN)
+    R = graph.poses[:, :-1, :-1]
+    own = graph.covariances()[:, :dimension, :dimension]
+    expected = R @ own @ np.swapaxes(R, 1, 2)
+    drawn = graph.position_errors(4000)
+    assert not drawn[:, 0].any()
+    for pose in range(1, 9):
+        size = np.trace(expected[pose])
+        assert np.abs(np.cov(drawn[:, pose].T) - expected[pose]).max() < 0.08 * size
+    assert np.array_equal(drawn[:5], graph.position_errors(5))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_of_results_of_redrawn_measurements_95_of_100_lie_within_the_bounds_of_the_expected_ate(dimension):
+    rng = np.random.default_rng(0)
+    _, true = ring(dimension, count=24)
+    inside = 0
+    for _ in range(100):
+        graph = redrawn(true, rng)
+        bounds = expected_ate(graph)
+        poses = Trajectory(graph.stamps_ns, lie.lift(graph.poses))
+        ate = absolute_error(pair(poses, Trajectory(graph.stamps_ns, lie.lift(true))))
+        inside += bounds.low <= ate.translation_m.rmse <= bounds.high
+    assert 90 <= inside <= 99
+
+
+def redrawn(true, rng):
+    """A ring, optimized, whose edges err as their information says."""
+    k = 3 if len(true[0]) == 3 else 6
+    sigma = rng.uniform(0.005, 0.03, k)
+    graph = PoseGraph(len(true[0]) - 1)
+    for index, T in enumerate(true):
+        graph.add_pose(T, 1_000_000_000 * index)
+    for i in range(len(true)):
+        j = (i + 1) % len(true)
+        Z = lie.between(true[i], true[j]) @ lie.exp(sigma * rng.normal(size=k))
+        graph.add_edge(i, j, Z, np.diag(sigma**-2.0))
+    graph.optimize(PLAIN)
+    return graph
+
+
+def test_a_pose_that_stands_for_many_scans_weighs_as_many_in_the_expected_ate():
+    graph = PoseGraph(2)
+    for index in range(3):
+        graph.add_pose(lie.pose_2d(index, 0.0, 0.0), index)
+    graph.add_edge(0, 1, lie.pose_2d(1.0, 0.0, 0.0), 1e12 * np.eye(3))
+    graph.add_edge(1, 2, lie.pose_2d(1.0, 0.0, 0.0), np.diag([1.0, 1e12, 1e12]))
+    alone, among_many = expected_ate(graph), expected_ate(graph, np.array([98, 1, 1]))
+    sigma_m, mean_m = 1.0, np.sqrt(2.0 / np.pi)
+    assert alone.mean == pytest.approx(sigma_m * mean_m * np.sqrt(2.0) / 3.0, rel=0.1)
+    assert among_many.mean == pytest.approx(sigma_m * mean_m * np.sqrt(0.01 * 0.99), rel=0.1)
 
 
 def test_odometry_alone_adds_up_the_covariances_of_its_steps():

@@ -66,24 +66,27 @@ def test_a_submap_holds_keyframes_of_its_own_segment_alone():
 
 
 def carried(slam, scans, first, last):
-    """The result of a log of which some scans were not recorded."""
-    for index, scan in enumerate(scans):
-        if not first <= index < last:
-            slam.process(replace(scan, T_odom_base=None))
-    return slam.finish()
+    """The result of a log of which some scans were not recorded, and the scans that start a segment."""
+    starts = [
+        scan.index
+        for index, scan in enumerate(scans)
+        if not first <= index < last and slam.process(replace(scan, T_odom_base=None)).starts_segment
+    ]
+    return slam.finish(), starts
 
 
 def test_a_robot_that_was_carried_elsewhere_is_found_again():
     log = open_log(shared_data("2d/intel.mcap"))
     scans = list(islice(log.scans(), 8000))
-    whole = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
+    whole, none = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
     slam = Slam(configured(2), log.T_base_lidar)
-    holed = carried(slam, scans, 4000, 4600)
+    holed, starts = carried(slam, scans, 4000, 4600)
     before, after = (
         absolute_error(pair(trajectory, whole.trajectory)).translation_m.rmse
         for trajectory in (holed.odometry, holed.trajectory)
     )
     assert len(slam.closer.segments.starts) == 2
+    assert none == [] and starts == [4600]
     assert before > 5.0
     assert after < 0.5
     across = [

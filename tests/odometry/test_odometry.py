@@ -8,11 +8,12 @@ import pytest
 
 from scanchain import baselines, lie
 from scanchain.config import Config, LogConfig
-from scanchain.data import Scan, State, Trajectory, Verdict
+from scanchain.data import Prior, Scan, State, Trajectory, Verdict
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.logs import open_log
-from scanchain.odometry import Odometry
+from scanchain.odometry import FrontEnd, Odometry
+from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.preprocess import sweep_of
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
@@ -217,6 +218,32 @@ def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
     assert step.state is State.DEGENERATE
     assert abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
     assert "is undetermined" in step.reason
+
+
+def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wheel_reading_too():
+    def sigmas_m(is_read):
+        front_end = FrontEnd(configured(2, {"odometry.keyframe_distance_m": 100.0}), np.eye(3))
+        told = []
+        for index, is_measured in enumerate(is_read):
+            T = lie.pose_2d(0.1 * index, 0.0, 0.0)
+            prior = Prior(T, 1e-4 * np.eye(3), np.ones(3), is_measured)
+            match = replace(first_match(T, np.zeros((9, 2)), configured(2).matching), information=SEES_ACROSS)
+            tracked = Tracked(None, NOTHING, NOTHING, T, match, State.DEGENERATE, "", prior, 0.0, 0.0, 0.0)
+            front_end.odometry.process = lambda scan, tracked=tracked: tracked
+            told.append(front_end.locate(None).information)
+        return np.sqrt(np.linalg.inv(np.array(told) + 1e-9 * np.eye(3))[:, 0, 0])
+
+    read = np.arange(24) > 0
+    whole, holed, without = sigmas_m(read), sigmas_m(read & ~between(5, 14)), sigmas_m(read & between(9, 9))
+    assert np.allclose(whole[1:], 0.01 * np.arange(1, 24), rtol=1e-3) and np.allclose(holed, whole)
+    assert (without > 1e4).all()  # what came before the first reading is unknown up to the next keyframe
+
+
+SEES_ACROSS, NOTHING = np.diag([0.0, 1e6, 1e6]), np.empty((0, 2))
+
+
+def between(first, last):
+    return (np.arange(24) >= first) & (np.arange(24) <= last)
 
 
 @pytest.fixture(scope="module")

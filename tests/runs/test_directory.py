@@ -386,6 +386,7 @@ def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
     text = finished.summary
     slow = msgspec.structs.replace(finished.metrics, scans_per_s=1.2)
     assert ", 1 scan/s, " in summary(slow, "", "", ())
+    assert finished.metrics.expected_ate_m is None and "expected ATE   unknown: the pose graph has no edge" in text
     assert "1 keyframe\n" in text and "PARTIAL: stopped by the user after 3 scans" in text
 
 

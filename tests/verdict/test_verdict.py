@@ -1,10 +1,32 @@
 """The verdict on made-up trajectories: right ones are trustworthy; slips, jumps and wrong loops are named."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from scanchain import lie
-from scanchain.verdict import Closures, Evidence, Kind, Verdict, check_overlap, check_velocity, check_wheels, judge
+from scanchain.data import Trajectory
+from scanchain.runs.overlay import read_overlay, write_overlay
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of
+from scanchain.verdict import (
+    Closures,
+    Evidence,
+    Kind,
+    Stretch,
+    Verdict,
+    WorstPlace,
+    check_overlap,
+    check_velocity,
+    check_wheels,
+    judge,
+    worst_place,
+)
+from scanchain.viz.stretch_colors import STRETCH_COLORS
+from tests.support.recordings import drive
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
 
@@ -225,6 +247,75 @@ def test_segments_that_a_closure_joins_are_not_told():
     assert judge(joined).verdict is Verdict.TRUSTWORTHY
 
 
+def test_a_scan_that_starts_a_segment_is_known_from_its_column_whatever_its_reason_says(tmp_path):
+    table = StepTable()
+    for step in drive(20, 3):
+        table.append(replace(step, starts_segment=step.scan.index == 7, reason="a new map begins"))
+    poses = np.array([row.T_world_lidar for row in table.rows])
+    table.write(tmp_path / "steps.parquet", Trajectory(table.odometry.stamps_ns, poses))
+    found = evidence_of(pq.ParquetFile(tmp_path / "steps.parquet").read(), None)
+    assert np.flatnonzero(found.starts_segment).tolist() == [7]
+
+
+def test_the_worst_place_of_a_slip_lies_between_the_scans_before_and_after_it():
+    truth, slipped = course(slip=(500, 530))
+    found = evidence(slipped, wheels=wheels_of(truth))
+    worst = worst_place(judge(found).stretches, found)
+    assert worst.stretch.kind is Kind.WHEELS and worst.before < 505 and worst.after > 525
+    assert worst_place((), found) is None
+
+
+def test_the_worst_place_of_a_long_stretch_is_the_scan_that_is_contradicted_most():
+    poses, _ = course()
+    fit = np.where(marked(300, 700), 0.5, 0.9)
+    fit[444] = 0.1
+    found = evidence(poses, fit=fit)
+    worst = worst_place(judge(found).stretches, found)
+    assert worst.stretch.kind is Kind.CONTRADICTED and (worst.before, worst.after) == (443, 444)
+
+
+def test_the_worst_place_of_disagreeing_loops_are_its_two_passes():
+    poses, _ = course()
+    found = evidence(poses)
+    loops = Stretch(Kind.LOOPS, 100, 700, 4, 20.0, 140.0, 2.0)
+    slip = Stretch(Kind.WHEELS, 300, 310, 11, 60.0, 62.0, 1.0)
+    assert worst_place((slip, loops), found)[1:] == (100, 700)
+
+
+@pytest.mark.parametrize(("kind", "seen"), [(Kind.WHEELS, "one side"), (Kind.LOOPS, "around")])
+def test_an_overlay_holds_the_points_of_keyframes_near_the_worst_place(tmp_path, kind, seen):
+    poses, _ = course()
+    numbers = np.arange(0, N, 5)
+    beside = np.array([[0.0, 1.0]])
+    result = SimpleNamespace(
+        trajectory=Trajectory(np.arange(N), poses),
+        keyframes=[SimpleNamespace(scan_index=int(k), points=beside) for k in numbers],
+        T_world_keyframes=poses[numbers],
+    )
+    stretch = Stretch(kind, 200, 205, 6, 40.0, 41.0, 1.0)
+    write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 199, 605), result)
+    overlay = read_overlay(tmp_path / "overlay.npz")
+    before, after = (
+        numbers[(np.abs(STEP_M * (numbers - scan)) < 6.0) & ((side * (numbers - scan) >= 0) | (seen == "around"))]
+        for scan, side in ((199, -1), (605, 1))
+    )
+    assert overlay.text == stretch.text and np.allclose(overlay.place, poses[605, :2, 2])
+    assert abs(len(overlay.before) - len(before)) <= 2 and abs(len(overlay.after) - len(after)) <= 2
+    assert np.isclose(overlay.before, lie.transform(poses[before[3]], beside), atol=1e-4).all(axis=1).any()
+
+
+def test_without_a_keyframe_near_it_an_overlay_has_the_nearest(tmp_path):
+    poses, _ = course()
+    keyframe = SimpleNamespace(scan_index=0, points=np.array([[1.0, 2.0]]))
+    result = SimpleNamespace(
+        trajectory=Trajectory(np.arange(N), poses), keyframes=[keyframe], T_world_keyframes=poses[:1]
+    )
+    stretch = Stretch(Kind.LOST, 800, 820, 21, 160.0, 164.0)
+    write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 799, 820), result)
+    overlay = read_overlay(tmp_path / "overlay.npz")
+    assert len(overlay.before) == len(overlay.after) == 1
+
+
 def test_a_lidar_that_was_carried_elsewhere_is_named_though_the_wheels_agree():
     poses, _ = course()
     share = np.full(N, 0.98)
@@ -263,3 +354,7 @@ def test_a_lidar_that_seems_to_stand_after_a_gap_at_speed_is_to_be_checked():
     changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
     (stretch,) = judge(evidence(poses[kept], **changes)).stretches
     assert (stretch.kind, stretch.first) == (Kind.CONTRADICTED, 300)
+
+
+def test_every_kind_of_stretch_has_a_color():
+    assert set(STRETCH_COLORS) == set(Kind) and len(set(STRETCH_COLORS.values())) == len(Kind)

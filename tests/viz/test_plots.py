@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
+from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
@@ -28,6 +29,15 @@ def test_ways_are_drawn_in_their_colors_on_white(tmp_path):
     for color in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)):
         assert share_of(pixels, color) > 0.001
     assert share_of(pixels, (1.0, 1.0, 1.0)) > 0.8
+
+
+def test_stretches_to_check_are_marked_on_their_trajectory(tmp_path):
+    stretches = (Stretch(Kind.WHEELS, 10, 30, 21, 1.0, 3.0, 0.7), Stretch(Kind.WHEELS, 60, 60, 1, 6.0, 6.0))
+    draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0), stretches=stretches)
+    draw_map(tmp_path / "b.png", title="t", optimized=circle(10.0))
+    pink = (0.839, 0.188, 0.561)
+    marked, plain = (share_of(image.imread(tmp_path / name), pink) for name in ("a.png", "b.png"))
+    assert marked > 0.001 and plain == 0.0
 
 
 def test_without_odometry_and_ground_truth_only_one_way_is_drawn(tmp_path):

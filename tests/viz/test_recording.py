@@ -18,9 +18,11 @@ from rerun.chunk import RrdReader
 
 from scanchain import lie
 from scanchain.config import RecordingConfig
+from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
+from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain.viz.recording import entities, shapes, viewer
 from scanchain.viz.recording.blueprint import blueprint
 from scanchain.viz.recording.messages import Message
@@ -487,12 +489,43 @@ def test_a_blueprint_lies_in_the_file(tmp_path):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_viewer_opens_on_observability_residual_and_loops_and_times_stand_behind(dimension):
     _, side = blueprint(dimension).root_container.contents
-    *plots, state, tabs = side.contents
+    verdict, *plots, state, tabs = side.contents
+    assert verdict.origin == entities.VERDICT
     assert [view.origin for view in plots] == [entities.OBSERVABILITY, entities.RESIDUAL, entities.LOOPS]
     assert state.origin == entities.STATE
     assert isinstance(tabs, rrb.Tabs) and tabs.active_tab is None  # the first is
     origins = [view.origin for view in tabs.contents]
     assert origins[0] == entities.LEGEND and entities.TIME in origins
+
+
+def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(tmp_path):
+    steps = drive(60, 2)
+    path = Trajectory(np.array([s.scan.stamp_ns for s in steps]), np.array([s.T_world_lidar for s in steps]))
+    stretches = (
+        Stretch(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0),
+        Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5),
+    )
+    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches)
+    with Recording(
+        tmp_path / "a.rrd", dimension=2, name="a", sinks=frozenset({"save"}), config=RecordingConfig()
+    ) as r:
+        for step in steps:
+            r.log(step)
+        r.log_verdict(judged, path)
+    assert r.warnings == []
+    texts = [text for row in column(tmp_path / "a.rrd", entities.EVENTS, "TextLog:text") for text in row]
+    assert [text for text in texts if "stretch" in text] == [
+        f"stretch to check: {each.text}" for each in stretches
+    ]
+    statics = {
+        chunk.entity_path.lstrip("/"): chunk.to_record_batch()
+        for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()
+        if chunk.is_static
+    }
+    (strips,) = statics[entities.STRETCHES].column("LineStrips3D:strips").to_pylist()
+    assert [len(strip) for strip in strips] == [2, 12]
+    (document,) = statics[entities.VERDICT].column("TextDocument:text").to_pylist()
+    assert document[0].startswith("## check these stretches") and stretches[0].text in document[0]
 
 
 def test_the_legend_has_no_table_whose_lines_the_viewer_would_cut_off(tmp_path):

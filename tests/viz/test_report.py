@@ -3,6 +3,7 @@
 import html
 import json
 import re
+import shutil
 import subprocess
 from base64 import b64decode, b64encode
 from hashlib import sha256
@@ -21,10 +22,12 @@ from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
+from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.simulation import simulate
-from scanchain.viz.pictures.map_figures import surroundings
+from scanchain.viz.pictures.map_figures import AFTER, BEFORE, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
 from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.run import write_run_report
 from scanchain.viz.report.sections import loop_section
 from scanchain.viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
 from tests.support.browser import find_browser, look
@@ -152,6 +155,22 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
     assert facts[:3] == ["verdict", "trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run, tmp_path, dimension):
+    page = (one_run / "report.html").read_text(encoding="utf-8")
+    assert "Worst place" not in page and "expected ATE" in page
+    folder = shutil.copytree(one_run, tmp_path / "run")
+    rng = np.random.default_rng(0)
+    clouds = {name: rng.uniform(20.0, 30.0, (500, dimension)) for name in ("before", "after")}
+    paths = {f"path_{name}": rng.uniform(24.0, 26.0, (5, dimension)) for name in clouds}
+    np.savez(folder / OVERLAY_FILE, text="scans 3 to 9: lost", place=np.full(dimension, 25.0), **clouds, **paths)
+    write_run_report(folder)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Worst place" in page and "scans 3 to 9: lost" in page and BEFORE in page and AFTER in page
+    shown = re.findall(r">(\d\d)</text>", page[page.index("Worst place") : page.index("Loop closures")])
+    assert "20" in shown and "30" in shown
 
 
 def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):

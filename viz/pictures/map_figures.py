@@ -9,12 +9,14 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.data import Points
+from scanchain.runs.overlay import Overlay
 from scanchain.viz.pictures.figure import INK, SvgFigure
 from scanchain.viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, Floats, PathLine
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
+_LOWEST = 5.0  # percentile of the heights that is taken for the ground's
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
 _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
 
@@ -46,7 +48,7 @@ def path_over_map(
 ) -> Markup:
     """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
     with SvgFigure.of_plan(name, low, high) as figure:
-        _draw_points(figure, points, low, high, by_height=False)
+        _draw_points(figure, points, low, high)
         for line in lines:
             style = (0, (3, 3)) if line.is_dashed else "-"
             x, y = line.positions[:, :2].T
@@ -56,16 +58,46 @@ def path_over_map(
         return figure.svg()
 
 
-def _draw_points(figure: SvgFigure, points: Points, low: Floats, high: Floats, *, by_height: bool) -> None:
+BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
+_MARGIN_M = 1.0  # around their points
+_VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes
+_GROUND_M = 0.5  # height above the lowest points below which points in space are ground, which hides walls
+
+
+def overlay_picture(name: str, overlay: Overlay) -> Markup:
+    """Points and paths of two passes over one place, seen from above; ground is left out."""
+    half_m = _VIEW_M[overlay.before.shape[1]]
+    before, after = _above_ground(overlay.before), _above_ground(overlay.after)
+    drawn = np.concatenate([before, after])[:, :2] if len(before) + len(after) else overlay.place[None, :2]
+    low = np.maximum(overlay.place[:2] - half_m, np.minimum(drawn.min(axis=0), overlay.place[:2]) - _MARGIN_M)
+    high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
+    with SvgFigure.of_plan(name, low, high) as figure:
+        for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
+            _draw_points(figure, points, low, high, color)
+            figure.axes.plot(path[:, 0], path[:, 1], color=color, linewidth=1.4)
+        figure.axes.set_xlim(low[0], high[0])
+        figure.axes.set_ylim(low[1], high[1])
+        return figure.svg()
+
+
+def _above_ground(points: Points) -> Points:
+    if points.shape[1] == 2:
+        return np.pad(points, ((0, 0), (0, 1)))
+    return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
+
+
+def _draw_points(
+    figure: SvgFigure, points: Points, low: Floats, high: Floats, color: str = _POINTS, *, by_height: bool = False
+) -> None:
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
-        image = _image(shown[inside], low, high, by_height=by_height)
+        image = _image(shown[inside], low, high, color, by_height=by_height)
         corners = (low[0], high[0], low[1], high[1])
         figure.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
 
 
-def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDArray[np.uint8]:
+def _image(points: Floats, low: Floats, high: Floats, color: str, *, by_height: bool) -> NDArray[np.uint8]:
     """(H, W, 4), clear where nothing is, opacity by the number of points, color by the highest of them."""
     from matplotlib import colormaps
     from matplotlib.colors import to_rgba
@@ -75,7 +107,7 @@ def _image(points: Floats, low: Floats, high: Floats, *, by_height: bool) -> NDA
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     points = points[np.argsort(points[:, 2])]
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
-    colors = np.array([to_rgba(_POINTS)])
+    colors = np.array([to_rgba(color)])
     if by_height and np.ptp(points[:, 2]):
         bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
         colors = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))

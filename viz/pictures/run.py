@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,9 +18,11 @@ from scanchain.evaluation import on_the_estimate
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
+from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures.figure import write_figure
 from scanchain.viz.pictures.map_figures import extent
 from scanchain.viz.pictures.trajectory_figures import TRUTH
+from scanchain.viz.stretch_colors import STRETCH_COLORS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,11 +55,13 @@ def draw_map(
     optimized: Matrix,
     odometry: Matrix | None = None,
     ground_truth: Matrix | None = None,
+    stretches: Sequence[Stretch] = (),
     points: NDArray[np.floating] | None = None,
     grid: GridPicture | None = None,
 ) -> None:
     """Draw trajectories (N, d+1, d+1) over a map, all in the world frame, to a PNG.
 
+    stretches : to check, of the optimized trajectory
     points : (M, d) of the map; of a 3D one the height is the shade
     ground_truth : already aligned to the estimate
     """
@@ -69,6 +75,7 @@ def draw_map(
     _draw_path(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
     _draw_path(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
     _draw_path(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
+    _mark_stretches(axes, optimized, stretches)
     _mark_ends(axes, optimized)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -150,6 +157,16 @@ def _draw_path(
     axes.plot(x, y, color=color, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
 
 
+def _mark_stretches(axes: Axes, poses: Matrix, stretches: Sequence[Stretch]) -> None:
+    """Draw stretches over their trajectory, each kind once in the legend."""
+    for kind, color in STRETCH_COLORS.items():
+        chosen = [each for each in stretches if each.kind is kind and each.kind is not Kind.LOOPS]
+        parts = [poses[max(each.first - 1, 0) : each.last + 1, :2, -1] for each in chosen]
+        for place, part in enumerate(parts):
+            label = str(kind) if place == 0 else None
+            axes.plot(*part.T, color=color, linewidth=3.0, solid_capstyle="round", label=label)
+
+
 def _mark_ends(axes: Axes, poses: Matrix) -> None:
     if not len(poses):
         return
@@ -171,8 +188,9 @@ def draw_run(directory: Path, picture: Path) -> None:
     optimized, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
     truth_file = directory / TRUTH_FILE
     truth = None
+    metrics = json.loads((directory / "metrics.json").read_bytes())
     if truth_file.exists():
-        accuracy = json.loads((directory / "metrics.json").read_bytes())["ground_truth"] or {}
+        accuracy = metrics["ground_truth"] or {}
         truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
     try:
         draw_map(
@@ -181,6 +199,7 @@ def draw_run(directory: Path, picture: Path) -> None:
             optimized=optimized.poses,
             odometry=odometry.poses,
             ground_truth=None if truth is None else truth.poses,
+            stretches=msgspec.convert(metrics["stretches"], tuple[Stretch, ...]),
             points=None if is_planar else points,
             grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
         )

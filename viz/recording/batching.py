@@ -20,7 +20,7 @@ _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
 _LEAST_DRAWN = 1e-3  # least observability that is drawn
-_WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
+WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
 
 
 class Batcher:
@@ -94,7 +94,7 @@ class Batcher:
         """The verdicts after the last step, at its ``times``; their numbers in any case."""
         self.closures = None
         return [
-            *_events([[(_INFORMATION, text) for text in verdicts.events]], times),
+            *events([[(_INFORMATION, text) for text in verdicts.events]], times),
             *self._counts([verdicts], times),
         ]
 
@@ -132,11 +132,11 @@ class Batcher:
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state
-        events: list[list[tuple[str, str]]] = []
+        told: list[list[tuple[str, str]]] = []
         for step, is_new, verdict in zip(steps, changed, verdicts, strict=True):
-            why = [(_WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
-            events.append([*why, *((_INFORMATION, text) for text in verdict.events)])
-        messages = [*_events(events, times), *self._counts(verdicts, times)]
+            why = [(WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
+            told.append([*why, *((_INFORMATION, text) for text in verdict.events)])
+        messages = [*events(told, times), *self._counts(verdicts, times)]
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
             messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
@@ -154,7 +154,7 @@ class Batcher:
         return [Message(entities.LOOPS, columns.partition([2] * int(changed.sum())), times[changed])]
 
 
-def _events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
+def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
     """The events of each row of ``times``, level and text."""
     rows = [row for row, of_row in enumerate(events) for _ in of_row]
     if not rows:

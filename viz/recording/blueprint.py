@@ -1,4 +1,4 @@
-"""Layout of a recording in the viewer: the scene, observability over time, everything else in tabs."""
+"""Layout of a recording in the viewer: the scene, verdict, observability over time, everything else in tabs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),  # there are few at first
     )
     state = rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole)
-    side = rrb.Vertical(*_plots(_FIRST), loops, state, tabs, row_shares=[3, 3, 3, 2, 6])
+    verdict = rrb.TextDocumentView(origin=entities.VERDICT, name="verdict")
+    side = rrb.Vertical(verdict, *_plots(_FIRST), loops, state, tabs, row_shares=[3, 3, 3, 3, 2, 5])
     return rrb.Blueprint(
         rrb.Horizontal(_scene(dimension, box), side, column_shares=[5, 3]),
         time_panel(scans),

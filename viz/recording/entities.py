@@ -28,6 +28,7 @@ KEYFRAMES = "world/graph/keyframes"
 ODOMETRY_EDGES = "world/graph/odometry"
 ACCEPTED = "world/graph/loops/accepted"
 REJECTED = "world/graph/loops/rejected"
+STRETCHES = "world/stretches"
 MAP = "world/map"
 GRID = "world/grid"
 TIME = "plots/time"
@@ -40,6 +41,7 @@ LOOPS = "plots/loops"
 STATE = "state"
 EVENTS = "events"
 LEGEND = "legend"
+VERDICT = "verdict"
 
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
@@ -63,6 +65,7 @@ _LEGEND = f"""
 - **violet dots, gray edges**: keyframes and the odometry between them
 - **green edges**: accepted loop closures; amber where the back end lowered their weight below ½
 - **red edges**: loop closures that the matcher or, later, the back end rejected
+- **thick lines**: stretches to check, listed in the verdict and in the events
 - **violet ellipsoid**: standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large
 
 **Observability** is the information along the least constrained direction over the least that is required: below 1
@@ -98,6 +101,7 @@ def constants(dimension: int) -> list[Message]:
         Message(ACCEPTED, rr.LineStrips3D.from_fields(radii=[pixels(1.5)])),
         Message(REJECTED, _lines(RED, 0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
+        Message(VERDICT, rr.TextDocument("The verdict comes with the end of the run.")),
         *_series(),
     ]
 

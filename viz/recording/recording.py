@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 from rerun.error_utils import catch_and_log_exceptions
 
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Matrix, Step
+from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepRow
+from scanchain.verdict import Judged
 from scanchain.viz.recording import entities, shapes, viewer
 from scanchain.viz.recording.batching import Batcher
 from scanchain.viz.recording.blueprint import blueprint
 from scanchain.viz.recording.keyframe_graph import KeyframeGraph
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
+from scanchain.viz.recording.verdict import verdict_messages
 
 
 class Recording:
@@ -127,6 +129,10 @@ class Recording:
     def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
         self._send(lambda: self._settled(closures, graph))
+
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
+        """Record the verdict, and its stretches on the optimized trajectory."""
+        self._send(lambda: verdict_messages(judged, trajectory))
 
     def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 
 from scanchain.runs.metrics import Metrics
+from scanchain.runs.overlay import read_overlay
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain.viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
 from scanchain.viz.pictures.trajectory_figures import color_of, innovations
 from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
 
@@ -18,8 +22,8 @@ _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
 
 
-def verdict_section(metrics: Metrics, steps: pa.Table) -> Section:
-    """Innovations along the log, and every suspicious stretch."""
+def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Section:
+    """Innovations along the log, two passes over the worst place if there is one, and every suspicious stretch."""
     curves = {
         name: (steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
         for place, (column, (name, limit)) in enumerate(_CURVES.items())
@@ -35,13 +39,22 @@ def verdict_section(metrics: Metrics, steps: pa.Table) -> Section:
         "Normalized innovations over their limits, largest of neighboring scans; above 1 (dotted) is a finding.",
         innovations("innovations", curves, shaded),
     )
+    drawings = [drawing]
+    if overlay_file.exists():
+        overlay = read_overlay(overlay_file)
+        chips += (Chip("scans before", BEFORE), Chip("scans after", AFTER))
+        caption = (
+            f"{overlay.text}: the scans before it and after it, or of both passes of a loop, where the trajectory "
+            "places them, seen from above. Where it is right, both show the same walls."
+        )
+        drawings.append(Drawing("Worst place", caption, overlay_picture("overlay", overlay)))
     heads = (
         Head("finding"), Head("first"), Head("last"), Head("scans"), Head("start", "s"), Head("end", "s"),
         Head("size", "m"),
     )  # fmt: skip
     longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
     rows = tuple(_row(each) for each in sorted(longest, key=lambda each: each.first))
-    return Section("Checks", "", chips, (drawing,), Grid(heads, rows) if rows else None)
+    return Section("Checks", "", chips, tuple(drawings), Grid(heads, rows) if rows else None)
 
 
 def _row(stretch: Stretch) -> Row:

@@ -18,6 +18,7 @@ from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
+from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.settings import read_layer
@@ -76,6 +77,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "verdict", str(m.verdict)
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
+    yield "expected ATE", m.expected_ate
     yield "scans", f"{m.scans:,} over {m.log_span_s:.1f} s, {m.dimension}D"
     yield "state", f"{m.ok:,} ok, {m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "pose graph", m.fit
@@ -120,7 +122,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     grain_m = float(str(config["maps.voxel_size_m"]))
     tables = Tables.read(steps, loops_file, metrics.stretches)
     yield trajectory_section(trajectories[0], tables, true_path, points, grain_m)
-    yield verdict_section(metrics, steps)
+    yield verdict_section(metrics, steps, directory / OVERLAY_FILE)
     if config["loops.enabled"]:
         yield from loop_section(
             trajectories[0], loops_file, "Loop closures", float(str(config["loops.min_travel_m"]))

@@ -22,19 +22,22 @@ from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.map_figures import map_picture, path_over_map, surroundings
 from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats, PathLine
 from scanchain.viz.report.page import Chip, Drawing, Section
+from scanchain.viz.stretch_colors import STRETCH_COLORS
 from scanchain.words import counted
 
 _DISPUTED = "at closures rejected by the back end"
+_OVER_ALL = (
+    Kind.OVERLAP,
+    Kind.WHEELS,
+    Kind.ACCELERATION,
+    Kind.DISCONNECTED,
+)  # drawn over the states of single scans
 _COLORS = {
-    State.DEGENERATE: "#d98200",
-    State.LOST: "#d6453d",
-    State.CONTRADICTED: "#a55bd6",
+    State.DEGENERATE: STRETCH_COLORS[Kind.DEGENERATE],
+    State.LOST: STRETCH_COLORS[Kind.LOST],
+    State.CONTRADICTED: STRETCH_COLORS[Kind.CONTRADICTED],
     _DISPUTED: "#075e70",
-    Kind.WHEELS: "#d6308f",
-    Kind.ACCELERATION: "#8a1c1c",
-    Kind.DISCONNECTED: "#6b7280",
-}
-_OVER_ALL = (Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED)  # drawn over the states of single scans
+} | {kind: STRETCH_COLORS[kind] for kind in _OVER_ALL}
 _MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict
 

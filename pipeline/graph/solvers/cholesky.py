@@ -162,6 +162,12 @@ class SparseCholesky:
             result[:, column] = x[self._places]
         return result.reshape(right_side.shape)
 
+    def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
+        x = noise.copy()
+        cholesky.solve_upper(self._fronts, self._factor, x, np.empty(self._fronts.widest))
+        return x[self._places]
+
     def inverse_blocks(self) -> NDArray[np.float64]:
         """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)

@@ -77,7 +77,13 @@ def solve(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
                 local[b] -= row[b] * value
         for b in range(pivots, height):
             x[rows[b]] += local[b]
-    for f in range(count - 1, -1, -1):
+    solve_upper(fronts, factor, x, local)
+
+
+@njit(cache=True)
+def solve_upper(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
+    """Solve U x = b in place; arguments as of ``solve``."""
+    for f in range(fronts.pivots.size - 1, -1, -1):
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
