@@ -68,6 +68,14 @@ def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_
     assert outcome.certified
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_groups_of_ten_wrong_loops_that_agree_are_rejected_as_groups(seed):
+    share = 0.3 / 0.7  # of the true ones: 30 % of all
+    outcome = try_wrong_loops(shared_data("graphs/intel.g2o"), share, "groups of 10", seed)
+    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
+    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_with_it(dimension):
     rng = np.random.default_rng(3)
