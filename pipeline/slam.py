@@ -207,6 +207,10 @@ class Slam:
             traveled_m=self.traveled_m,
             scale=located.scale,
         )
+        if self.graph.drift.any():
+            T_last_keyframe = lie.between(self.keyframes[-1].T_odom_lidar, keyframe.T_odom_lidar)
+            T_world_keyframe = self.graph.poses[-1] @ self.graph.predicted(T_last_keyframe)
+            self.T_world_odom = lie.normalize(T_world_keyframe @ lie.inverse(keyframe.T_odom_lidar))
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
         if self.keyframes:
             last = self.keyframes[-1]

@@ -27,7 +27,8 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.optimization import Optimization, solve, solve_with_drift
+from scanchain.graph.robust import drift as systematic
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
@@ -54,6 +55,7 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
+        self._drift = np.zeros(systematic.size(k))
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
 
@@ -85,8 +87,16 @@ class PoseGraph:
 
     @property
     def measurements(self) -> Matrix:
-        """T_ij of every edge, (E, d+1, d+1)."""
-        return self._measurements.rows
+        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift``."""
+        return self._corrected(self._drift)
+
+    @property
+    def drift(self) -> NDArray[np.float64]:
+        """Systematic drift of odometry that loop edges show, (2,) or (4,): a share of the way, and radians a meter.
+
+        Odometry is that much too short, and turns that much too little. Zero where nothing shows one.
+        """
+        return self._drift
 
     @property
     def information(self) -> Matrix:
@@ -184,6 +194,10 @@ class PoseGraph:
         padded[:, :2, :2] = checks.matrices(information, "information", (len(edges), 2, 2))
         self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
 
+    def predicted(self, T_ij: Pose) -> Pose:
+        """A motion by odometry, corrected by ``drift``."""
+        return systematic.corrected(T_ij, self._drift)
+
     def fix(self, index: int) -> None:
         """Fix this pose instead of pose 0."""
         index = checks.integer(index, "index", "the index of a pose")
@@ -208,7 +222,15 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
+            if rejection == "refined" and config.robust == "truncated":
+                solved = solve_with_drift(
+                    self._problem_of, self._drift, self.poses, self.is_loop, config, initialize
+                )
+                if not np.array_equal(solved.drift, self._drift):
+                    self._drift = solved.drift
+                    self._changed()
+            else:
+                solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         minimum = solved.minimum
@@ -302,8 +324,23 @@ class PoseGraph:
         if self._problem is None:
             fixed = self.fixed
             check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
-            self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
+            self._problem = self._problem_of(self._drift)
         return self._problem
+
+    def _problem_of(self, drift: NDArray[np.float64]) -> BetweenProblem:
+        """The problem with odometry corrected by a drift, or the one that is there already."""
+        if self._problem is not None and np.array_equal(drift, self._drift):
+            return self._problem
+        measurements = self._corrected(drift)
+        return BetweenProblem(self.edges, measurements, self.information, self.fixed, self.is_point)
+
+    def _corrected(self, drift: NDArray[np.float64]) -> Matrix:
+        if not drift.any():
+            return self._measurements.rows
+        measurements = self._measurements.rows.copy()
+        odometry = ~self.is_loop
+        measurements[odometry] = systematic.corrected(measurements[odometry], drift)
+        return measurements
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""

@@ -114,7 +114,8 @@ def _refine(
     price = fair_price(against[kept], nominal, problem.freedom)
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
     minimum = _refine_edges(minimizer, minimum, against, price, max_iterations, tolerance)
-    return _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
+    minimum = _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
+    return replace(minimum, price=price)
 
 
 def _refine_edges(
