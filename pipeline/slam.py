@@ -266,7 +266,7 @@ class Slam:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:
             return None
-        return self._optimize("refined" if self.moves_map else "gnc")
+        return self._optimize("edges" if self.moves_map else "gnc")
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
-from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, fit_text
+from scanchain.data import GraphState, Matrix, fit_text
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.robust.drift import corrected, drift_step, penalty
 from scanchain.graph.robust.graduation import OutlierRejection, minimize
 from scanchain.graph.robust.losses import robust_loss
 from scanchain.graph.solvers.minimizer import Minimizer, Minimum
 from scanchain.words import counted
-
-_WORTH = 3.0  # loop edges, none near another, that a systematic drift must bring in, less what it costs
-_MAX_DRIFT_STEPS = 10
-_SETTLED = 0.1  # share of the price of a loop edge below which another step of the drift gains nothing
-
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
@@ -78,12 +71,11 @@ class Optimization:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """Poses (K, d+1, d+1) of the minimum, the minimum itself, its initialization, and the drift of odometry."""
+    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and its initialization."""
 
     poses: Matrix
     minimum: Minimum
     initialization: Initialization
-    drift: NDArray[np.float64]
 
 
 def solve(
@@ -109,49 +101,7 @@ def solve(
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
     found[fixed] = poses[fixed]
-    return Solved(found, minimum, source, np.zeros(0))
-
-
-def solve_with_drift(
-    problem_of: Callable[[NDArray[np.float64]], BetweenProblem],
-    drift: NDArray[np.float64],
-    poses: Matrix,
-    is_loop: NDArray[np.bool_],
-    config: GraphConfig,
-    initialize: Initialization,
-) -> Solved:
-    """``solve`` with a refined set of inliers, and with the systematic drift of odometry that explains most of them.
-
-    problem_of : the problem with odometry corrected by a drift
-    A drift is taken where it lets in loop edges of several places that contradict each other without it, and
-    then follows the evidence from one optimization to the next.
-    """
-    problem = problem_of(drift)
-    best = replace(solve(problem, poses, is_loop, config, initialize, "refined"), drift=drift)
-    for _ in range(_MAX_DRIFT_STEPS):
-        minimum = best.minimum
-        price, kept = minimum.price, minimum.weights > REJECTED_WEIGHT
-        known = bool(best.drift.any())
-        worth = 0.0 if known else _WORTH * price
-        if price == 0.0 or len(problem.sightings) or (not known and price * (is_loop & ~kept).sum() <= worth):
-            break
-        step = drift_step(problem, best.poses, is_loop, kept, best.drift, price)
-        if step.gain <= max(worth, _SETTLED * price):
-            break
-        changed = best.drift + step.change
-        problem = problem_of(changed)
-        trial = replace(solve(problem, best.poses, is_loop, config, "given", "refined"), drift=changed)
-        if not _cost(trial, is_loop, price) + worth < _cost(best, is_loop, price):
-            break
-        best = trial
-    return best
-
-
-def _cost(solved: Solved, is_loop: NDArray[np.bool_], price: float) -> float:
-    """Cost of a minimum at this price of a loop edge, and of its drift."""
-    kept = solved.minimum.weights > REJECTED_WEIGHT
-    chi2 = float(solved.minimum.estimate.chi2[kept].sum())
-    return chi2 + price * int((is_loop & ~kept).sum()) + penalty(solved.drift)
+    return Solved(found, minimum, source)
 
 
 def _orthonormal(poses: Matrix) -> Matrix:

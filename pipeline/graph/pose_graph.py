@@ -27,8 +27,9 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization, solve, solve_with_drift
-from scanchain.graph.robust import drift as systematic
+from scanchain.graph.explanation import Explainer, Explanation
+from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
@@ -55,7 +56,7 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
-        self._drift = np.zeros(systematic.size(k))
+        self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
 
@@ -88,7 +89,7 @@ class PoseGraph:
     @property
     def measurements(self) -> Matrix:
         """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift``."""
-        return self._corrected(self._drift)
+        return self._explanation.measurements(self._measurements.rows, self.is_loop)
 
     @property
     def drift(self) -> NDArray[np.float64]:
@@ -96,12 +97,17 @@ class PoseGraph:
 
         Odometry is that much too short, and turns that much too little. Zero where nothing shows one.
         """
-        return self._drift
+        return self._explanation.drift
+
+    @property
+    def slips(self) -> NDArray[np.int64]:
+        """Odometry edges that loop edges show to be off by more than they say, ascending."""
+        return np.array(sorted(self._explanation.slips), np.int64)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k)."""
-        return self._information.rows
+        """Ω of every edge, (E, k, k), lower for ``slips`` than it was given."""
+        return self._explanation.information(self._information.rows, self._measurements.rows)
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
@@ -196,7 +202,7 @@ class PoseGraph:
 
     def predicted(self, T_ij: Pose) -> Pose:
         """A motion by odometry, corrected by ``drift``."""
-        return systematic.corrected(T_ij, self._drift)
+        return corrected(T_ij, self._explanation.drift)
 
     def fix(self, index: int) -> None:
         """Fix this pose instead of pose 0."""
@@ -222,13 +228,15 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            if rejection == "refined" and config.robust == "truncated":
-                solved = solve_with_drift(
-                    self._problem_of, self._drift, self.poses, self.is_loop, config, initialize
+            if rejection != "gnc" and config.robust == "truncated":
+                explainer = Explainer(
+                    self._problem_of, self._information.rows, self.is_loop, config, rejection
                 )
-                if not np.array_equal(solved.drift, self._drift):
-                    self._drift = solved.drift
+                explained = explainer.solve(self._explanation, self.poses, initialize)
+                solved = explained.solved
+                if explained.explanation is not self._explanation:
                     self._changed()
+                    self._explanation = explained.explanation
             else:
                 solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
         except SingularMatrixError as error:
@@ -324,23 +332,16 @@ class PoseGraph:
         if self._problem is None:
             fixed = self.fixed
             check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
-            self._problem = self._problem_of(self._drift)
+            self._problem = self._problem_of(self._explanation)
         return self._problem
 
-    def _problem_of(self, drift: NDArray[np.float64]) -> BetweenProblem:
-        """The problem with odometry corrected by a drift, or the one that is there already."""
-        if self._problem is not None and np.array_equal(drift, self._drift):
+    def _problem_of(self, explanation: Explanation) -> BetweenProblem:
+        """The problem under an explanation; the one that is there already, if it is that."""
+        if self._problem is not None and explanation is self._explanation:
             return self._problem
-        measurements = self._corrected(drift)
-        return BetweenProblem(self.edges, measurements, self.information, self.fixed, self.is_point)
-
-    def _corrected(self, drift: NDArray[np.float64]) -> Matrix:
-        if not drift.any():
-            return self._measurements.rows
-        measurements = self._measurements.rows.copy()
-        odometry = ~self.is_loop
-        measurements[odometry] = systematic.corrected(measurements[odometry], drift)
-        return measurements
+        measurements = explanation.measurements(self._measurements.rows, self.is_loop)
+        information = explanation.information(self._information.rows, self._measurements.rows)
+        return BetweenProblem(self.edges, measurements, information, self.fixed, self.is_point)
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""

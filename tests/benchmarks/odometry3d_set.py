@@ -143,7 +143,7 @@ def _is_lost_alone(row: Sequence[Score], first_rival: int, place: int) -> bool:
 def _version() -> str:
     """A name for the simulator as it is now."""
     root = Path(scanchain.__file__).parent
-    sources = sorted([*root.glob("simulate/*.py"), root / "kernels" / "raycast.py"])
+    sources = sorted([*root.glob("simulation/**/*.py"), *root.glob("kernels/raycast/*.py")])
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 

@@ -11,12 +11,12 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.covariance import difference_covariance
+from scanchain.graph.robust.groups import apart
 
 Vector = NDArray[np.float64]
 
 SCALE_SIGMA, TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
 _CURVATURE = 0.3  # share of a predicted change that its linearization may be off by
-_REACH = 5  # largest difference of the poses of two edges, at both ends, up to which they count as one
 _MOST = 100  # largest number of contradicting loop edges that are looked at
 _ROUNDS = 5  # of the least squares over the edges that a drift explains
 
@@ -94,7 +94,7 @@ def drift_step(
     slope = np.einsum("eap,ea->p", omega_B, errors[odometry]) - _prior(p) * drift
     response = np.zeros((len(problem.variable), k, p))
     response[problem.free] = sparse.packing.spread_rows(moved)
-    out = _apart(problem.edges, np.flatnonzero(is_loop & ~kept))
+    out = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
     out = out[:: max(1, -(-len(out) // _MOST))]
     i, j = problem.edges[out].T
     V = jacobians[out] @ (response[j] - response[i])
@@ -103,15 +103,6 @@ def drift_step(
         joint = difference_covariance(sparse, *problem.edges[edge])
         noise[place] += jacobians[edge] @ joint @ jacobians[edge].T
     return _consensus(errors[out], V, noise, curvature, slope, out, price)
-
-
-def _apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Those of the edges that join other poses than the ones before: what repeats a mistake does not count twice."""
-    chosen: list[int] = []
-    for edge in edges.tolist():
-        if not (np.abs(ends[chosen] - ends[edge]).max(axis=1, initial=0) <= _REACH).any():
-            chosen.append(edge)
-    return np.array(chosen, np.int64)
 
 
 def _consensus(

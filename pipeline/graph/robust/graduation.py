@@ -15,7 +15,7 @@ from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
-OutlierRejection = Literal["gnc", "refined"]
+OutlierRejection = Literal["gnc", "edges", "refined"]
 
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
@@ -33,14 +33,15 @@ def minimize(
 ) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others
+    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others, and
+        groups of edges that agree
     """
     now, used = minimizer.evaluate(poses, loss), 0
     graduation = loss.graduation(now.chi2[minimizer.loops])
     if graduation is not None and len(minimizer.loops):
         now, loss, used = _graduate(minimizer, now, graduation)
-    if rejection == "refined" and loss.kernel == "truncated" and len(minimizer.loops):
-        minimum = _refine(minimizer, now, loss, max_iterations, tolerance)
+    if rejection != "gnc" and loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _refine(minimizer, now, loss, max_iterations, tolerance, rejection)
     else:
         minimum = minimizer.descend(now, loss, max_iterations, tolerance)
         if loss.kernel not in ("none", "truncated"):
@@ -102,7 +103,12 @@ class _Focus:
 
 
 def _refine(
-    minimizer: Minimizer, now: Evaluation, loss: RobustLoss, max_iterations: int, tolerance: float
+    minimizer: Minimizer,
+    now: Evaluation,
+    loss: RobustLoss,
+    max_iterations: int,
+    tolerance: float,
+    rejection: OutlierRejection,
 ) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
@@ -114,7 +120,8 @@ def _refine(
     price = fair_price(against[kept], nominal, problem.freedom)
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
     minimum = _refine_edges(minimizer, minimum, against, price, max_iterations, tolerance)
-    minimum = _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
+    if rejection == "refined":
+        minimum = _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
     return replace(minimum, price=price)
 
 

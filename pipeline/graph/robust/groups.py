@@ -48,6 +48,15 @@ def agreeing_groups(
     return [each for each in members if FEWEST <= len(each) <= _MOST]
 
 
+def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of the edges that join other poses than the ones before: what repeats a mistake does not count twice."""
+    chosen: list[int] = []
+    for edge in edges.tolist():
+        if not (np.abs(ends[chosen] - ends[edge]).max(axis=1, initial=0) <= _REACH).any():
+            chosen.append(edge)
+    return np.array(chosen, np.int64)
+
+
 class Contradiction:
     """Squared Mahalanobis distance between what groups of edges measure and what all other kept edges predict.
 
