@@ -1,9 +1,9 @@
-"""Errors of odometry that explain loop edges which contradict it: a systematic drift, and slips of single edges."""
+"""Errors of odometry that explain loop edges which contradict it: a systematic drift, and slips."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from scanchain.graph.initialize import Initialization
 from scanchain.graph.optimization import Solved, solve
 from scanchain.graph.robust.drift import corrected, drift_step, penalty, size
 from scanchain.graph.robust.graduation import OutlierRejection
-from scanchain.graph.robust.slips import directions, next_slip, prices, relaxed
+from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
 
 _WORTH = 3.0  # loop edges, none near another, that a systematic drift must bring in, less what it costs
+_FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
 
@@ -29,42 +31,31 @@ class Explanation:
     Attributes
     ----------
     drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
-    slips : odometry edges that are off by more than they say
+    slips : stretches of odometry that are too short by more than their edges say
     """
 
     drift: NDArray[np.float64]
-    slips: frozenset[int] = field(default=frozenset())
+    slips: tuple[Slip, ...] = ()
 
     @classmethod
     def none(cls, freedom: int) -> Explanation:
         """Odometry as it is."""
         return cls(np.zeros(size(freedom)))
 
-    @property
-    def is_empty(self) -> bool:
-        """True where odometry stays as it is."""
-        return not self.slips and not self.drift.any()
-
-    def measurements(self, measured: Matrix, is_loop: NDArray[np.bool_]) -> Matrix:
-        """Measurements (E, d+1, d+1) with the drift taken out of odometry."""
-        if not self.drift.any():
+    def measurements(self, measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]) -> Matrix:
+        """Measurements (E, d+1, d+1) with drift and slips taken out of odometry."""
+        if not self.drift.any() and not self.slips:
             return measured
-        result = measured.copy()
-        result[~is_loop] = corrected(measured[~is_loop], self.drift)
+        result, odometry = measured.copy(), ~is_loop
+        result[odometry] = corrected(
+            without_slips(measured[odometry], information[odometry], self.slips), self.drift
+        )
         return result
 
-    def information(self, claimed: Matrix, measured: Matrix) -> Matrix:
-        """Information (E, k, k) with that of the slips lowered."""
-        if not self.slips:
-            return claimed
-        result, slips = claimed.copy(), sorted(self.slips)
-        result[slips] = relaxed(claimed[slips], directions(claimed[slips], measured[slips]))
-        return result
-
-    def price(self, claimed: Matrix, measured: Matrix, price: float) -> float:
-        """Cost of the explanation, where a loop edge left out costs this price."""
-        slips = sorted(self.slips)
-        of_slips = float(prices(claimed[slips], directions(claimed[slips], measured[slips])).sum())
+    def cost(self, measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_], price: float) -> float:
+        """Cost of the explanation itself, where a loop edge left out costs this price."""
+        odometry = ~is_loop
+        of_slips = sum(price_of(slip, measured[odometry], information[odometry]) for slip in self.slips)
         return of_slips + penalty(self.drift) + (_WORTH * price if self.drift.any() else 0.0)
 
 
@@ -82,14 +73,19 @@ class Explainer:
     def __init__(
         self,
         problem_of: Callable[[Explanation], BetweenProblem],
-        claimed: Matrix,
+        measured: Matrix,
         is_loop: NDArray[np.bool_],
         config: GraphConfig,
         rejection: OutlierRejection,
+        unexplained: int,
     ) -> None:
-        """problem_of : the problem under an explanation; claimed : (E, k, k) information of the edges."""
-        self._problem_of, self._claimed, self._is_loop = problem_of, claimed, is_loop
-        self._config, self._rejection = config, rejection
+        """problem_of : the problem under an explanation; measured : (E, d+1, d+1) as odometry has it.
+
+        unexplained : number of loop edges left out for which no slip was found; until there are more, slips are
+            looked for again where the rejection is "refined" only
+        """
+        self._problem_of, self._measured, self._is_loop = problem_of, measured, is_loop
+        self._config, self._rejection, self.unexplained = config, rejection, unexplained
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
@@ -115,16 +111,18 @@ class Explainer:
     def _candidates(self, best: Explained, problem: BetweenProblem) -> list[Explanation]:
         now, poses, price = best.explanation, best.solved.poses, best.solved.minimum.price
         kept = best.solved.minimum.weights > REJECTED_WEIGHT
+        count = len(apart(problem.edges, np.flatnonzero(self._is_loop & ~kept)))
+        if count < _FEWEST:
+            return []
         found: list[tuple[float, Explanation]] = []
         if now.drift.any() or (self._is_loop & ~kept).sum() > _WORTH:
             step = drift_step(problem, poses, self._is_loop, kept, now.drift, price)
             gain = step.gain - (0.0 if now.drift.any() else _WORTH * price)
             found.append((gain, replace(now, drift=now.drift + step.change)))
-        slipped = np.zeros(len(kept), np.bool_)
-        slipped[list(now.slips)] = True
-        slip = next_slip(problem, poses, self._is_loop, kept, slipped, price)
-        if slip.edge >= 0:
-            found.append((slip.gain, replace(now, slips=now.slips | {slip.edge})))
+        if self._rejection == "refined" or count > self.unexplained:
+            self.unexplained = count
+            gain, slips = next_slip(problem, self._measured, poses, self._is_loop, kept, now.slips, price)
+            found.append((gain, replace(now, slips=slips)))
         found.sort(key=lambda each: -each[0])
         return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
@@ -138,5 +136,6 @@ class Explainer:
         minimum, explanation = explained.solved.minimum, explained.explanation
         kept = minimum.weights > REJECTED_WEIGHT
         chi2 = float(minimum.estimate.chi2[kept].sum())
-        measured = self._problem_of(explanation).measurements
-        return chi2 + price * int((self._is_loop & ~kept).sum()) + explanation.price(self._claimed, measured, price)
+        information = self._problem_of(explanation).information
+        own = explanation.cost(self._measured, information, self._is_loop, price)
+        return chi2 + price * int((self._is_loop & ~kept).sum()) + own

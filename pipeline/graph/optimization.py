@@ -17,6 +17,7 @@ from scanchain.graph.robust.losses import robust_loss
 from scanchain.graph.solvers.minimizer import Minimizer, Minimum
 from scanchain.words import counted
 
+
 @dataclass(frozen=True, slots=True)
 class GraphChange:
     """A graph before and after, for pictures and recordings, each with the edges that were in force then."""

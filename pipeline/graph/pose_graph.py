@@ -16,6 +16,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
+from scanchain.graph.explanation import Explainer, Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -27,10 +28,10 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.explanation import Explainer, Explanation
 from scanchain.graph.optimization import Optimization, solve
 from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.graph.robust.slips import Slip
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
 
@@ -56,7 +57,7 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
-        self._explanation = Explanation.none(k)
+        self._explanation, self._unexplained = Explanation.none(k), 0
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
 
@@ -88,26 +89,26 @@ class PoseGraph:
 
     @property
     def measurements(self) -> Matrix:
-        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift``."""
-        return self._explanation.measurements(self._measurements.rows, self.is_loop)
+        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift`` and ``slips``."""
+        return self._explanation.measurements(self._measurements.rows, self.information, self.is_loop)
 
     @property
     def drift(self) -> NDArray[np.float64]:
-        """Systematic drift of odometry that loop edges show, (2,) or (4,): a share of the way, and radians a meter.
+        """Systematic drift that loop edges show, (2,) or (4,): odometry is too short by a share, turns too little.
 
-        Odometry is that much too short, and turns that much too little. Zero where nothing shows one.
+        A pure number, and radians a meter about every axis; zero where nothing shows one.
         """
         return self._explanation.drift
 
     @property
-    def slips(self) -> NDArray[np.int64]:
-        """Odometry edges that loop edges show to be off by more than they say, ascending."""
-        return np.array(sorted(self._explanation.slips), np.int64)
+    def slips(self) -> tuple[Slip, ...]:
+        """Stretches of odometry that loop edges show to be off by more than their edges say."""
+        return self._explanation.slips
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), lower for ``slips`` than it was given."""
-        return self._explanation.information(self._information.rows, self._measurements.rows)
+        """Ω of every edge, (E, k, k)."""
+        return self._information.rows
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
@@ -229,10 +230,12 @@ class PoseGraph:
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
             if rejection != "gnc" and config.robust == "truncated":
+                measured = self._measurements.rows
                 explainer = Explainer(
-                    self._problem_of, self._information.rows, self.is_loop, config, rejection
+                    self._problem_of, measured, self.is_loop, config, rejection, self._unexplained
                 )
                 explained = explainer.solve(self._explanation, self.poses, initialize)
+                self._unexplained = explainer.unexplained
                 solved = explained.solved
                 if explained.explanation is not self._explanation:
                     self._changed()
@@ -339,9 +342,8 @@ class PoseGraph:
         """The problem under an explanation; the one that is there already, if it is that."""
         if self._problem is not None and explanation is self._explanation:
             return self._problem
-        measurements = explanation.measurements(self._measurements.rows, self.is_loop)
-        information = explanation.information(self._information.rows, self._measurements.rows)
-        return BetweenProblem(self.edges, measurements, information, self.fixed, self.is_point)
+        measurements = explanation.measurements(self._measurements.rows, self.information, self.is_loop)
+        return BetweenProblem(self.edges, measurements, self.information, self.fixed, self.is_point)
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""

@@ -46,14 +46,12 @@ def _changed(twists: Matrix, drift: Vector) -> Matrix:
     turns = len(drift) - 1
     d = twists.shape[-1] - turns
     length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True)
-    return np.concatenate(
-        [(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1
-    )
+    return np.concatenate([(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
 class DriftStep:
-    """A change of the drift, and the loop edges that it would make inliers, with the fall of the cost it promises."""
+    """A change of the drift, the loop edges that it would make inliers, and the fall of the cost it promises."""
 
     change: Vector
     explained: NDArray[np.int64]
@@ -106,7 +104,13 @@ def drift_step(
 
 
 def _consensus(
-    errors: Matrix, V: Matrix, noise: Matrix, curvature: Matrix, slope: Vector, edges: NDArray[np.int64], price: float
+    errors: Matrix,
+    V: Matrix,
+    noise: Matrix,
+    curvature: Matrix,
+    slope: Vector,
+    edges: NDArray[np.int64],
+    price: float,
 ) -> DriftStep:
     """Best change of the drift, of those that single edges ask for."""
     own = np.linalg.solve(curvature, slope)

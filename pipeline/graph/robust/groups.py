@@ -49,7 +49,7 @@ def agreeing_groups(
 
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Those of the edges that join other poses than the ones before: what repeats a mistake does not count twice."""
+    """Those of the edges that join other poses than the ones before: a mistake repeated does not count twice."""
     chosen: list[int] = []
     for edge in edges.tolist():
         if not (np.abs(ends[chosen] - ends[edge]).max(axis=1, initial=0) <= _REACH).any():
