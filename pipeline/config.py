@@ -92,6 +92,8 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_range_m : returns nearer than this are not used
     max_range_m : returns farther than this are not used
     deskew : whether the motion of the lidar during a scan is removed, where its points have times
+    calibrate_elevation : whether a constant error of the lidar's vertical angles is estimated from its first scans
+        that move, and corrected from then on
     map_voxel_m : voxel size to which scans are downsampled before they are inserted into the local map
     match_voxel_m : largest voxel size to which scans are downsampled before they are matched
     match_points : number of points to match; the voxels of matching shrink, down to those of the map, until
@@ -102,6 +104,7 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_range_m: NonNegative = 0.5
     max_range_m: Positive = 100.0
     deskew: bool = True
+    calibrate_elevation: bool = True
     map_voxel_m: Positive = 0.5
     match_voxel_m: Positive = 1.5
     match_points: Count = 2500

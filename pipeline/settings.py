@@ -21,7 +21,7 @@ PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
 _REVOLUTION_KEYS = ("log.revolution_s", "log.revolution_start_rad")
 _PLACE_KEYS = ("loops.place_radius_m",)
-_SPATIAL_KEYS = ("maps.slice_min_z_m", "maps.slice_max_z_m")
+_SPATIAL_KEYS = ("preprocess.calibrate_elevation", "maps.slice_min_z_m", "maps.slice_max_z_m")
 _PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
 _NOTHING: Mapping[str, str] = {}
 _ORDERED = (
@@ -102,6 +102,8 @@ def load_settings(
         raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
     if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
         raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
+    if not (isinstance(idle, Mapping) and all(isinstance(text, str) for each in idle.items() for text in each)):
+        raise InputError(f"idle is {shown(idle)}; wanted a mapping of keys without effect to the reasons")
     layer: dict[str, Value] = {}
     source = "defaults"
     if dimension is not None:

@@ -46,7 +46,8 @@ class SlamResult:
     """The result of a log.
 
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
-    the scans that stand in the ``graph``; ``closures`` every loop closure tried.
+    the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
+    the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule.
     """
 
     trajectory: Trajectory
@@ -55,6 +56,8 @@ class SlamResult:
     closures: tuple[Closure, ...]
     graph: PoseGraph
     state: GraphState
+    elevation_offset_rad: float = 0.0
+    calibrated_from: int = 0
 
     @property
     def T_world_keyframes(self) -> Matrix:
@@ -176,6 +179,8 @@ class Slam:
             closures=tuple(self.closures),
             graph=self.graph,
             state=state,
+            elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
+            calibrated_from=self.front_end.odometry.elevation.since,
         )
 
     def _check_unfinished(self) -> None:

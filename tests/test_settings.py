@@ -14,6 +14,11 @@ from tests.support.messages import says
 from tests.support.scenes import ROOT, configured
 
 
+@pytest.mark.parametrize("idle", [3, "keys", {"log.rate_hz": 3}, ["log.rate_hz"]])
+def test_idle_keys_that_are_no_mapping_are_refused(idle):
+    assert "wanted a mapping of keys without effect to the reasons" in complaint(dimension=2, idle=idle)
+
+
 def flag(key, text):
     return Override(key, text, f"--{key}")
 

@@ -12,7 +12,10 @@ from scanchain.data import Pose, RawPoints
 
 
 class Baseline(Protocol):
-    """An odometry by others, run on the same scans as ours; any class with these two members can be compared."""
+    """An odometry by others, run on the same scans as ours.
+
+    Any class with ``track`` can be compared; without a ``description`` it goes by its name.
+    """
 
     @property
     def description(self) -> str:

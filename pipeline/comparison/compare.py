@@ -28,7 +28,6 @@ from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
 from scanchain.source import Source
-from scanchain.verdict import Verdict
 from scanchain.words import counted
 
 
@@ -76,11 +75,6 @@ class Compared:
     def failures(self) -> list[str]:
         """Names of the methods that started and failed."""
         return [row.name for row in self.table.rows if row.status.is_failure]
-
-    @property
-    def unreliable(self) -> list[str]:
-        """Names of the methods whose result is not trustworthy."""
-        return [row.name for row in self.table.rows if row.verdict == Verdict.NOT_TRUSTWORTHY]
 
 
 def compare(comparison: Comparison, present: Callable[[Path], None], progress: Progress) -> Compared:

@@ -33,7 +33,7 @@ from scanchain.comparison.outcome import (
 )
 from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import MissingExtraError, ScanchainError
+from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, peak_mib
 from scanchain.runs.job import Unwatched
 
@@ -72,7 +72,7 @@ def can_start_again(method: Method) -> bool:
 class _Others:
     def __init__(self, method: Method, dimension: int) -> None:
         self.baseline = _baseline(method, dimension)
-        self.description = self.baseline.description
+        self.description = str(getattr(self.baseline, "description", "")) or method.base
 
     def track(self, scan: Scan) -> Pose:
         return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
@@ -109,6 +109,8 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
         began_s, cpu_began_s = perf_counter(), process_time()
         pose = runner.track(scan)
         took_s, cpu_took_s = perf_counter() - began_s, process_time() - cpu_began_s
+        if np.shape(pose) != (size, size):
+            raise ValueError(f"track returned {shown(pose)}; wanted a pose ({size}, {size})")
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
         seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose

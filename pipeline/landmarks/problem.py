@@ -26,7 +26,7 @@ class LandmarkData:
     measured : (N, 2) relative x, y in m; or bearing in rad, range in m
     odometry_covariance : (2, 2) m²
     observation_covariance : (2, 2) of ``measured``
-    true_poses, true_landmarks : (K, 2), (L, 2) m
+    true_poses, true_landmarks : (K, 2), (L, 2) m; (0, 2) and NaN where unknown
     """
 
     name: str

@@ -25,7 +25,7 @@ def linear_system(data: LandmarkData) -> LinearSystem:
     The prior puts the first pose at the origin. It can be met exactly, so that its weight, a hundredth of a step's
     noise, matters to the covariance alone.
     """
-    layout = Layout(len(data.true_poses), 2, np.arange(len(data.true_landmarks)))
+    layout = Layout(len(data.odometry) + 1, 2, np.arange(len(data.true_landmarks)))
     W_odometry, W_observation = whitening(data.odometry_covariance), whitening(data.observation_covariance)
     poses = pose_columns(layout, np.arange(layout.poses))
     seen_from, seen = data.observed.T
@@ -41,5 +41,5 @@ def linear_system(data: LandmarkData) -> LinearSystem:
 
 def state_of(data: LandmarkData, x: np.ndarray) -> Values:
     """The unknowns as positions."""
-    split = 2 * len(data.true_poses)
+    split = 2 * (len(data.odometry) + 1)
     return Values(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))

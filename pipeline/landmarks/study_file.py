@@ -64,7 +64,7 @@ def _nonlinear(data: LandmarkData, options: Options) -> _Solved:
     begin = working_s()
     system = problem.system(problem.linearize(minimum.state), minimum.weights)
     build_s = working_s() - begin
-    if options.optimizer == "gradient-descent":  # solves no linear system: compare them on the one at its end
+    if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
         methods = compare_linear(system, names, options.repeats)
     else:
         methods = compare_nonlinear(problem, guess, options.optimizer, names, options.repeats)

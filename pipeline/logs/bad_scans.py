@@ -14,6 +14,10 @@ from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 from scanchain.words import counted
 
+_FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than meters
+_MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
+_SPANS = 100  # number of first scans whose point times are compared with the period
+_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
@@ -60,7 +64,14 @@ def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     near_m, far_m = np.sqrt([squares.min(), squares.max()])
     limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
     seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"
-    return f"no point between {limits} ({seen}: widen these limits)"
+    in_millimeters = near_m > high_m and are_millimeters(float(np.median(np.sqrt(squares))), config)
+    remedy = "millimeters? convert them to meters" if in_millimeters else "widen these limits"
+    return f"no point between {limits} ({seen}: {remedy})"
+
+
+def are_millimeters(range_m: float, config: PreprocessConfig) -> bool:
+    """True if a typical range is one that no lidar has in meters, and within the limits in millimeters."""
+    return range_m > _FARTHEST_M and config.min_range_m <= 1e-3 * range_m <= config.max_range_m
 
 
 class ScanCounts:
@@ -72,6 +83,8 @@ class ScanCounts:
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = 0
         self.first_complaint = ""
         self.last_stamp_ns: int | None = None
+        self.spans_s: list[float] = []
+        self.log_times_ns: list[int] = []
 
     def skip(self, complaint: str) -> None:
         """Count a scan that is left out."""
@@ -87,13 +100,40 @@ class ScanCounts:
             self.backwards += scan.stamp_ns < self.last_stamp_ns
             self.repeated += scan.stamp_ns == self.last_stamp_ns
         self.last_stamp_ns = scan.stamp_ns
+        if len(self.log_times_ns) < _SPANS:
+            self.log_times_ns.append(scan.log_time_ns)
+            self.spans_s += [float(np.ptp(scan.times_s))] if len(scan.times_s) else []
 
     def losses(self) -> list[str]:
-        """A line on the scans that were left out, none where there are none."""
-        if not self.bad:
+        """Lines on scans left out, stamps that most scans do not have, and odd point times; none as a rule."""
+        lines = []
+        if self.bad:
+            were = "was" if self.bad == 1 else "were"
+            share = f"{self.bad} of {counted(self.scans, 'scan')} of {self.topic} {were}"
+            lines.append(f"{share} left out (the first: {self.first_complaint})")
+        if self._has_no_stamps and self.last_stamp_ns is not None:
+            share = f"{self.repeated} of {counted(self.scans, 'scan')} of {self.topic}"
+            lines.append(
+                f"{share} have the header stamp of the one before (the last {1e-9 * self.last_stamp_ns:.3f} s): "
+                "the times in the results do not tell scans apart; record with stamps"
+            )
+        return [*lines, *self._odd_times()]
+
+    def _odd_times(self) -> list[str]:
+        """A line where the point times of the first scans span next to nothing, or more than two periods."""
+        if not self.spans_s or len(self.log_times_ns) < 2:
             return []
-        share = f"{self.bad} of {counted(self.scans, 'scan')} of {self.topic} {'was' if self.bad == 1 else 'were'}"
-        return [f"{share} left out (the first: {self.first_complaint})"]
+        span_s, period_s = float(np.median(self.spans_s)), 1e-9 * float(np.median(np.diff(self.log_times_ns)))
+        if period_s <= 0.0 or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
+            return []
+        return [
+            f"by their point times scans of {self.topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of "
+            "the period: of another unit? scanchain doctor names the flag, --preprocess.deskew false ignores them"
+        ]
+
+    @property
+    def _has_no_stamps(self) -> bool:
+        return self.repeated > _MOST_REPEATED * self.scans
 
     def notes(self) -> list[str]:
         """Lines on stamps out of order and missing wheel odometry."""
@@ -101,7 +141,7 @@ class ScanCounts:
         if self.backwards:
             steps = counted(self.backwards, "step")
             lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")
-        if self.repeated:
+        if self.repeated and not self._has_no_stamps:
             lines.append(
                 f"{counted(self.repeated, 'scan')} of {self.topic} with the header stamp of the one before"
             )

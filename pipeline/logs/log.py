@@ -217,11 +217,12 @@ class Log:
                 requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
+            is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
-        if self._damage:
+        if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 

@@ -61,6 +61,7 @@ FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
 AUTO = "auto"  # value of log.format: the format that claims the path
 HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.rate_hz has no effect
 
+_RUN_FILE = "run.json"
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
 _HEAD_BYTES = 64  # number of bytes of a file's head by which formats claim it
@@ -132,7 +133,9 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
 
 
 def _claiming(path: Path, head: bytes) -> LogFormat:
-    """The format that claims a path. Raises InputError where none does."""
+    """The format that claims a path. Raises InputError where none does, and for a run directory."""
+    if (path / _RUN_FILE).is_file():
+        raise InputError(f"{path}: is a run directory, no log; give the log that its {_RUN_FILE} names")
     for form in FORMATS.values():
         if form.claims(path, head):
             return form

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
-from scanchain.errors import InputError
+from scanchain.errors import InputError, shown
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_recognizer
 from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
@@ -96,7 +96,10 @@ class PlaceCloser:
         apart_m = max((RADII_BEHIND + RADII_AHEAD) * submap.radius_m, self.config.loops.min_travel_m)
         T_expected = self._expected(anchor, keyframes, T_world)
         query = Query(submap, anchor.traveled_m - apart_m, T_expected, keyframes, T_world)
-        for candidate in recognizer.query(query):
+        candidates = recognizer.query(query)
+        if not isinstance(candidates, Iterable):
+            raise InputError(f"{self._named}: query returned {shown(candidates)}; wanted a list of candidates")
+        for candidate in candidates:
             self._check(candidate, query)
             is_connected = bool(connected[candidate.target] == connected[anchor.index])
             if not is_connected and candidate.proposed_by is Proposal.POSITION:
@@ -122,19 +125,28 @@ class PlaceCloser:
         T_last_anchor = lie.between(keyframes[self.last.source].T_odom_lidar, anchor.T_odom_lidar)
         return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
 
+    @property
+    def _named(self) -> str:
+        return f"loops.recognizer {self.config.loops.recognizer}"
+
     def _check(self, candidate: Candidate, query: Query) -> None:
-        """Refuse a candidate that is out of range."""
-        name, target = self.config.loops.recognizer, candidate.target
+        """Refuse what is no candidate, and a candidate that is out of range."""
+        if not isinstance(candidate, Candidate):
+            raise InputError(
+                f"{self._named}: query returned {shown(candidate)} among its candidates; wanted "
+                "scanchain.loops.recognizer.Candidate"
+            )
+        target = candidate.target
         is_old = 0 <= target < len(query.keyframes) and query.keyframes[target].traveled_m <= query.max_traveled_m
         if not is_old:
             raise InputError(
-                f"loops.recognizer {name}: candidate {target} for keyframe {query.submap.anchor.index} is not "
+                f"{self._named}: candidate {target} for keyframe {query.submap.anchor.index} is not "
                 "older; wanted one whose traveled_m is at most query.max_traveled_m"
             )
         T, size = np.asarray(candidate.T_target_source), self.dimension + 1
         if T.shape != (size, size) or not np.isfinite(T).all():
             raise InputError(
-                f"loops.recognizer {name}: T_target_source of candidate {target} has the shape {T.shape}; wanted "
+                f"{self._named}: T_target_source of candidate {target} has the shape {T.shape}; wanted "
                 f"a finite pose ({size}, {size})"
             )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
@@ -46,16 +47,19 @@ class MapKeeper:
         if scale != self.surfaces.scale:
             self._remake(scale)
 
+    def replace(self, scans: Iterable[tuple[Points, Pose]]) -> None:
+        """Rebuild the map from these scans (N, d), each in its own lidar frame, with its pose."""
+        self.recent.clear()
+        self.recent.extend(scans)
+        self._remake(self.surfaces.scale)
+
     def restart(self, points: Points) -> None:
         """Rebuild the map from a single scan (N, d), odom frame."""
-        self.recent.clear()
-        self.recent.append((points, lie.identity(self.surfaces.dimension)))
-        self._remake(self.surfaces.scale)
+        self.replace([(points, lie.identity(self.surfaces.dimension))])
 
     def forget(self) -> None:
         """Empty the map."""
-        self.recent.clear()
-        self._remake(self.surfaces.scale)
+        self.replace([])
 
     def _remake(self, scale: float) -> None:
         self.surfaces = VoxelMap(self.surfaces.dimension, self.config, scale)

@@ -14,6 +14,7 @@ from scanchain.config import Config
 from scanchain.data import LEAST_FIT, Match, Points, Pose, RawPoints, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.live_stamps import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
@@ -63,6 +64,8 @@ class Odometry:
         self.recovery = Recovery(config.matching)
         self.standstill = Standstill(self.dimension)
         self.map = MapKeeper(self.dimension, config.local_map)
+        is_wanted = self.dimension == 3 and config.preprocess.calibrate_elevation
+        self.elevation = ElevationCalibration(is_wanted=is_wanted)
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
         self.live_stamps = LiveStamps()
@@ -97,7 +100,7 @@ class Odometry:
         self._check_dimension(scan)
         self.scans += 1
         started = working_s()
-        sweep, sparse = self.resolution.downsampled(scan)
+        sweep, sparse = map(self.elevation.corrected, self.resolution.downsampled(scan))
         self.map.resize(self.resolution.scale)
         if not len(self.local_map):
             self._check_range(scan, sparse)
@@ -108,6 +111,7 @@ class Odometry:
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
         points = sweep.from_middle(self.predictor.velocity)
         self._extend(points, registered)
+        self._calibrate(points, registered.state)
         tracked = Tracked(
             scan=scan,
             points=points,
@@ -178,6 +182,7 @@ class Odometry:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.forget()
         self.recovery.forget()
+        self.elevation.forget()
         self.standstill.begin(prediction.T_odom_last)
         away_m = prediction.reach_m
         reason = f"may be {away_m:.0f} m away after a time without scans: {NEW_MAP}"
@@ -201,15 +206,27 @@ class Odometry:
         elif self.recovery.has_given_up:
             self.map.insert(points, T_odom_lidar)
 
+    def _calibrate(self, points: Points, state: State) -> None:
+        """Take the scan for the elevation offset; where one is found, rebuild the map without it."""
+        if state is State.LOST:
+            self.elevation.forget()
+            return
+        corrected = self.elevation.take(points, self.predictor.T_odom_lidar, self.local_map.voxels.size_m)
+        if corrected:
+            self.map.replace(corrected)
+
     def _at_stamp(self, tracked: Tracked, sweep: Sweep, prediction: Prediction) -> Tracked:
         """A scan that was aligned as seen from its middle, as seen from its stamp.
 
-        The stamp lies between two middles, or just beyond; the motion between these is the last one.
+        The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
+        changes at the rate of the last two motions. In translation such a rate would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.interval_s <= 0.0:
             return tracked
-        motion = lie.log(self.predictor.T_previous_current)
-        return seen_from(tracked, lie.exp(sweep.middle_s / prediction.interval_s * motion))
+        mean = lie.log(self.predictor.T_previous_current) / prediction.interval_s
+        change = (1.0 - sweep.middle_s / prediction.interval_s) * (self.predictor.velocity - mean)
+        change[: self.dimension] = 0.0
+        return seen_from(tracked, lie.exp(sweep.middle_s * (mean + change)))
 
     def _check_dimension(self, scan: Scan) -> None:
         checks.instance(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,16 @@ from scanchain.config import Config, PreprocessConfig
 from scanchain.data import Match, Points, Pose
 from scanchain.errors import InputError
 from scanchain.preprocess import downsample
-from scanchain.registration.correlative import CorrelativeMap
+from scanchain.registration.correlative import CorrelativeMap, Window
 from scanchain.registration.matcher import create_matcher
 from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
 _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most
 _WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
+_SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number, distance, share of the best score
+_ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
+_AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
 
 
@@ -75,7 +79,7 @@ def align(
 
 
 def _matched(target: Points, source: Points, T_first: Pose, range_m: float, config: Config) -> Match:
-    """The match of two clouds that fit the configuration; in the plane the better of two beginnings."""
+    """The match of two clouds that fit the configuration; in the plane the best of several beginnings."""
     local_map = VoxelMap(target.shape[1], config.local_map)
     local_map.insert(downsample(target, config.preprocess.map_voxel_m), lie.identity(target.shape[1]))
     sparse = _downsampled(source, config.preprocess)
@@ -83,10 +87,22 @@ def _matched(target: Points, source: Points, T_first: Pose, range_m: float, conf
     match = matcher.align(sparse, local_map, T_first, wide=True)
     if local_map.dimension == 3:
         return match
-    seed = CorrelativeMap(local_map, T_first).best(
-        sparse, T_first, half_width_m=_WINDOW * range_m, half_width_rad=_WINDOW_RAD
-    )
-    return min(match, matcher.align(sparse, local_map, seed.T_target_source), key=lambda each: each.cost)
+    window = Window(_WINDOW * range_m, _WINDOW_RAD, _SEEDS_APART_M, _RIVAL, _SEEDS)
+    seeds = CorrelativeMap(local_map, T_first).search(sparse, T_first, window)
+    found = (lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist())
+    return _unambiguous([match, *(matcher.align(sparse, local_map, T_seed) for T_seed in found)])
+
+
+def _unambiguous(matches: Sequence[Match]) -> Match:
+    """The match of the lowest cost, not converged where one elsewhere fits nearly as well."""
+    best = min(matches, key=lambda match: match.cost)
+    for other in matches:
+        apart_m, apart_rad = lie.apart(best.T_target_source, other.T_target_source)
+        is_elsewhere = apart_m > _ELSEWHERE_M or apart_rad > _ELSEWHERE_RAD
+        if best.converged and is_elsewhere and other.cost < _AMBIGUOUS * best.cost:
+            reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
+            best = replace(best, converged=False, reason=reason)
+    return best
 
 
 def _range_voxels(points: int, d: int) -> float:

@@ -104,13 +104,16 @@ class CorrelativeMap:
 
         least : share of the highest score, below which nothing counts
         """
-        some = evenly(downsample(points, self.grid.resolution_m), _POINTS)
         window = Window(half_width_m, half_width_rad, _APART_M, _RIVAL, answers=2, least=least)
-        found = self.grid.search(some, T_first, window)
+        found = self.search(points, T_first, window)
         if not len(found):
             return Seed(T_first, 0.0, 0.0)
         x_m, y_m, yaw_rad, share = found[0].tolist()
         return Seed(lie.pose_2d(x_m, y_m, yaw_rad), share, found[1, 3] if len(found) > 1 else 0.0)
+
+    def search(self, points: Points, T_first: Pose, window: Window) -> NDArray[np.float64]:
+        """The best poses of a window around the first one, as those of ``ScoreGrid.search``."""
+        return self.grid.search(evenly(downsample(points, self.grid.resolution_m), _POINTS), T_first, window)
 
 
 def evenly(points: Points, most: int) -> Points:

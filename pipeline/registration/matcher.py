@@ -56,7 +56,11 @@ class CheckedMatcher:
         self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """The result of the user's ``align``, its arrays of the shape and dtype wanted."""
-        match = self.own.align(points, target, T_first, prior, wide=wide)
+        try:
+            match = self.own.align(points, target, T_first, prior, wide=wide)
+        except Exception as error:  # of the user's own code
+            reason = " ".join(str(error).split())
+            raise InputError(f"{self.name}: align failed with {type(error).__name__}: {reason}") from error
         if not isinstance(match, Match):
             raise InputError(f"{self.name}: align returned {shown(match)}; wanted a scanchain.Match")
         d, of = len(T_first) - 1, f"{self.name}: of the Match that align returned,"

@@ -22,7 +22,7 @@ from scanchain.runs.vouching import evidence_of_trajectory
 from scanchain.settings import Override, load_settings
 from scanchain.source import Source
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Evidence, Judged, judge
+from scanchain.verdict import Evidence, Judged, check_overlap, judge
 
 _FEWEST = 3  # scans with a pose
 
@@ -98,5 +98,6 @@ def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, floa
         evidence,
         is_lost=np.array([match is not None and match.inlier_share < least for match, _ in matches]),
         is_degenerate=np.array([match is not None and match.observability < 1.0 for match, _ in matches]),
+        overlap=check_overlap(np.array([1.0 if match is None else match.inlier_share for match, _ in matches])),
         fit=np.array([np.nan if m is None else m.fit if away_m < farthest_m else 0.0 for m, away_m in matches]),
     )

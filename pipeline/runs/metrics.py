@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from math import isfinite
@@ -72,6 +73,8 @@ class Metrics(Struct, frozen=True):
     ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
+    ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
+    ``calibrated_from`` on; 0 where no error was found.
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 
@@ -110,6 +113,8 @@ class Metrics(Struct, frozen=True):
     stretches: tuple[Stretch, ...] = ()
     stopped: str = ""
     compile_s: float = 0.0
+    elevation_offset_rad: float = 0.0
+    calibrated_from: int = 0
 
     @property
     def sentence(self) -> str:
@@ -207,6 +212,8 @@ def measure(
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,
+        elevation_offset_rad=result.elevation_offset_rad,
+        calibrated_from=result.calibrated_from,
     )
 
 
@@ -236,6 +243,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
+        *_calibration_lines(m),
         f"time           {m.run_s:.1f} s{m.compiling}, "
         f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
@@ -283,3 +291,13 @@ def _accuracy_lines(truth: GroundTruth) -> list[str]:
             f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"
         )
     return lines
+
+
+def _calibration_lines(m: Metrics) -> list[str]:
+    if not m.elevation_offset_rad:
+        return []
+    offset_deg = math.degrees(m.elevation_offset_rad)
+    return [
+        f"calibration    vertical angles corrected by {offset_deg:+.2f} deg from scan {m.calibrated_from:,} on "
+        "(preprocess.calibrate_elevation)"
+    ]

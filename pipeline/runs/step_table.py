@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
 from scanchain.evaluation import motion_nees, pair
-from scanchain.verdict import check_velocity, check_wheels
+from scanchain.verdict import check_overlap, check_velocity, check_wheels
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -150,7 +150,11 @@ class StepTable:
 
         log_times_ns = np.array([row.log_time_ns for row in self.rows], np.int64)
         velocity = check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses)
-        columns: dict[str, object] = {"velocity_innovation": pa.array(velocity, from_pandas=True)}
+        overlap = check_overlap(np.array([row.match.inlier_share for row in self.rows], np.float64))
+        columns: dict[str, object] = {
+            "velocity_innovation": pa.array(velocity, from_pandas=True),
+            "overlap_ratio": pa.array(overlap, from_pandas=True),
+        }
         if T_base_lidar is None or not any(row.T_odom_base is not None for row in self.rows):
             return columns
         wheels = self.wheel_poses(T_base_lidar)
@@ -172,6 +176,7 @@ _NOTES = {
     "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
     "null where there is nothing to compare",
     "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
+    "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
     "keyframe": "number in the graph, -1 if none was made",
 }
 

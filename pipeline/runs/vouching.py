@@ -13,7 +13,7 @@ from scanchain.data import Matrix, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.odometry.tracked import NEW_MAP
 from scanchain.runs.closures import VERIFICATION
-from scanchain.verdict import Closures, Evidence, Judged, check_velocity, check_wheels, judge
+from scanchain.verdict import Closures, Evidence, Judged, check_overlap, check_velocity, check_wheels, judge
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -27,6 +27,10 @@ def judge_run(folder: Path) -> Judged:
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder}: has no steps.parquet: no run directory, or that of an unfinished run (--resume goes on)"
+        ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"
@@ -50,6 +54,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
+        overlap=check_overlap(steps["inliers"].to_numpy() / np.maximum(steps["points"].to_numpy(), 1)),
         closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
     )
 
@@ -69,6 +74,7 @@ def evidence_of_trajectory(
         points=points,
         wheels=check_wheels(trajectory.poses, wheels),
         velocity=check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses),
+        overlap=np.full(n, np.nan),
         closures=_no_closures(trajectory.poses),
     )
 

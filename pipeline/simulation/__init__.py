@@ -2,8 +2,8 @@
 
 from scanchain.simulation.drive import Drive, plan
 from scanchain.simulation.information import information, spectrum, undetermined
-from scanchain.simulation.log import simulate
+from scanchain.simulation.log import record, simulate
 from scanchain.simulation.sensors import SENSORS
 from scanchain.simulation.worlds.registry import WORLDS
 
-__all__ = ["SENSORS", "WORLDS", "Drive", "information", "plan", "simulate", "spectrum", "undetermined"]
+__all__ = ["SENSORS", "WORLDS", "Drive", "information", "plan", "record", "simulate", "spectrum", "undetermined"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,7 @@ class Drive:
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
     scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
+    solids_of_instant : the solids at the begin of a scan, where some of them move
     """
 
     solids: Solids
@@ -38,6 +39,11 @@ class Drive:
     sensor: Sensor
     T_base_lidar: Matrix
     scans: NDArray[np.int64]
+    solids_of_instant: Callable[[float], Solids] | None = None
+
+    def solids_at(self, time_s: float) -> Solids:
+        """The solids during the scan that begins then."""
+        return self.solids if self.solids_of_instant is None else self.solids_of_instant(time_s)
 
     def truth(self) -> Trajectory:
         """T_world_lidar at the stamp of every recorded scan: SE(2) for a laser scanner, SE(3) for a lidar."""

@@ -49,6 +49,19 @@ def simulate(
     if truth_file.exists() and not force:
         raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
     drive = plan(world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout)
+    return record(drive, destination, seed=seed, drift=drift, force=force, progress=progress)
+
+
+def record(
+    drive: Drive,
+    destination: Path,
+    *,
+    seed: int = 0,
+    drift: float = 1.0,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Write a log of any drive, as ``simulate`` does of one that is planned; the truth, beside it as well."""
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
@@ -63,7 +76,7 @@ def simulate(
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
                 progress(done + 1, len(truth))
-    write_tum(truth_file, truth)
+    write_tum(destination.with_suffix(".tum"), truth)
     return truth
 
 
@@ -72,7 +85,7 @@ def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
 
     def take(index: int) -> Sweep:
         start_s = index * drive.sensor.period_ns * 1e-9
-        return take_sweep(drive.solids, drive.motion, drive.sensor, index, start_s, rng)
+        return take_sweep(drive.solids_at(start_s), drive.motion, drive.sensor, index, start_s, rng)
 
     with ThreadPoolExecutor(max_workers=1) as caster:
         upcoming = caster.submit(take, int(drive.scans[0]))

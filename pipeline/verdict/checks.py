@@ -27,7 +27,10 @@ _GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number 
 
 _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands can do
 _MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
-_ALIKE = 1.4  # largest ratio of two intervals that agree
+_ALIKE = 1.4  # an interval shorter than the usual one by this factor is none: its stamps jitter
+
+_FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
+_LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
 
 
 class WheelCheck(NamedTuple):
@@ -104,16 +107,28 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
     clocks.append(np.full(n - 1, usual_s))
     best = np.full(n - 2, np.inf)
     for interval_s in clocks:
-        before, after = interval_s[:-1], interval_s[1:]
-        is_plausible = (before > usual_s / _ALIKE) & (after > usual_s / _ALIKE)
-        ratio = np.where(is_plausible, after / np.where(is_plausible, before, 1.0), 1.0)
-        change = motions[1:] - ratio[:, None] * motions[:-1]
-        span_s2 = np.where(is_plausible, 0.5 * after * (before + after), usual_s**2)
+        plausible_s = np.maximum(interval_s, usual_s / _ALIKE)
+        before, after = plausible_s[:-1], plausible_s[1:]
+        change = motions[1:] - (after / before)[:, None] * motions[:-1]
+        span_s2 = 0.5 * after * (before + after)
         sigma_m = np.hypot(_ACCELERATION_M_S2 * span_s2, _MOTION_M)
         sigma_rad = np.hypot(_ACCELERATION_RAD_S2 * span_s2, _MOTION_RAD)
         best = np.minimum(best, np.maximum(_lengths(change[:, :d]) / sigma_m, _lengths(change[:, d:]) / sigma_rad))
     innovation[2:] = best
     return innovation
+
+
+def check_overlap(inlier_share: Floats) -> Floats:
+    """(N,) share of the points with a correspondence over its median in the scans before, NaN for the first.
+
+    What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
+    than the map says, or something stands close before it.
+    """
+    n = len(inlier_share)
+    usual = [np.median(inlier_share[max(scan - _BEFORE, 0) : scan]) for scan in range(_FEWEST, n)]
+    ratio = np.full(n, np.nan)
+    ratio[_FEWEST:] = inlier_share[_FEWEST:] / np.maximum(usual, _LEAST_USUAL)
+    return ratio
 
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:

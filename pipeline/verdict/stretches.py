@@ -16,10 +16,13 @@ from scanchain.verdict.checks import Floats, WheelCheck
 from scanchain.verdict.loops import Closures, contradicting_groups
 
 WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
+_LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
+_GAP = 3.0  # intervals of usual length from which on the motion is not predicted
 _GAP_SCANS = 10  # longest gap within a stretch
 _SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
+_KNOWN = 0.5  # least share of its scans that the wheels are compared at
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
 
 
@@ -33,6 +36,7 @@ class Kind(StrEnum):
     ACCELERATION = "impossible acceleration"
     LOOPS = "loop closures disagree"
     DISCONNECTED = "disconnected"
+    OVERLAP = "overlap lost"
 
 
 class Stretch(Struct, frozen=True):
@@ -77,7 +81,7 @@ class Evidence:
     fit : as in ``Match``; NaN where unknown
     starts_segment : scans whose motion from the one before is unknown
     points : valid returns
-    wheels, velocity : checks
+    wheels, velocity, overlap : checks
     closures : those that verification accepted
     """
 
@@ -90,6 +94,7 @@ class Evidence:
     points: NDArray[np.int64]
     wheels: WheelCheck
     velocity: Floats
+    overlap: Floats
     closures: Closures
 
     @property
@@ -101,6 +106,12 @@ class Evidence:
     def is_held_by_wheels(self) -> NDArray[np.bool_]:
         """(N,) scans around which the wheels agree with the trajectory."""
         return self.wheels.innovation <= WHEEL_LIMIT
+
+    @property
+    def is_after_gap(self) -> NDArray[np.bool_]:
+        """(N,) scans before which the log has none for so long that the motion is not predicted."""
+        intervals_s = np.diff(self.seconds, prepend=self.seconds[0])
+        return intervals_s > _GAP * np.median(intervals_s)
 
     def __len__(self) -> int:
         return len(self.seconds)
@@ -114,6 +125,7 @@ def find_stretches(evidence: Evidence) -> list[Stretch]:
         *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & _fits_badly(evidence)),
         *_of_wheels(evidence),
         *_of_acceleration(evidence),
+        *_of_overlap(evidence),
         *_of_loops(evidence),
         *_of_segments(evidence),
     ]
@@ -121,19 +133,39 @@ def find_stretches(evidence: Evidence) -> list[Stretch]:
 
 
 def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> Iterator[Stretch]:
-    """Stretches that are too long to be passed by the predicted motion."""
-    positions, is_held = evidence.poses[:, :-1, -1], evidence.is_held_by_wheels
+    """Stretches that are too long to be passed by the predicted motion.
+
+    A scan in between that is not marked measures the pose again, unless those beside it were inserted into the map
+    at poses that their correspondences contradict.
+    """
     for part in merged(is_marked):
-        entered = positions[max(part.start - 1, 0)]
-        extent_m = float(np.linalg.norm(positions[part] - entered, axis=1).max())
-        passed_m = _PASSED_BY_WHEELS_M if is_held[part].all() else _PASSED_M
-        if extent_m > passed_m:
+        inner = merged(is_marked[part], 0 if kind is not Kind.CONTRADICTED else _GAP_SCANS)
+        runs = [slice(part.start + run.start, part.start + run.stop) for run in inner]
+        if any(_extent_m(evidence, run, kind) > _passed_m(evidence, run) for run in runs):
             yield _stretch(evidence, kind, part.start, part.stop - 1, int(is_marked[part].sum()))
 
 
+def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
+    """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
+    positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
+    extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
+    if kind is Kind.DEGENERATE or not evidence.is_after_gap[part.start]:
+        return extent_m
+    speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / np.median(np.diff(evidence.seconds))
+    return max(extent_m, float(speed_m_s * (evidence.seconds[part.start] - evidence.seconds[last])))
+
+
+def _passed_m(evidence: Evidence, part: slice) -> float:
+    """Extent up to which a part is passed without harm: more where wheels are known and none contradicts."""
+    innovation = evidence.wheels.innovation[part]
+    is_held = np.isfinite(innovation).mean() >= _KNOWN and not (innovation > WHEEL_LIMIT).any()
+    return _PASSED_BY_WHEELS_M if is_held else _PASSED_M
+
+
 def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
-    """(N,) scans around which most contradict their pose."""
-    return median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest") < LEAST_FIT
+    """(N,) scans around which most contradict their pose, and those after a gap over which no wheels agree."""
+    median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
+    return (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
 
 
 def _of_wheels(evidence: Evidence) -> Iterator[Stretch]:
@@ -151,6 +183,12 @@ def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
     for part in merged(is_marked):
         size_m = float(jumps_m[part][is_marked[part]].max())
         yield _stretch(evidence, Kind.ACCELERATION, part.start, part.stop - 1, int(is_marked[part].sum()), size_m)
+
+
+def _of_overlap(evidence: Evidence) -> Iterator[Stretch]:
+    is_marked = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
+    for part in merged(is_marked):
+        yield _stretch(evidence, Kind.OVERLAP, part.start, part.stop - 1, int(is_marked[part].sum()))
 
 
 def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
@@ -171,12 +209,12 @@ def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
         yield _stretch(evidence, Kind.DISCONNECTED, int(scans[0]), int(scans[-1]), len(scans))
 
 
-def merged(is_marked: NDArray[np.bool_]) -> list[slice]:
+def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
     """Runs of marked scans, joined over gaps of a few scans."""
     places = np.flatnonzero(is_marked)
     if not len(places):
         return []
-    parts = np.split(places, np.flatnonzero(np.diff(places) > _GAP_SCANS + 1) + 1)
+    parts = np.split(places, np.flatnonzero(np.diff(places) > gap + 1) + 1)
     return [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
 
 

@@ -17,7 +17,7 @@ _MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and conf
 _LARGE_M = 1.0  # impossible change of the motion above which the trajectory is wrong
 _EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
-_UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)
+_UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 _SHOWN = 3  # stretches that the sentence lists
 
 
@@ -130,6 +130,7 @@ def _by(evidence: Evidence) -> str:
     """Names of the checks that were made, as text."""
     checks = [
         *(["fit"] if np.isfinite(evidence.fit).any() else []),
+        *(["overlap"] if np.isfinite(evidence.overlap).any() else []),
         *(["constant velocity"] if np.isfinite(evidence.velocity).any() else []),
         *(["wheels"] if np.isfinite(evidence.wheels.innovation).any() else []),
         *(["loop closures"] if len(evidence.closures.target) else []),

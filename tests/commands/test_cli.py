@@ -455,6 +455,12 @@ def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_resu
     assert call("check", out) == (1, f"not trustworthy: {why}\n", "")
 
 
+def test_the_directory_of_a_run_that_did_not_finish_is_named_as_such(call, tmp_path):
+    code, _, errors = call("check", tmp_path)
+    assert code == 2
+    says(errors, f"{tmp_path}: has no steps.parquet: no run directory, or that of an unfinished run", "--resume")
+
+
 def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_not_one_that_jumps(
     call, tmp_path, office
 ):

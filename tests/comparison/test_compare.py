@@ -33,7 +33,7 @@ from scanchain.trajectory import read_tum, write_kitti, write_tum
 from tests.support.scenes import ROOT, shared_data
 
 SUPPORT = ROOT / "tests" / "support"
-NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself")
+NATURES = ("Raises", "Hangs", "Eats", "Dies", "DiesEarly", "LosesItself", "Spatial")
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,11 @@ def test_every_bad_method_is_a_row_that_says_how_it_ended(bad):
         ("dies", Status.CRASHED, "at scan 10: ended by SIGSEGV"),
         ("diesearly", Status.CRASHED, "while starting or warming up: ended by SIGSEGV"),
         ("losesitself", Status.CRASHED, "at scan 10: ValueError: a pose that is not finite"),
+        (
+            "spatial",
+            Status.CRASHED,
+            "at scan 0: ValueError: track returned an array of the shape (4, 4); wanted a pose (3, 3)",
+        ),
     ):
         assert (row(table, name).status, row(table, name).reason) == (status, reason)
         assert row(table, name).figures.ate_m is None
@@ -170,17 +175,17 @@ def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(offic
     assert line == "not installed: kiss-icp, genz-icp; pip install 'scanchain[baselines]'"
 
 
-def test_an_unreliable_result_is_exit_code_1(office, good, monkeypatch, capfd):
+def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, good, monkeypatch, capfd):
     table, folder = good
-    doubted = [
-        msgspec.structs.replace(each, verdict="not trustworthy", verdict_reason="most are lost")
-        for each in table.rows[:1]
-    ]
-    for rows, code in ((table.rows, 0), ([*doubted, *table.rows[1:]], 1)):
-        compared = Compared(folder, msgspec.structs.replace(table, rows=rows))
+    doubted = msgspec.structs.replace(table.rows[0], verdict="not trustworthy", verdict_reason="most are lost")
+    crashed = msgspec.structs.replace(table.rows[0], status=Status.CRASHED)
+    for first, code in ((doubted, 0), (crashed, 1)):
+        compared = Compared(folder, msgspec.structs.replace(table, rows=[first, *table.rows[1:]]))
         monkeypatch.setattr("scanchain.comparison.compare.compare", lambda *_, done=compared: done)
         assert main(["compare", str(office), "--out", str(folder)]) == code
-    assert "error: not trustworthy: plicp; see the table for the reason" in capfd.readouterr().err
+    output = capfd.readouterr()
+    assert output.err == "error: did not finish: plicp; see the table for the reason\n"
+    assert "plicp: not trustworthy: most are lost" in output.out
 
 
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):

@@ -4,9 +4,11 @@ import pytest
 from scanchain.errors import InputError
 from scanchain.landmarks.files.mrclam import read_mrclam
 from scanchain.landmarks.files.npz import read_landmark_data
+from scanchain.landmarks.files.write import accuracy_lines
 from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
 from scanchain.landmarks.ranges.slam import solve_range_log
 from scanchain.landmarks.study import Options
+from scanchain.landmarks.study_file import study_file
 from scanchain.landmarks.study_log import study_log
 from tests.support.scenes import shared_data
 
@@ -37,6 +39,53 @@ def test_the_kind_of_observation_is_found_by_what_fits_the_truth(tmp_path, array
     x, y = arrays["observations"][:, 2:].T
     arrays["observations"][:, 2:] = np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
     assert read_landmark_data(written(tmp_path, arrays)).kind == "bearing-range"
+
+
+@pytest.mark.parametrize("missing", [("gt_traj", "gt_landmarks"), ("gt_traj",), ("gt_landmarks",)])
+@pytest.mark.parametrize("kind", ["linear", "bearing-range"])
+def test_without_the_truth_the_kind_is_found_and_the_estimate_stands(tmp_path, arrays, missing, kind):
+    true_poses, true_landmarks = arrays["gt_traj"], arrays["gt_landmarks"]
+    arrays["observations"] = np.vstack([arrays["observations"], [1.0, 1.0, 3.0, 2.0]])
+    x, y = arrays["observations"][:, 2:].T
+    if kind == "bearing-range":
+        arrays["observations"][:, 2:] = np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
+    for name in missing:
+        del arrays[name]
+    data = read_landmark_data(written(tmp_path, arrays))
+    study = study_file(data, Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt"))
+    assert data.kind == kind and study.converged
+    np.testing.assert_allclose(study.after.state.poses, true_poses, atol=1e-6)
+    np.testing.assert_allclose(study.after.state.landmarks, true_landmarks, atol=1e-6)
+    (_, after), _ = accuracy_lines(study)[1:]
+    assert after.count("unknown") == 1
+    assert np.isnan(study.after.accuracy.poses_m) == ("gt_traj" in missing)
+
+
+def test_without_the_truth_bearings_in_degrees_are_refused_and_what_nothing_tells_apart(tmp_path, arrays):
+    del arrays["gt_traj"], arrays["gt_landmarks"]
+    plain = arrays["observations"].copy()
+    arrays["observations"] = np.delete(plain, (2, 3), axis=0)
+    with pytest.raises(InputError, match="no landmark is observed twice and there is no gt_landmarks"):
+        read_landmark_data(written(tmp_path, arrays))
+    x, y = plain[:, 2:].T
+    plain[:, 2:] = np.stack([np.degrees(np.arctan2(y, x)), np.hypot(x, y)], axis=1)
+    arrays["observations"] = plain
+    with pytest.raises(InputError, match=r"bearings of observations reach .*: degrees\? give radians"):
+        read_landmark_data(written(tmp_path, arrays))
+
+
+def test_landmarks_that_are_not_observed_are_named(tmp_path, arrays):
+    arrays["gt_landmarks"] = np.vstack([arrays["gt_landmarks"], np.zeros((3, 2))])
+    with pytest.raises(InputError, match="3 of 5 landmarks are not observed, the first is 2; add observations"):
+        read_landmark_data(written(tmp_path, arrays))
+
+
+def test_bearings_in_degrees_of_a_folder_are_refused(folder):
+    path = folder / "Robot1_Measurement.dat"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(f"{a} {b} {c} {np.degrees(float(d))}\n" for a, b, c, d in rows))
+    with pytest.raises(InputError, match=r"Robot1_Measurement\.dat: bearings reach .*: degrees\? give radians"):
+        read_mrclam(folder, 1)
 
 
 def without(name):

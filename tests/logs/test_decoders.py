@@ -5,6 +5,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import LogConfig
+from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.simulation import simulate
 from tests.support.naive_logs import (
@@ -64,6 +65,13 @@ def test_beams_without_return_are_dropped_with_their_times_and_counted(tmp_path)
     assert distances(scan) == pytest.approx([1.0, 2.0, 3.0])
     assert scan.times_s == pytest.approx([0.25, 1.0, 2.25])
     assert scan.dropped == 8
+
+
+@pytest.mark.parametrize("step", [1.0, -0.5])
+def test_angles_in_degrees_are_refused_and_a_turn_and_a_bit_is_not(tmp_path, step):
+    with pytest.raises(InputError, match=r"180 beams, -?\d.* rad apart, cover \d.* turns: degrees\? wanted"):
+        laser(tmp_path, np.full(180, 2.0), first=-90.0, step=step)
+    assert len(laser(tmp_path, np.full(370, 2.0), first=-np.pi, step=np.radians(1.0)).points) == 370
 
 
 def test_a_scanner_that_leaves_its_range_limits_at_zero_loses_nothing(tmp_path):
@@ -276,6 +284,10 @@ def test_times_before_the_stamp_are_negative(tmp_path):
 def test_nanoseconds_in_a_float_are_recognized(tmp_path):
     np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e9, "<f8"), RISING_S, atol=1e-7)
     np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S * 1e9, "<f4"), RISING_S, atol=1e-7)
+
+
+def test_whole_milliseconds_are_recognized(tmp_path):
+    np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e3, "<u4"), RISING_S, atol=1e-3)
 
 
 def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):

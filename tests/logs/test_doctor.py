@@ -363,6 +363,16 @@ def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
     assert diagnose(path, point_times="s")["point times"].severity == "ok"
 
 
+@pytest.mark.parametrize(("factor", "said"), [(1e-3, "0.095 ms, 0.00095 of"), (100.0, "9.5e+03 ms, 95 of")])
+def test_a_run_warns_of_point_times_that_do_not_fit_the_period(tmp_path, factor, said):
+    log = open_log(saved(tmp_path, sweeps(span=0.095 * factor)), point_times="s")
+    list(log.scans())
+    assert any(f"by their point times scans of /points last {said} the period" in line for line in log.damage)
+    log = open_log(saved(tmp_path, sweeps()), point_times="s")
+    list(log.scans())
+    assert log.damage == []
+
+
 def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
     plain = np.dtype([(name, "<f4") for name in "xyz"])
 
@@ -403,6 +413,23 @@ def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
     said = [cloud_said(STAMP_NS + k * STEP_NS, point_cloud(STAMP_NS + k * STEP_NS, far(k))) for k in range(5)]
     finding = diagnose(saved(tmp_path, said))["ranges"]
     assert finding.severity == "note" and finding.remedy.startswith("--preprocess.max_range_m 17")
+
+
+def test_ranges_in_millimeters_are_a_problem_and_not_to_be_widened_to(call, tmp_path):
+    path = saved(tmp_path, drive(ranges=lambda k: 1e3 * room(k)))
+    finding = diagnose(path)["ranges"]
+    assert (finding.severity, finding.remedy) == ("problem", "") and "100 % lie beyond" in finding.effect
+    code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off")
+    assert code == 2 and "millimeters? convert them to meters" in errors and "widen" not in errors
+
+
+def test_wheels_in_millimeters_are_a_problem_with_the_flag_that_leaves_them_out(tmp_path):
+    said = [
+        odometry_said(STAMP_NS + k * STEP_NS, odometry(STAMP_NS + k * STEP_NS, 100.0 * k, 0.0)) for k in range(40)
+    ]
+    finding = diagnose(saved(tmp_path, [*drive(), *said]))["wheels"]
+    assert (finding.severity, finding.remedy) == ("problem", "--odometry.prior constant-velocity")
+    assert "moves at 1e+03 m/s" in finding.found
 
 
 def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):

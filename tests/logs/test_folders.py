@@ -1,5 +1,7 @@
 """Folders of sweeps: KITTI raw and odometry, PCD and PLY as open3d writes them, raw float32."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -260,6 +262,22 @@ def test_a_file_that_is_broken_is_left_out_and_told(tmp_path, name, content):
     log, scans = read(tmp_path)
     assert [scan.stamp_ns for scan in scans] == [2 * SECOND]
     assert name in log.damage[0] and "left out" in log.damage[0]
+    assert f"is malformed: {name} " in log.damage[1]
+
+
+@pytest.mark.parametrize("shape", [(3, 500), (500, 2), (500,)])
+def test_arrays_of_another_shape_are_named_with_it(tmp_path, shape):
+    for k in range(4):
+        np.save(tmp_path / f"{k}.npy", np.ones(shape, np.float32))
+    with pytest.raises(InputError, match=rf"is malformed: \d\.npy is an array {re.escape(str(shape))} of float32"):
+        read(tmp_path, rate_hz=10.0)
+
+
+def test_a_run_directory_is_no_log(tmp_path):
+    (tmp_path / "run.json").write_text("{}")
+    (tmp_path / "map.ply").write_text("")
+    with pytest.raises(InputError, match=r"is a run directory, no log; give the log that its run\.json names"):
+        open_log(tmp_path)
 
 
 def swept(k, count=300):

@@ -51,6 +51,16 @@ class Careless(Ranges):
         return [Candidate(query.submap.anchor.index, np.eye(3), 1.0)]
 
 
+class Numbers(Ranges):
+    def query(self, query):
+        return [3]
+
+
+class Nothing(Ranges):
+    def query(self, query):
+        return None
+
+
 class Mute:
     def __init__(self, config, dimension):
         pass
@@ -110,7 +120,7 @@ def test_a_run_finds_it_in_the_working_directory_also_where_python_does_not_look
     ("name", "parts"),
     [
         ("my_places:Mute", ("my_places:Mute", "no method add")),
-        ("my_places:Rangers", ("has no class Rangers", "Ranges, Careless, Mute")),
+        ("my_places:Rangers", ("has no class Rangers", "Ranges, Careless, Numbers, Nothing, Mute")),
         ("nowhere:Ranges", ("no module nowhere", "PYTHONPATH")),
         ("my_places:", ("wanted module:Class",)),
         ("ranges", ("one of auto, none, descriptor", "module:Class")),
@@ -129,10 +139,18 @@ def test_a_module_that_cannot_be_imported_says_why(folder):
         plugins.load("broken_places:Ranges")
 
 
-def test_a_candidate_that_is_not_older_is_refused(folder):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Careless", "candidate 0 for keyframe 0 is not older"),
+        ("Numbers", r"query returned 3 among its candidates; wanted scanchain\.loops\.recognizer\.Candidate"),
+        ("Nothing", "query returned None; wanted a list of candidates"),
+    ],
+)
+def test_what_is_no_candidate_and_one_that_is_not_older_are_refused(folder, name, said):
     log = open_log(shared_data(CSAIL))
-    slam = Slam(configured(2, SMALL | {"loops.recognizer": "my_places:Careless"}), log.T_base_lidar)
-    with pytest.raises(InputError, match="my_places:Careless: candidate 0 for keyframe 0 is not older"):
+    slam = Slam(configured(2, SMALL | {"loops.recognizer": f"my_places:{name}"}), log.T_base_lidar)
+    with pytest.raises(InputError, match=f"my_places:{name}: {said}"):
         for scan in log.scans():
             slam.process(scan)
 

@@ -37,6 +37,23 @@ def town(tmp_path_factory):
     return list(log.scans()), log.T_base_lidar, truth
 
 
+@pytest.fixture(scope="module")
+def turns(tmp_path_factory):
+    """Six seconds of turns at 120 deg/s, with 16 rings."""
+    path = tmp_path_factory.mktemp("turns") / "turns.mcap"
+    truth = simulate("turns", path, duration_s=6.0, sensor="vlp-16")
+    return list(open_log([path], Config().log).scans()), truth
+
+
+def test_heading_at_the_stamp_follows_the_acceleration_of_a_turn(turns):
+    scans, truth = turns
+    poses = np.array([step.T_odom_lidar for step in tracked(scans, np.eye(4), configured(3))])
+    error = lie.log(
+        lie.between(lie.between(truth.poses[:-10], truth.poses[10:]), lie.between(poses[:-10], poses[10:]))
+    )
+    assert np.degrees(np.linalg.norm(error[:, 3:], axis=1)).max() < 0.8
+
+
 def tracked(scans, T_base_lidar, config):
     odometry = Odometry(config, T_base_lidar)
     return [odometry.process(scan) for scan in scans]

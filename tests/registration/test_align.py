@@ -1,5 +1,6 @@
 """Two clouds in one call: any unit, any origin; clouds that do not fit are not said to."""
 
+import re
 from itertools import islice
 
 import numpy as np
@@ -84,6 +85,31 @@ def test_another_place_and_too_far_a_motion_do_not_converge():
         match = scanchain.align(target, source)
         assert not match.converged
         assert "matching." not in match.reason and "units of" not in match.reason
+
+
+def corridor(ends, spacing=2.0):
+    """Points of a corridor with niches at even steps, between two end walls or open, seen from x = 0."""
+    x = np.arange(-8.0, 8.0, 0.05)
+    niche = np.abs((x / spacing) % 1.0 - 0.5) < 0.2
+    depth = np.arange(1.2, 1.6, 0.05)
+    walls = []
+    for side in (-1.0, 1.0):
+        walls.append(np.stack([x, side * (1.2 + 0.4 * niche)], axis=1))
+        for at in x[np.diff(niche, prepend=0) != 0]:
+            walls.append(np.stack([np.full(len(depth), at), side * depth], axis=1))
+    across = np.arange(-1.2, 1.2, 0.05)
+    walls += [np.stack([np.full(len(across), end), across], axis=1) for end in ends]
+    return np.concatenate(walls)
+
+
+def test_a_pose_with_an_equal_elsewhere_is_ambiguous():
+    niches, ended = corridor(()), corridor((-8.0, 8.0))
+    away = lie.pose_2d(0.3, 0.1, 0.05)
+    repeated = scanchain.align(niches, lie.transform(lie.inverse(away), niches[np.abs(niches[:, 0]) < 5.0]))
+    single = scanchain.align(ended, lie.transform(lie.inverse(away), ended))
+    assert single.converged and np.allclose(single.T_target_source, away, atol=0.02)
+    assert not repeated.converged
+    assert re.match(r"ambiguous: a pose (2|1\.9\d) away, turned by 0.00 rad, fits", repeated.reason)
 
 
 def test_a_reason_is_in_the_unit_of_the_clouds_and_never_reads_like_its_limit():

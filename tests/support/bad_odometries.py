@@ -9,8 +9,6 @@ import numpy as np
 
 
 class StandsStill:
-    description = "stands still"
-
     def __init__(self):
         self.scans = 0
 
@@ -51,6 +49,13 @@ class Eats(StandsStill):
 class Dies(StandsStill):
     def misbehave(self):
         os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Spatial(StandsStill):
+    """A 3D pose of a 2D log."""
+
+    def track(self, points, times_s, stamp_ns):
+        return np.eye(4)
 
 
 class LosesItself(StandsStill):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.verdict import Closures, Evidence, Kind, Verdict, check_velocity, check_wheels, judge
+from scanchain.verdict import Closures, Evidence, Kind, Verdict, check_overlap, check_velocity, check_wheels, judge
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
 
@@ -39,7 +39,7 @@ def wheels_of(poses, seed=1, *, scale=1.0, drift_rad_m=0.0, share=0.02):
 
 def evidence(poses, *, wheels=None, closures=(), **changes):
     n = len(poses)
-    seconds = INTERVAL_S * np.arange(n)
+    seconds = changes.pop("seconds", INTERVAL_S * np.arange(n))
     stamps_ns = (1e9 * seconds).astype(np.int64)
     unknown = np.full_like(poses, np.nan)
     ends = np.array([pair for pair, _ in closures], np.int64).reshape(-1, 2)
@@ -50,6 +50,7 @@ def evidence(poses, *, wheels=None, closures=(), **changes):
         "fit": np.full(n, 0.9),
         "starts_segment": np.zeros(n, bool),
         "points": np.full(n, 500),
+        "overlap": np.ones(n),
     }
     return Evidence(
         seconds=seconds,
@@ -175,6 +176,16 @@ def test_missing_scans_accelerate_nothing():
     assert np.nanmax(check_velocity(stamps_ns[there], stamps_ns[there], poses[there])) < 0.1
 
 
+def test_a_short_interval_after_a_gap_accelerates_nothing():
+    motions = np.tile([0.0, 0.0, 0.0], (60, 1))
+    motions[30] = [1.9, 0.0, 0.0]  # over 16 s without scans
+    intervals_s = np.full(60, 0.2)
+    intervals_s[30:32] = 16.0, 0.08
+    stamps_ns = (1e9 * np.concatenate([[0.0], np.cumsum(intervals_s)])).astype(np.int64)
+    poses = chained(motions, np.random.default_rng(0))
+    assert np.nanmax(check_velocity(stamps_ns, stamps_ns, poses)) < 1.0
+
+
 @pytest.mark.parametrize("kind", [Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED])
 def test_a_stretch_of_doubtful_scans_is_to_be_checked_and_most_of_a_run_is_not_trustworthy(kind):
     poses, _ = course()
@@ -212,3 +223,43 @@ def test_segments_that_a_closure_joins_are_not_told():
     joined = evidence(poses, starts_segment=starts)
     object.__setattr__(joined, "closures", closures)
     assert judge(joined).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_lidar_that_was_carried_elsewhere_is_named_though_the_wheels_agree():
+    poses, _ = course()
+    share = np.full(N, 0.98)
+    share[600] = 0.4  # of the points have a correspondence; the next scans match the one that was inserted
+    judged = judge(evidence(poses, wheels=wheels_of(poses), overlap=check_overlap(share)))
+    assert judged.verdict is Verdict.CHECK
+    assert [(each.kind, each.first, each.last) for each in judged.stretches] == [(Kind.OVERLAP, 600, 600)]
+
+
+def test_overlap_that_shrinks_slowly_doubts_nothing():
+    poses, _ = course()
+    share = np.linspace(1.0, 0.3, N)
+    assert judge(evidence(poses, overlap=check_overlap(share))).verdict is Verdict.TRUSTWORTHY
+
+
+def test_one_contradicted_scan_after_a_gap_is_to_be_checked_unless_wheels_agree():
+    poses, _ = course()
+    kept = ~marked(300, 315)
+    changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
+    (stretch,) = judge(evidence(poses[kept], **changes)).stretches
+    assert (stretch.kind, stretch.first, stretch.last) == (Kind.CONTRADICTED, 300, 300)
+    wheels = wheels_of(poses)[kept]
+    assert judge(evidence(poses[kept], wheels=wheels, **changes)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_degenerate_scans_between_which_others_measure_the_pose_are_passed():
+    poses, _ = course()
+    mostly = marked(300, 360) & (np.arange(N) % 8 != 0)  # 0.7 m at a time
+    assert judge(evidence(poses, is_degenerate=mostly)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_lidar_that_seems_to_stand_after_a_gap_at_speed_is_to_be_checked():
+    poses, _ = course()
+    poses[316:] = poses[299] @ lie.inverse(poses[315]) @ poses[316:]  # as if the gap had lasted a moment
+    kept = ~marked(300, 315)
+    changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
+    (stretch,) = judge(evidence(poses[kept], **changes)).stretches
+    assert (stretch.kind, stretch.first) == (Kind.CONTRADICTED, 300)

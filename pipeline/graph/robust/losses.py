@@ -50,7 +50,7 @@ class Kernel(Protocol):
     """
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
+        """Weight w = dρ/dχ² in [0, 1], 1 near zero whatever the scale."""
         ...
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
@@ -80,11 +80,11 @@ class Quadratic:
     """ρ = χ²: no robust loss."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = 1."""
+        """Weight w = 1."""
         return np.ones_like(chi2)
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = χ²."""
+        """Loss ρ = χ²."""
         return chi2
 
 
@@ -92,11 +92,11 @@ class Huber:
     """Huber 1964: linear in χ above s."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = min(1, s/χ)."""
+        """Weight w = min(1, s/χ)."""
         return s / np.sqrt(np.maximum(chi2, s**2))
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = 2 s χ − s² above s."""
+        """Loss ρ = 2 s χ − s² above s."""
         s2 = s**2
         return np.where(chi2 <= s2, chi2, 2.0 * s * np.sqrt(np.maximum(chi2, s2)) - s2)
 
@@ -105,11 +105,11 @@ class Cauchy:
     """Of the Cauchy distribution: grows without bound, but slowly."""
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = s² / (s² + χ²)."""
+        """Weight w = s² / (s² + χ²)."""
         return s**2 / (s**2 + chi2)
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = s² log(1 + χ²/s²)."""
+        """Loss ρ = s² log(1 + χ²/s²)."""
         return s**2 * np.log1p(chi2 / s**2)
 
 
@@ -119,11 +119,11 @@ class GemanMcClure:
     schedule = _WIDENED
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = (μ s² / (μ s² + χ²))²."""
+        """Weight w = (μ s² / (μ s² + χ²))²."""
         return (mu * s**2 / (mu * s**2 + chi2)) ** 2
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = μ s² χ² / (μ s² + χ²)."""
+        """Loss ρ = μ s² χ² / (μ s² + χ²)."""
         return chi2 * mu * s**2 / (mu * s**2 + chi2)
 
 
@@ -133,11 +133,11 @@ class Tukey:
     schedule = _WIDENED
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = (1 − χ²/(μ s²))² or 0."""
+        """Weight w = (1 − χ²/(μ s²))² or 0."""
         return np.maximum(1.0 - chi2 / (mu * s**2), 0.0) ** 2
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = μ s² (1 − (1 − χ²/(μ s²))³) / 3, or μ s²/3."""
+        """Loss ρ = μ s² (1 − (1 − χ²/(μ s²))³) / 3, or μ s²/3."""
         share = np.minimum(chi2 / (mu * s**2), 1.0)
         return mu * s**2 * share * (1.0 - share + share**2 / 3.0)
 
@@ -148,14 +148,14 @@ class Truncated:
     schedule = _SURROGATE
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
-        """w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
+        """Weight w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
         if np.isinf(mu):
             return (chi2 <= s**2).astype(np.float64)
         middle = s * np.sqrt(mu * (mu + 1.0) / np.maximum(chi2, 1e-300)) - mu
         return np.clip(middle, 0.0, 1.0)
 
     def loss(self, chi2: Array, s: float, mu: float) -> Array:
-        """ρ = min(χ², s²), and 2 s χ √(μ (μ + 1)) − μ (s² + χ²) between."""
+        """Loss ρ = min(χ², s²), and 2 s χ √(μ (μ + 1)) − μ (s² + χ²) between."""
         s2 = s**2
         if np.isinf(mu):
             return np.minimum(chi2, s2)
@@ -241,11 +241,13 @@ def _check(loss: RobustLoss) -> None:
     try:
         weight = np.asarray(loss.weight(chi2), np.float64)
         slope = (np.asarray(loss.loss(chi2 + step), np.float64) - loss.loss(chi2)) / step
+    except InputError:
+        raise
     except Exception as error:  # of the user's own code
         reason = " ".join(str(error).split())
         raise InputError(
-            f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, mu) "
-            "and loss(self, chi2, s, mu)"
+            f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, "
+            "mu) and loss(self, chi2, s, mu)"
         ) from error
     if weight.shape != chi2.shape or not np.all((weight >= 0.0) & (weight <= 1.0)) or weight[0] < _ONE:
         raise InputError(f"{loss.kernel}: weight returned {weight.tolist()}; wanted (N,) in [0, 1], 1 at χ² = 0")

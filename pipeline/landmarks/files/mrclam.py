@@ -60,7 +60,10 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
         listed = ", ".join(map(str, there)) or "none"
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_table(folder / name, 3))
-    seen = _by_time(_table(folder / f"Robot{robot}_Measurement.dat", 4))
+    measurements = folder / f"Robot{robot}_Measurement.dat"
+    seen = _by_time(_table(measurements, 4))
+    if (largest := float(np.abs(seen[:, 3]).max())) > 2.0 * np.pi:
+        raise InputError(f"{measurements}: bearings reach {largest:.6g}: degrees? give radians")
     subject = _subjects(_table(folder / "Barcodes.dat", 2), seen[:, 1])
     timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
     used = (subject > _ROBOTS) & timely

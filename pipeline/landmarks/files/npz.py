@@ -21,27 +21,30 @@ _SHAPES = {
     "sigma_odom": "(2, 2)",
     "sigma_landmark": "(2, 2)",
 }
+_TRUTH = ("gt_traj", "gt_landmarks")  # what a problem need not have
 
 
 def read_landmark_data(path: Path) -> LandmarkData:
     """Read a problem; raises InputError for whatever is wrong with the file, pickled objects included.
 
     The file does not state whether its observations are relative positions or bearings and ranges: the one that
-    the true positions fit better is taken.
+    the true positions fit better is taken, or that agree better with each other where the file has no truth.
     """
     arrays = _read(path)
-    poses, landmarks, odometry, table = (
-        arrays[name] for name in ("gt_traj", "gt_landmarks", "odom", "observations")
-    )
-    if len(odometry) != len(poses) - 1:
+    odometry, table = arrays["odom"], arrays["observations"]
+    poses = arrays.get("gt_traj", np.empty((0, 2)))
+    if len(poses) and len(odometry) != len(poses) - 1:
         raise InputError(
             f"{path}: odom has {counted(len(odometry), 'step')} "
             f"between {counted(len(poses), 'pose')} of gt_traj; it must have one less"
         )
-    observed = _indices(path, table, len(poses), len(landmarks))
+    observed = _indices(path, table, len(odometry) + 1, len(arrays.get("gt_landmarks", ())))
+    landmarks = arrays.get("gt_landmarks", np.full((int(observed[:, 1].max()) + 1, 2), np.nan))
+    _check_observed(path, observed[:, 1], len(landmarks))
+    reckoned = np.cumsum(np.vstack([np.zeros(2), odometry]), axis=0)
     return LandmarkData(
         name=path.stem,
-        kind=_kind(path, poses, landmarks, observed, table[:, 2:]),
+        kind=_kind(path, poses if len(poses) else reckoned, landmarks, observed, table[:, 2:]),
         odometry=odometry,
         observed=observed,
         measured=np.ascontiguousarray(table[:, 2:]),
@@ -59,10 +62,10 @@ def _read(path: Path) -> dict[str, Matrix]:
             if file.read(2) != b"PK":
                 raise InputError(f"{path}: is no npz file; a problem is one with {', '.join(_SHAPES)}")
         with np.load(path, allow_pickle=False) as file:
-            missing = [name for name in _SHAPES if name not in file]
+            missing = [name for name in _SHAPES if name not in file and name not in _TRUTH]
             if missing:
                 raise InputError(f"{path}: has no array {missing[0]}; a problem has {', '.join(_SHAPES)}")
-            return {name: _table(path, name, file[name]) for name in _SHAPES}
+            return {name: _table(path, name, file[name]) for name in _SHAPES if name in file}
     except FileNotFoundError:
         raise InputError(f"{path}: does not exist; check the path") from None
     except OSError as error:
@@ -96,8 +99,8 @@ def _table(path: Path, name: str, array: NDArray) -> Matrix:
 
 
 def _indices(path: Path, table: Matrix, poses: int, landmarks: int) -> NDArray[np.int64]:
-    """Pose and landmark of every observation, (N, 2)."""
-    for column, name, count in ((0, "pose", poses), (1, "landmark", landmarks)):
+    """Pose and landmark of every observation, (N, 2); ``landmarks`` is 0 where their number is not stated."""
+    for column, name, count in ((0, "pose", poses), (1, "landmark", landmarks or len(table))):
         wrong = (
             (table[:, column] != np.floor(table[:, column])) | (table[:, column] < 0) | (table[:, column] >= count)
         )
@@ -109,6 +112,16 @@ def _indices(path: Path, table: Matrix, poses: int, landmarks: int) -> NDArray[n
     return table[:, :2].astype(np.int64)
 
 
+def _check_observed(path: Path, seen: NDArray[np.int64], landmarks: int) -> None:
+    """Refuse landmarks without an observation, which leaves them open."""
+    open_ones = np.setdiff1d(np.arange(landmarks), seen)
+    if len(open_ones):
+        raise InputError(
+            f"{path}: {len(open_ones)} of {counted(landmarks, 'landmark')} are not observed, the first is "
+            f"{open_ones[0]}; add observations of them, or leave them out and number the others on"
+        )
+
+
 def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
     matrix = arrays[name]
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
@@ -117,20 +130,35 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 
 
 def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
-    """Kind of the measurements: least median distance of the measured point from the true position.
+    """Kind of the measurements: least median distance of the measured points from the landmarks.
 
-    Raises InputError where they fit bearings in degrees best.
+    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where the
+    points fit bearings in degrees best, and where nothing tells.
     """
-    true = landmarks[observed[:, 1]] - poses[observed[:, 0]]
     bearing, reach = measured.T
     polar, by_degrees = (
         np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=1)
         for angle in (bearing, np.radians(bearing))
     )
     as_linear, as_polar, as_degrees = (
-        np.median(np.linalg.norm(guess - true, axis=1)) for guess in (measured, polar, by_degrees)
+        _spread(poses[observed[:, 0]] + relative, landmarks, observed[:, 1])
+        for relative in (measured, polar, by_degrees)
     )
     largest = float(np.abs(bearing).max())
     if largest > 2.0 * np.pi and 2.0 * as_degrees < min(as_linear, as_polar):
         raise InputError(f"{path}: bearings of observations reach {largest:.6g}: degrees? give radians")
+    if not np.isfinite(landmarks).all() and len(np.unique(observed[:, 1])) == len(observed):
+        raise InputError(
+            f"{path}: no landmark is observed twice and there is no gt_landmarks, so that nothing tells relative "
+            "positions from bearings and ranges; add observations, or gt_landmarks"
+        )
     return "linear" if as_linear <= as_polar else "bearing-range"
+
+
+def _spread(points: Matrix, landmarks: Matrix, seen: NDArray[np.int64]) -> float:
+    """Median distance of points (N, 2) from the landmarks that they are measurements of."""
+    order = np.argsort(seen, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(seen[order])) + 1)
+    middle = np.array([np.median(points[group], axis=0) for group in groups])  # every landmark is observed
+    at = np.where(np.isfinite(landmarks), landmarks, middle)
+    return float(np.median(np.linalg.norm(points - at[seen], axis=1)))

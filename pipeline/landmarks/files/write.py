@@ -146,10 +146,11 @@ def _write_csv(
 
 
 def _accuracy(accuracy: Accuracy) -> str:
-    if math.isnan(accuracy.poses_m):
-        return "unknown"
-    landmarks = "unknown" if math.isnan(accuracy.landmarks_m) else f"{accuracy.landmarks_m:.4f} m"
-    return f"poses {accuracy.poses_m:.4f} m, landmarks {landmarks} off"
+    poses, landmarks = (
+        "unknown" if math.isnan(error_m) else f"{error_m:.4f} m off"
+        for error_m in (accuracy.poses_m, accuracy.landmarks_m)
+    )
+    return "unknown" if poses == landmarks == "unknown" else f"poses {poses}, landmarks {landmarks}"
 
 
 def _figures(accuracy: Accuracy) -> dict[str, float | str | None]:

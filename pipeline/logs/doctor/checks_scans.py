@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, RawPoints
-from scanchain.logs.bad_scans import most_bad_scans
+from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import LEAST_S, Rest, Survey
 from scanchain.words import counted
@@ -143,12 +143,14 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
     if far_m > high_m:
         unused = float(np.mean(ranges_m > high_m))
-        effect = f"{100 * unused:.2g} % lie beyond {high_m:g} m and are not used"
+        effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
+        if are_millimeters(float(np.median(ranges_m)), preprocess):
+            return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
         remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, remedy)
     if near_m < low_m:
         unused = float(np.mean(ranges_m < low_m))
-        effect = f"{100 * unused:.2g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
+        effect = f"{100 * unused:.3g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
         remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, remedy)
     return Finding("ranges", Severity.OK, found)

@@ -25,6 +25,8 @@ _LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
+_FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
+_LEAST_STEP_M = 1e-3  # length of a step between two readings from which on the wheels turn
 _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 
 
@@ -149,9 +151,22 @@ def _wheels(seen: Survey) -> Finding:
     scans = counted(len(seen.scans), "scan")
     missed = int(np.count_nonzero(np.minimum(before_ns, after_ns) > _NEAR_NS))
     found = f"{topic}: {counted(len(stamps_ns), 'reading')}, {missed} of {scans} without one within 0.5 s"
+    if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
+        found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
+        effect = "no vehicle does: millimeters, or jumps? Scans are predicted where the robot never was"
+        return Finding("wheels", Severity.PROBLEM, found, effect, "--odometry.prior constant-velocity")
     if not missed:
         return Finding("wheels", Severity.OK, found)
     return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
+
+
+def _wheel_speed_m_s(seen: Survey) -> float:
+    """Median speed by the wheels while they turn; 0 where they stand still."""
+    stamps_ns, order = np.unique([pose.stamp_ns for pose in seen.wheels], return_index=True)
+    positions = np.array([seen.wheels[k].T_parent_child[:-1, -1] for k in order])
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    moving = steps_m > _LEAST_STEP_M
+    return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
 
 
 def _point_times(seen: Survey) -> Finding:

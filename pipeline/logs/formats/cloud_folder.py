@@ -63,7 +63,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0) -> FileIndex:
         try:
             data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file, raw))
         except (CloudFileError, OSError) as error:
-            unreadable = Message(channel, stamp_ns, memoryview(b""))  # counts among the scans, as a malformed one
+            unreadable = Message(channel, stamp_ns, memoryview(b""), f"{file.name} {error}")
             return Contents([unreadable], f"{file}: {error}; it was left out")
         return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 

@@ -40,11 +40,12 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message: its channel, log time, and bytes."""
+    """One message: its channel, log time, and bytes; ``defect`` says why there are none."""
 
     channel: Channel
     log_time_ns: int
     data: memoryview
+    defect: str = ""
 
 
 class Contents(NamedTuple):

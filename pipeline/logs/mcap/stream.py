@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 from scanchain.logs.mcap.blocks import DamagedBlockError, read_block, release
-from scanchain.logs.mcap.records import Block, Channel, FileIndex
+from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message
 from scanchain.logs.mcap.selection import EVERYTHING, Span, messages_of
 from scanchain.logs.messages.cdr import MalformedMessageError
 
@@ -48,7 +48,7 @@ def decoded_messages(
     def decode(block: Block) -> tuple[list[Decoded], str]:
         contents = read_block(indexes[block.file], block, wanted[block.file])
         decoded = [
-            Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message.data))
+            Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
             if span.begin_ns <= message.log_time_ns <= span.end_ns
         ]
@@ -74,9 +74,11 @@ def decoded_messages(
             yield heappop(waiting)[-1]
 
 
-def _decode(decoder: Callable[[memoryview], object], data: memoryview) -> object:
+def _decode(decoder: Callable[[memoryview], object], message: Message) -> object:
+    if message.defect:
+        return MalformedMessageError(message.defect)
     try:
-        return decoder(data)
+        return decoder(message.data)
     except MalformedMessageError as error:
         return error
 

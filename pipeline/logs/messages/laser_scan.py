@@ -14,6 +14,7 @@ from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
 from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
 
 _MOST_GEOMETRIES = 16
+_MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
 _NEAREST_M = float(np.finfo(np.float32).tiny)
 _FARTHEST_M = float(np.finfo(np.float32).max)
 
@@ -131,6 +132,11 @@ def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> G
     if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
         raise MalformedMessageError(
             f"its beams lie {step_rad:g} rad and {beam_s:g} s apart from {first_rad:g} rad on, which cannot be"
+        )
+    turns = abs(step_rad) * count / (2.0 * np.pi)
+    if turns > _MOST_TURNS:
+        raise MalformedMessageError(
+            f"its {count} beams, {step_rad:g} rad apart, cover {turns:.3g} turns: degrees? wanted radians"
         )
     angles_rad = first_rad + step_rad * np.arange(count)
     directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)

@@ -13,7 +13,7 @@ NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once"
-_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are microseconds
+_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
 _NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
 _ABSOLUTE_S = 3600.0  # least absolute time in seconds
@@ -55,10 +55,10 @@ class PointTimes:
     def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:
         """Times (N,) of raw values (N,); (0,) where not finite or all the same.
 
-        Whole numbers are nanoseconds, or microseconds where that would make the whole scan shorter than half a
-        millisecond. Floats are seconds where they span up to 10, else milli-, micro- or nanoseconds by their span.
-        Values within a second of the stamp are absolute, others count from it; those of another clock, the
-        sensor's own or one that is off by the leap seconds, count from the first point.
+        Whole numbers are nanoseconds, or the next unit, micro- or milliseconds, in which the whole scan is not
+        shorter than half a millisecond. Floats are seconds where they span up to 10, else milli-, micro- or
+        nanoseconds by their span. Values within a second of the stamp are absolute, others count from it; those of
+        another clock, the sensor's own or one that is off by the leap seconds, count from the first point.
         """
         if not len(values):
             return NO_TIMES
@@ -87,7 +87,7 @@ class PointTimes:
 
 def _likely_unit(span: float, *, is_whole: bool) -> str:
     if is_whole:
-        return "us" if span < _SHORTEST_SCAN_NS else "ns"
+        return "ns" if span >= _SHORTEST_SCAN_NS else "us" if 1e3 * span >= _SHORTEST_SCAN_NS else "ms"
     if span <= 10.0:
         return "s"
     if span <= _LONGEST_SCAN:

@@ -98,7 +98,7 @@ def _messages(
     scans = Counter[str]()
     for message in decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
-        if not message.value:  # of a file that could not be read
+        if not isinstance(message.value, bytes):  # of a file that could not be read
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message

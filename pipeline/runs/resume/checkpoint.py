@@ -22,6 +22,7 @@ from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
+from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.map_keeper import MapKeeper
@@ -65,9 +66,10 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
-        Recovery, Standstill, MapKeeper, Resolution, Sweep, VoxelMap, Voxels, PointToShapeMatcher, LoopCloser,
-        ProximityCloser, PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps, ScanVerifier, SubmapVerifier,
-        Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray, PointStore, StoredPoints,
+        Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap, Voxels,
+        PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps,
+        ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray, PointStore,
+        StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],

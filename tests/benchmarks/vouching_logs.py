@@ -1,0 +1,334 @@
+"""The cases of tests.benchmarks.vouching: simulated logs with incidents, and real ones with their references."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.simulation import SENSORS, Drive, information, plan, record
+from scanchain.simulation.motion import Motion
+from scanchain.simulation.sensors import Rays, Sensor
+from scanchain.simulation.solids import Solids
+
+DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log
+
+_AHEAD_S = 9.0  # a kidnapped lidar goes on where it would have been so much later
+_GAPS = ((0.35, 1.5), (0.65, 3.0))  # dropped scans: begin as a share of the drive, seconds
+_CARRIED_S = 2.0  # without scans while it is carried
+_MOUNTING = lie.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, np.radians(6.0)]))  # error of the transform in the log
+_SHARE_EVERY_S = 0.5  # between two looks at the true geometry
+_SHARE_RAYS = 4000  # of a scan that such a look takes
+_PEOPLE, _AROUND_M, _NEAREST_M = 30, 8.0, 0.9
+_WALK_M_S = 1.4
+_ON_ROADS = ("town", "rounds", "highway", "gap")
+
+
+@dataclass(frozen=True, slots=True)
+class LogSpec:
+    """A log: a simulated drive with an incident, or a file with its reference.
+
+    Attributes
+    ----------
+    incident : "plain", "gap", "kidnapped", "carried" (kidnapped while no scan is recorded), "crowd" or "mounting"
+    file, reference : of a real log, whose ``world`` is its name
+    overrides : configuration of every run on it
+    reference_m, reference_rad : error of a motion by the reference, infinite where it is no truth
+    """
+
+    world: str
+    sensor: str = ""
+    incident: str = "plain"
+    duration_s: float = 30.0
+    dimension: int = 3
+    file: Path | None = None
+    reference: Path | None = None
+    overrides: dict[str, object] = field(default_factory=dict)
+    reference_m: float = 0.0
+    reference_rad: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """World, sensor and incident."""
+        return " ".join(part for part in (self.world, self.sensor, self.incident) if part)
+
+    @property
+    def seed(self) -> int:
+        """Of the drive, by the name."""
+        return zlib.crc32(self.name.encode()) % 1000
+
+    def paths(self, cache: Path) -> tuple[Path, Path | None]:
+        """Log and reference; None where the log holds it."""
+        if self.file is not None:
+            return self.file, self.reference
+        path = cache / "logs" / f"{self.name.replace(' ', '_')}_{self.duration_s:g}s.mcap"
+        return path, path.with_suffix(".tum")
+
+    def open_shares(self, cache: Path) -> Matrix | None:
+        """(K, 2) stamps in ns and the share of the returns that speak about the worst direction there."""
+        if self.file is not None:
+            return None
+        return np.load(self.paths(cache)[0].with_suffix(".npy"))
+
+    def make(self, cache: Path) -> None:
+        """Simulate the log unless it is there."""
+        path = self.paths(cache)[0]
+        if self.file is not None or path.with_suffix(".npy").exists():
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        drive = self.drive()
+        record(drive, path, seed=self.seed, force=True)
+        np.save(path.with_suffix(".npy"), _open_shares(drive))
+
+    def drive(self) -> Drive:
+        """The drive with its incident."""
+        drive = plan(self.world, seed=self.seed, duration_s=self.duration_s + _AHEAD_S, sensor=self.sensor)
+        times_s = drive.scans * (drive.sensor.period_ns * 1e-9)
+        kept = times_s < self.duration_s
+        middle_s = round(0.5 * self.duration_s)
+        if self.incident == "gap":
+            for share, length_s in _GAPS:
+                begin_s = share * self.duration_s
+                kept &= (times_s < begin_s) | (times_s >= begin_s + length_s)
+        elif self.incident == "carried":
+            kept &= (times_s < middle_s) | (times_s >= middle_s + _CARRIED_S)
+        drive = replace(drive, scans=drive.scans[kept])
+        if self.incident in ("kidnapped", "carried"):
+            return replace(drive, motion=Kidnapped(drive.motion, middle_s))
+        if self.incident == "mounting":
+            return replace(drive, T_base_lidar=drive.T_base_lidar @ _MOUNTING)
+        if self.incident == "crowd":
+            place = _traffic if self.world in _ON_ROADS else _people
+            return replace(drive, solids_of_instant=place(drive, np.random.default_rng(self.seed)))
+        return drive
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One run: a log, every n-th of its scans, and what becomes of the wheels."""
+
+    log: LogSpec
+    wheels: str = "wheels"
+    every: int = 1
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the scans; 0 where the log does not say."""
+        return 1e9 / SENSORS[self.log.sensor].period_ns / self.every if self.log.sensor in SENSORS else 0.0
+
+    @property
+    def name(self) -> str:
+        """Unique among the cases."""
+        rate = f"{self.rate_hz:g} Hz" if self.rate_hz else f"every {self.every}"
+        return f"{self.log.name}, {rate}, {self.wheels}"
+
+    @property
+    def kind(self) -> str:
+        """Row of the table."""
+        d = f"{self.log.dimension}D"
+        if self.log.file is not None:
+            return f"{d} real, low rate" if self.every > 1 else f"{d} real"
+        low = self.log.incident == "plain" and self.rate_hz < 8.0
+        return f"{d} {'low rate' if low else self.log.incident}"
+
+    @property
+    def half(self) -> int:
+        """0 or 1, by a hash of the log's name: runs on one log stay together."""
+        return zlib.crc32(f"half of {self.log.name}".encode()) >> 7 & 1
+
+
+class Kidnapped:
+    """A motion whose lidar jumps along the route; wheels do not notice."""
+
+    def __init__(self, motion: Motion, instant_s: float) -> None:
+        self._motion, self._instant_s = motion, instant_s
+        ends = motion.base(np.array([instant_s, instant_s + _AHEAD_S]))
+        self._T_before_after = ends[0] @ lie.inverse(ends[1])
+
+    def _is_after(self, times_s: NDArray[np.floating]) -> NDArray[np.bool_]:
+        return times_s >= self._instant_s - 1e-9
+
+    def _moved(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
+        return times_s + _AHEAD_S * self._is_after(times_s)
+
+    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Speed along the path, without the jump."""
+        return self._motion.speed_m_s(self._moved(times_s))
+
+    def base(self, times_s: NDArray[np.floating]) -> Matrix:
+        """T_world_base as the wheels roll."""
+        poses = self._motion.base(self._moved(times_s))
+        after = self._is_after(times_s)
+        poses[after] = self._T_before_after @ poses[after]
+        return poses
+
+    def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
+        """T_world_lidar with the jump."""
+        return self._motion.lidar(self._moved(times_s))
+
+
+def _people(drive: Drive, rng: np.random.Generator) -> Callable[[float], Solids]:
+    """People around the lidar: a third keep pace with it, the others walk straight on."""
+    start = rng.uniform(-_AROUND_M, _AROUND_M, (_PEOPLE, 2))
+    velocity = _WALK_M_S * np.stack([np.cos(a := rng.uniform(0.0, 2.0 * np.pi, _PEOPLE)), np.sin(a)], axis=1)
+    velocity[: _PEOPLE // 3] = 0.0
+    start[: _PEOPLE // 3] *= 0.5
+
+    def solids(time_s: float) -> Solids:
+        base, lidar = drive.motion.base(np.array([time_s]))[0], drive.motion.lidar(np.array([time_s]))[0]
+        place = start + velocity * time_s
+        place[_PEOPLE // 3 :] -= base[:2, 3]
+        offset = (place + _AROUND_M) % (2.0 * _AROUND_M) - _AROUND_M
+        distance_m = np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-6)
+        place = lidar[:2, 3] + offset * np.maximum(1.0, _NEAREST_M / distance_m)
+        heights = np.tile([0.25, base[2, 3] - 0.5, base[2, 3] + 1.75], (_PEOPLE, 1))
+        return replace(drive.solids, cylinders=np.vstack([drive.solids.cylinders, np.hstack([place, heights])]))
+
+    return solids
+
+
+def _traffic(drive: Drive, rng: np.random.Generator) -> Callable[[float], Solids]:
+    """Trucks that keep pace with a car, ahead and beside it, and others that overtake it or come towards it."""
+    along = np.array([10.0, -2.0, *rng.uniform(-40.0, 40.0, 4)])
+    across = np.array([0.0, -3.4, 3.4, 3.4, -3.4, 6.8])
+    relative_m_s = np.array([0.0, 0.0, 3.0, -12.0, -2.0, -20.0])
+
+    def solids(time_s: float) -> Solids:
+        base = drive.motion.base(np.array([time_s]))[0]
+        ahead = base[:2, 0] / np.linalg.norm(base[:2, 0])
+        u = np.where(relative_m_s == 0.0, along, (along + relative_m_s * time_s + 40.0) % 80.0 - 40.0)
+        place = base[:2, 3] + u[:, None] * ahead + across[:, None] * np.array([-ahead[1], ahead[0]])
+        size = np.tile([4.0, 1.2, base[2, 3] + 0.3, base[2, 3] + 3.2, *ahead], (len(place), 1))
+        return replace(drive.solids, boxes=np.vstack([drive.solids.boxes, np.hstack([place, size])]))
+
+    return solids
+
+
+def _open_shares(drive: Drive) -> Matrix:
+    """As ``LogSpec.open_shares``, from the true geometry without what moves."""
+    truth = drive.truth()
+    stride = max(1, round(_SHARE_EVERY_S * 1e9 / drive.sensor.period_ns))
+    starts_s = drive.scans[::stride] * (drive.sensor.period_ns * 1e-9)
+    sensor = replace(drive.sensor, rays=_fewer(drive.sensor))
+    shares = [
+        _least_share(information(drive.solids, T, sensor, index=int(index)), drive.sensor.dimension)
+        for T, index in zip(drive.motion.lidar(starts_s), drive.scans[::stride], strict=True)
+    ]
+    return np.stack([truth.stamps_ns[::stride].astype(np.float64), shares], axis=1)
+
+
+def _fewer(sensor: Sensor) -> Callable[[int], Rays]:
+    """Some of the sensor's rays; a prime stride mixes the rings."""
+
+    def rays(index: int) -> Rays:
+        whole = sensor.rays(index)
+        stride = max(1, len(whole.directions) // _SHARE_RAYS)
+        return replace(
+            whole,
+            directions=whole.directions[:: stride | 1],
+            instant_of_ray=whole.instant_of_ray[:: stride | 1],
+            ring=whole.ring[:: stride | 1],
+        )
+
+    return rays
+
+
+def _least_share(H: Matrix, dimension: int) -> float:
+    """As ``scanchain.simulation.spectrum``, in the plane of x, y and yaw for a laser scanner."""
+    d, chosen = (2, [0, 1, 5]) if dimension == 2 else (3, [0, 1, 2, 3, 4, 5])
+    H = H[np.ix_(chosen, chosen)]
+    count, levers = np.trace(H[:d, :d]), np.trace(H[d:, d:])
+    if count <= 0.0:
+        return 0.0
+    scale = lie.by_component(len(chosen), 1.0, float(np.sqrt(count / max(levers, 1e-12 * count))))
+    return max(float(np.linalg.eigvalsh(scale[:, None] * H * scale / count)[0]), 0.0)
+
+
+_PLAIN_2D = (
+    ("office", "lms-270"), ("office", "utm-30"), ("identical", "lms-270"), ("identical", "utm-30"),
+    ("corridor", "lms-270"), ("corridor", "utm-30"), ("hall", "lms-270"), ("turns", "utm-30"),
+)  # fmt: skip
+_PLAIN_3D = (
+    ("town", "hdl-64"), ("town", "vlp-16"), ("town", "rosette"), ("rounds", "os1-32"), ("highway", "vlp-16"),
+    ("highway", "os1-32"), ("corridor", "vlp-16"), ("corridor", "os1-32"), ("field", "vlp-16"),
+    ("forest", "os1-32"), ("forest", "rosette"), ("staircase", "os1-32"), ("staircase", "vlp-16"),
+    ("hall", "vlp-16"), ("hall", "rosette"), ("turns", "os1-32"), ("turns", "vlp-16"), ("gap", "vlp-16"),
+    ("office", "vlp-16"), ("identical", "os1-32"),
+)  # fmt: skip
+_INCIDENTS = {
+    "gap": (
+        "office utm-30", "identical lms-270", "town vlp-16", "forest os1-32", "staircase vlp-16", "turns lms-270",
+        "highway vlp-16", "field os1-32", "hall os1-32",
+    ),
+    "kidnapped": (
+        "office lms-270", "identical utm-30", "town vlp-16", "hall vlp-16", "office utm-30", "town os1-32",
+        "forest vlp-16", "staircase os1-32",
+    ),
+    "carried": (
+        "office utm-30", "identical lms-270", "rounds vlp-16", "forest os1-32", "hall lms-270", "highway vlp-16",
+        "turns vlp-16",
+    ),
+    "crowd": (
+        "office lms-270", "hall utm-30", "town vlp-16", "highway os1-32", "office rosette", "corridor vlp-16",
+        "identical lms-270", "rounds vlp-16", "forest vlp-16",
+    ),
+    "mounting": ("office lms-270", "turns utm-30", "town vlp-16", "hall os1-32"),
+}  # fmt: skip
+
+
+def cases() -> list[Case]:
+    """All cases; every factor and the pairs that matter occur, not their product."""
+    found = []
+    for dimension, pairs in ((2, _PLAIN_2D), (3, _PLAIN_3D)):
+        for k, (world, sensor) in enumerate(pairs):
+            log = LogSpec(world, sensor, duration_s=40.0 if dimension == 2 else 24.0, dimension=dimension)
+            tenth = 100_000_000 // SENSORS[sensor].period_ns
+            slow = (2, 5) if k % 2 else (5, 2)
+            found += [Case(log, "wheels", tenth), Case(log, "no wheels", slow[0] * tenth)]
+            found.append(Case(log, *(("no wheels", tenth) if k % 3 else ("wheels", slow[1] * tenth))))
+    for incident, pairs in _INCIDENTS.items():
+        for k, pair in enumerate(pairs):
+            world, sensor = pair.split()
+            tenth = 100_000_000 // SENSORS[sensor].period_ns
+            log = LogSpec(world, sensor, incident, duration_s=24.0, dimension=SENSORS[sensor].dimension)
+            found += [Case(log, "wheels", tenth), Case(log, "checked" if k % 2 else "no wheels", tenth)]
+    return found + _real()
+
+
+def _real() -> list[Case]:
+    found = []
+    for name in ("intel", "aces"):
+        file = DATA / f"2d/{name}.mcap"
+        log = LogSpec(name, dimension=2, file=file, reference=file.with_suffix(".relations"))
+        log = replace(log, reference_m=0.05, reference_rad=np.radians(1.0))  # made by hand
+        found += [Case(log, wheels) for wheels in WHEELS]
+        cut = replace(log, world=f"{name} cut", overrides={"log__start_s": 300.0, "log__end_s": 700.0})
+        found += [Case(cut, "no wheels"), Case(cut, "no wheels", 3), Case(cut, "wheels", 3)]
+    csail = DATA / "2d/mit_csail.mcap"
+    corrected = csail.with_name("mit_csail_corrected.tum")  # of another SLAM system
+    log = LogSpec("csail", dimension=2, file=csail, reference=corrected, reference_m=np.inf)
+    found += [Case(log, "wheels"), Case(log, "no wheels")]
+    for room in (1, 2):
+        topic = {"log__ground_truth_topic": "/vrpn_client_node/jackal/pose"}
+        file = DATA / f"2d/mocap_room_{room}.bag"  # stamps are 25 ms off, it turns by up to 2 rad/s
+        log = LogSpec(f"mocap {room}", "", dimension=2, file=file, overrides=topic)
+        log = replace(log, reference_m=0.05, reference_rad=0.1)
+        found += [Case(log, "no wheels", every) for every in (1, 2, 5)]
+    kitti = DATA / "3d/kitti_0001_first54.mcap"
+    log = LogSpec("kitti 0001", file=kitti, reference=kitti.with_suffix(".tum"))
+    found += [Case(log, "no wheels", every) for every in (1, 2, 3, 5)]
+    cut = replace(log, world="kitti 0001 cut", overrides={"log__start_s": 2.0})
+    found += [Case(cut, "no wheels", every) for every in (1, 3)]
+    panda = DATA / "3d/pandaset_002_sweeps30to55.mcap"
+    for topic in ("/pandar64/points", "/pandar_gt/points"):
+        log = LogSpec(f"pandaset {topic.split('/')[1]}", file=panda, overrides={"log__topic": topic})
+        found.append(Case(log, "no wheels"))
+    return [case for case in found if case.log.file is not None and case.log.file.exists()]
