@@ -85,7 +85,8 @@ class Explainer:
             looked for again where the rejection is "refined" only
         """
         self._problem_of, self._measured, self._is_loop = problem_of, measured, is_loop
-        self._config, self._rejection, self.unexplained = config, rejection, unexplained
+        self._config, self.unexplained = config, unexplained
+        self._rejection: OutlierRejection = rejection
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""

@@ -113,21 +113,25 @@ def _consensus(
     price: float,
 ) -> DriftStep:
     """Best change of the drift, of those that single edges ask for."""
-    own = np.linalg.solve(curvature, slope)
+    own = np.asarray(np.linalg.solve(curvature, slope), np.float64)
     best, most = DriftStep(own, edges[:0], 0.0), float(slope @ own)
 
     def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
         A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
-        return np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members]))
+        return np.asarray(
+            np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members])), np.float64
+        )
 
     def fitting(change: Vector) -> tuple[Vector, Matrix]:
         size_2 = np.repeat(_squared_sizes(V @ change), _parts(errors.shape[1]), axis=1)
-        weight = np.linalg.inv(noise + _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1]))
+        spread = _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1])
+        weight = np.asarray(np.linalg.inv(noise + spread), np.float64)
         left = errors + V @ change
         return np.einsum("ea,eab,eb->e", left, weight, left), weight
 
     for start in range(len(edges)):
-        members, change = np.array([start]), solved(np.array([start]), np.linalg.inv(noise[[start]]))
+        members = np.array([start])
+        change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
         for _ in range(_ROUNDS):
             chi2, weight = fitting(change)
             members = np.flatnonzero(chi2 < price)

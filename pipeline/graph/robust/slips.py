@@ -138,7 +138,7 @@ def _predicted_information(
     for place, edge in enumerate(edges):
         joint = difference_covariance(sparse, *problem.edges[edge])
         result[place] += jacobians[edge] @ joint @ jacobians[edge].T
-    return np.linalg.inv(result)
+    return np.asarray(np.linalg.inv(result), np.float64)
 
 
 def _stretches(count: int, slips: tuple[Slip, ...]) -> Iterator[Slip]:
