@@ -213,6 +213,10 @@ class Slam:
             traveled_m=self.traveled_m,
             scale=located.scale,
         )
+        if self.graph.drift.any():
+            T_last_keyframe = lie.between(self.keyframes[-1].T_odom_lidar, keyframe.T_odom_lidar)
+            T_world_keyframe = self.graph.poses[-1] @ self.graph.predicted(T_last_keyframe)
+            self.T_world_odom = lie.normalize(T_world_keyframe @ lie.inverse(keyframe.T_odom_lidar))
         self.graph.add_pose(self.T_world_odom @ keyframe.T_odom_lidar, keyframe.stamp_ns)
         if self.keyframes:
             last = self.keyframes[-1]
@@ -268,7 +272,7 @@ class Slam:
             enough = max(enough, _GROWTH * len(self.keyframes))
         if not self.waiting_closures or grown < enough:
             return None
-        return self._optimize("refined" if self.moves_map else "gnc")
+        return self._optimize("edges" if self.moves_map else "gnc")
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state

@@ -16,6 +16,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
+from scanchain.graph.explanation import Explainer, Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -28,7 +29,9 @@ from scanchain.graph.observability import (
     weakly_joined,
 )
 from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.graph.robust.slips import Slip
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
 
@@ -54,6 +57,7 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
+        self._explanation, self._unexplained = Explanation.none(k), 0
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
 
@@ -85,8 +89,21 @@ class PoseGraph:
 
     @property
     def measurements(self) -> Matrix:
-        """T_ij of every edge, (E, d+1, d+1)."""
-        return self._measurements.rows
+        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift`` and ``slips``."""
+        return self._explanation.measurements(self._measurements.rows, self.information, self.is_loop)
+
+    @property
+    def drift(self) -> NDArray[np.float64]:
+        """Systematic drift that loop edges show, (2,) or (4,): odometry is too short by a share, turns too little.
+
+        A pure number, and radians a meter about every axis; zero where nothing shows one.
+        """
+        return self._explanation.drift
+
+    @property
+    def slips(self) -> tuple[Slip, ...]:
+        """Stretches of odometry that loop edges show to be off by more than their edges say."""
+        return self._explanation.slips
 
     @property
     def information(self) -> Matrix:
@@ -184,6 +201,10 @@ class PoseGraph:
         padded[:, :2, :2] = checks.matrices(information, "information", (len(edges), 2, 2))
         self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
 
+    def predicted(self, T_ij: Pose) -> Pose:
+        """A motion by odometry, corrected by ``drift``."""
+        return corrected(T_ij, self._explanation.drift)
+
     def fix(self, index: int) -> None:
         """Fix this pose instead of pose 0."""
         index = checks.integer(index, "index", "the index of a pose")
@@ -208,7 +229,19 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
+            if rejection != "gnc" and config.robust == "truncated":
+                measured = self._measurements.rows
+                explainer = Explainer(
+                    self._problem_of, measured, self.is_loop, config, rejection, self._unexplained
+                )
+                explained = explainer.solve(self._explanation, self.poses, initialize)
+                self._unexplained = explainer.unexplained
+                solved = explained.solved
+                if explained.explanation is not self._explanation:
+                    self._changed()
+                    self._explanation = explained.explanation
+            else:
+                solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         minimum = solved.minimum
@@ -310,8 +343,15 @@ class PoseGraph:
         if self._problem is None:
             fixed = self.fixed
             check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
-            self._problem = BetweenProblem(self.edges, self.measurements, self.information, fixed, self.is_point)
+            self._problem = self._problem_of(self._explanation)
         return self._problem
+
+    def _problem_of(self, explanation: Explanation) -> BetweenProblem:
+        """The problem under an explanation; the one that is there already, if it is that."""
+        if self._problem is not None and explanation is self._explanation:
+            return self._problem
+        measurements = explanation.measurements(self._measurements.rows, self.information, self.is_loop)
+        return BetweenProblem(self.edges, measurements, self.information, self.fixed, self.is_point)
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""

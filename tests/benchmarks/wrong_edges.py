@@ -2,8 +2,9 @@
 
 To the loops of a graph are added, in proportion to their number, edges between random poses that never saw each
 other: "anywhere", their relative pose drawn from the extent of the map; "nearby", within 2 m and any angle, as a
-matcher that was deceived would give; "groups", nearby ones that agree in runs of five successive poses, as along a
-corridor that looks like another. The trajectory is compared with the optimum of the graph without them.
+matcher that was deceived would give; "groups" and "groups of 10", nearby ones that agree in runs of five and ten
+successive poses, as along a corridor that looks like another. A share is of the true loops: 0.43 makes 30 % of all
+wrong. The trajectory is compared with the optimum of the graph without them.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.graph.files.g2o import read_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
-KINDS = ("anywhere", "nearby", "groups")
+KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +40,13 @@ def add_wrong_loops(graph, share, kind, rng):
     real = len(graph.edges)
     wanted = int(share * graph.is_loop.sum())
     omega = np.median(graph.information[graph.is_loop], axis=0)
-    pairs, poses = [], []
+    pairs, poses, agreeing = [], [], KINDS[kind]
     while len(pairs) < wanted:
-        i, j = rng.integers(0, len(graph) - 5, 2)
+        i, j = rng.integers(0, len(graph) - max(agreeing, 5), 2)
         if abs(i - j) <= 10:
             continue
         T = random_pose(graph, kind, rng)
-        for step in range(5 if kind == "groups" else 1):
+        for step in range(agreeing):
             pairs.append((i + step, j + step))
             poses.append(moved_along(graph, i, j, step, T))
     graph.add_edges(
@@ -107,7 +108,7 @@ def main():
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "graphs")
     options = parser.parse_args()
     print(
-        f"{'graph':12} {'kind':9} {'added':>6} {'seed':>4} {'wrong rejected':>15} {'true rejected':>14} "
+        f"{'graph':12} {'kind':12} {'added':>6} {'seed':>4} {'wrong rejected':>15} {'true rejected':>14} "
         f"{'ATE m':>9} {'without':>9} {'time s':>7}"
     )
     for name in options.graphs:
@@ -116,7 +117,7 @@ def main():
                 for seed in range(options.seeds):
                     o = try_wrong_loops(options.data / f"{name}.g2o", share, kind, seed, options.robust)
                     print(
-                        f"{name:12} {kind:9} {100 * share:5.0f}% {seed:4d} {100 * o.wrong_rejected:14.2f}% "
+                        f"{name:12} {kind:12} {100 * share:5.0f}% {seed:4d} {100 * o.wrong_rejected:14.2f}% "
                         f"{100 * o.true_rejected:13.2f}% {o.ate_m:9.4f} {o.ate_clean_m:9.4f} {o.time_s:7.2f}",
                         flush=True,
                     )

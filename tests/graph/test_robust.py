@@ -9,6 +9,7 @@ from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.inliers import contradictions
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.scenes import shared_data
@@ -66,6 +67,14 @@ def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_
     assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
     assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
     assert outcome.certified
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_groups_of_ten_wrong_loops_that_agree_are_rejected_as_groups(seed):
+    share = 0.3 / 0.7  # of the true ones: 30 % of all
+    outcome = try_wrong_loops(shared_data("graphs/intel.g2o"), share, "groups of 10", seed)
+    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
+    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -213,3 +222,43 @@ def test_a_loss_of_the_users_that_is_none_is_refused(name, fault):
     graph, _, _ = with_false_loops("intel", 0.03)
     with pytest.raises(InputError, match=fault):
         graph.optimize(GraphConfig(robust=f"{__name__}:{name}"))
+
+
+def round_trips(drifted, turns=3):
+    """A graph of laps whose odometry is measured as ``drifted`` makes it, every lap closed at every tenth pose."""
+    rng = np.random.default_rng(1)
+    true = [lie.pose_2d(10 * np.cos(a), 10 * np.sin(a), a + np.pi / 2) for a in np.arange(60 * turns) * np.pi / 30]
+    graph, sigma = PoseGraph(2), np.array([0.01, 0.01, 0.005])
+    for index in range(len(true)):
+        graph.add_pose(true[index], index)
+    for i in range(len(true) - 1):
+        Z = lie.inverse(true[i]) @ true[i + 1] @ lie.exp(0.3 * sigma * rng.normal(size=3))
+        graph.add_edge(i, i + 1, drifted(i, Z), np.diag(sigma**-2))
+    for i in range(0, len(true) - 60, 10):
+        Z = lie.inverse(true[i]) @ true[i + 60] @ lie.exp(0.3 * sigma * rng.normal(size=3))
+        graph.add_edge(i, i + 60, Z, np.diag(sigma**-2), is_loop=True)
+    return graph, np.array(true)
+
+
+def test_loops_that_agree_show_a_systematic_drift_of_odometry_instead_of_being_rejected():
+    drift = np.array([0.0, -0.01])  # laps do not show the scale
+    graph, true = round_trips(lambda i, Z: corrected(Z, -drift))
+    answer = graph.optimize(GraphConfig(), initialize="odometry")
+    assert not answer.rejected.any()
+    assert graph.drift[1] == pytest.approx(drift[1], abs=1e-3)
+    assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.2
+
+
+def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected():
+    graph, true = round_trips(lambda i, Z: Z @ lie.pose_2d(0.15 if 70 <= i < 80 else 0.0, 0.0, 0.0))
+    answer = graph.optimize(GraphConfig(), initialize="odometry")
+    assert not answer.rejected.any() and not graph.drift.any()
+    (slip,) = graph.slips
+    assert slip.first < 80 and slip.first + slip.count > 70 and slip.size_m == pytest.approx(-1.5, abs=0.3)
+    assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.7
+
+
+def test_odometry_that_no_loop_contradicts_is_left_as_it_is():
+    graph, _ = round_trips(lambda i, Z: Z)
+    graph.optimize(GraphConfig())
+    assert not graph.drift.any() and graph.slips == ()

@@ -21,6 +21,10 @@ class DriftingOdometry:
         return self.odometry.local_map
 
     @property
+    def elevation(self):
+        return self.odometry.elevation
+
+    @property
     def first_points(self):
         return self.odometry.first_points
 

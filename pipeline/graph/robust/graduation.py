@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.robust.groups import Contradiction, agreeing_groups
 from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
-OutlierRejection = Literal["gnc", "refined"]
+OutlierRejection = Literal["gnc", "edges", "refined"]
 
 _WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
+_MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
 
 
@@ -31,14 +33,15 @@ def minimize(
 ) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others
+    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others, and
+        groups of edges that agree
     """
     now, used = minimizer.evaluate(poses, loss), 0
     graduation = loss.graduation(now.chi2[minimizer.loops])
     if graduation is not None and len(minimizer.loops):
         now, loss, used = _graduate(minimizer, now, graduation)
-    if rejection == "refined" and loss.kernel == "truncated" and len(minimizer.loops):
-        minimum = _refine(minimizer, now, loss, max_iterations, tolerance)
+    if rejection != "gnc" and loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _refine(minimizer, now, loss, max_iterations, tolerance, rejection)
     else:
         minimum = minimizer.descend(now, loss, max_iterations, tolerance)
         if loss.kernel not in ("none", "truncated"):
@@ -100,7 +103,12 @@ class _Focus:
 
 
 def _refine(
-    minimizer: Minimizer, now: Evaluation, loss: RobustLoss, max_iterations: int, tolerance: float
+    minimizer: Minimizer,
+    now: Evaluation,
+    loss: RobustLoss,
+    max_iterations: int,
+    tolerance: float,
+    rejection: OutlierRejection,
 ) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
@@ -111,7 +119,22 @@ def _refine(
     against = _against(minimizer, minimum, nominal)
     price = fair_price(against[kept], nominal, problem.freedom)
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
-    share = 1.0
+    minimum = _refine_edges(minimizer, minimum, against, price, max_iterations, tolerance)
+    if rejection == "refined":
+        minimum = _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
+    return replace(minimum, price=price)
+
+
+def _refine_edges(
+    minimizer: Minimizer,
+    minimum: Minimum,
+    against: NDArray[np.float64],
+    price: float,
+    max_iterations: int,
+    tolerance: float,
+) -> Minimum:
+    """The minimum after rounds of changes of single edges, as long as the cost falls; ``against`` (L,) them."""
+    kept, share = minimum.weights[minimizer.loops] > 0.5, 1.0
     for _ in range(_MAX_ROUNDS):
         gain = np.where(kept, against - price, price - against)
         if share < _FEWEST or not (gain > 0.0).any():
@@ -125,6 +148,66 @@ def _refine(
         minimum, kept, share = replace(trial, iterations=used), inliers.kept, 1.0
         against = _against(minimizer, minimum, price)
     return minimum
+
+
+def _refine_groups(
+    minimizer: Minimizer, minimum: Minimum, price: float, limit: float, max_iterations: int, tolerance: float
+) -> Minimum:
+    """The minimum after changes of groups of edges that agree, each followed by those of single ones.
+
+    Wrong edges that agree shield each other: without any one of them, the others predict it. So do the true ones
+    that they push out.
+    """
+    tried: set[tuple[int, ...]] = set()
+    failed = 0
+    while failed < _MAX_FAILED:
+        group = _next_group(minimizer, minimum, price, limit, tried)
+        if not len(group):
+            break
+        tried.add(tuple(group.tolist()))
+        kept = minimum.weights > 0.5
+        kept[group] ^= True
+        inliers = InlierSet(kept[minimizer.loops], price)
+        trial = _settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
+        against = _against(minimizer, trial, price)
+        trial = _refine_edges(minimizer, trial, against, price, max_iterations, tolerance)
+        used = minimum.iterations + trial.iterations
+        is_better = trial.estimate.cost < minimum.estimate.cost
+        failed = 0 if is_better else failed + 1
+        minimum = replace(trial if is_better else minimum, iterations=used)
+    return minimum
+
+
+def _next_group(
+    minimizer: Minimizer, minimum: Minimum, price: float, limit: float, tried: set[tuple[int, ...]]
+) -> NDArray[np.int64]:
+    """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
+    problem, poses, is_loop = minimizer.problem, minimum.estimate.poses, minimizer.is_loop
+    kept = minimum.weights > 0.5
+    against = np.zeros(len(kept))
+    against[minimizer.loops] = _against(minimizer, minimum, price)
+    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
+    best, most = np.empty(0, np.int64), 0.0
+    if not out:
+        return best
+    contradiction = Contradiction(problem, poses, kept)
+    for group in (*out, *agreeing_groups(problem, poses, is_loop, is_loop & kept, limit)):
+        is_kept, worth = bool(kept[group[0]]), price * len(group)
+        if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
+            continue
+        if is_kept and not is_connected(problem.edges[_without(kept, group)], problem.variable < 0):
+            continue
+        rise = worth - contradiction.of(group, kept=is_kept)
+        gain = -rise if is_kept else rise
+        if gain > most:
+            best, most = group, gain
+    return best
+
+
+def _without(kept: NDArray[np.bool_], group: NDArray[np.int64]) -> NDArray[np.bool_]:
+    rest = kept.copy()
+    rest[group] = False
+    return rest
 
 
 def _settle(

@@ -10,8 +10,10 @@ from time import perf_counter
 
 from scanchain import config, data
 from scanchain.clock import working_s
+from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.robust.slips import Slip
 from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.connectivity import Drift, Segments
@@ -66,7 +68,8 @@ _CLASSES = Classes(
         Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
         Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap, Voxels,
         PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps,
-        ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, GrowingArray, PointStore, StoredPoints,
+        ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray, PointStore,
+        StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],

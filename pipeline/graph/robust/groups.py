@@ -1,0 +1,99 @@
+"""Groups of loop edges that agree with each other, and how much a group contradicts all other edges."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.graph.between import BetweenProblem
+
+FEWEST = 3  # least number of edges of a group; fewer may agree by chance
+_REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
+_MOST = 50  # largest number of edges of a group that is looked at as one
+_ROUNDING = 1e-9  # keeps a group without which its poses would be loose from a division by zero
+
+
+def agreeing_groups(
+    problem: BetweenProblem, poses: Matrix, is_loop: NDArray[np.bool_], chosen: NDArray[np.bool_], limit: float
+) -> list[NDArray[np.int64]]:
+    """Edges of each group among those chosen (E,): they join the same two stretches of poses and agree there.
+
+    Two agree where one predicts the other along the poses between their ends: the squared Mahalanobis distance,
+    with the noise of both and of an odometry edge for each of these poses, is below the limit.
+    """
+    loops = np.flatnonzero(chosen & is_loop)
+    if len(loops) < FEWEST:
+        return []
+    ends = problem.edges[loops]
+    a, b = KDTree(ends).query_pairs(_REACH, p=np.inf, output_type="ndarray").T
+    steps = np.abs(ends[a] - ends[b]).sum(axis=1)
+    (i, j), (k, m) = ends[a].T, ends[b].T
+    before, after = lie.between(poses[k], poses[i]), lie.between(poses[j], poses[m])
+    predicted = before @ problem.measurements[loops[a]] @ after
+    errors = lie.log(lie.between(problem.measurements[loops[b]], predicted))
+    noise = np.linalg.pinv(problem.information[loops], hermitian=True)
+    odometry = problem.information[~is_loop]
+    step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
+    covariance = noise[a] + noise[b] + steps[:, None, None] * step
+    agree = np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors) < limit
+    links = coo_array((np.ones(agree.sum()), (a[agree], b[agree])), shape=(len(loops), len(loops)))
+    label = connected_components(links, directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    members = np.split(loops[order], 1 + np.flatnonzero(np.diff(label[order])))
+    return [each for each in members if FEWEST <= len(each) <= _MOST]
+
+
+def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of the edges that join other poses than the ones before: a mistake repeated does not count twice."""
+    chosen: list[int] = []
+    for edge in edges.tolist():
+        if not (np.abs(ends[chosen] - ends[edge]).max(axis=1, initial=0) <= _REACH).any():
+            chosen.append(edge)
+    return np.array(chosen, np.int64)
+
+
+class Contradiction:
+    """Squared Mahalanobis distance between what groups of edges measure and what all other kept edges predict.
+
+    Of kept edges it is what the χ² of the whole graph falls by without them, of others what it rises by with them,
+    to first order, as ``contradictions`` has it of single edges.
+    """
+
+    def __init__(self, problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
+        """Kept (E,): the edges in force at these poses."""
+        self._problem = problem
+        self._errors = problem.errors(poses)
+        self._jacobians = problem.jacobians(poses, self._errors)
+        self._sparse = problem.restricted(kept)
+        equations = self._sparse.linearize(poses, self._errors[kept], np.ones(int(kept.sum())))
+        self._sparse.cholesky.factorize(equations.values)
+
+    def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
+        """The distance of the edges of a group, all of them kept or none."""
+        k, count = self._problem.freedom, len(group)
+        columns = [self._predicted(edge, axis, group) for edge in group for axis in range(k)]
+        predicted = np.array(columns).reshape(k * count, k * count)
+        information = np.zeros((count, k, count, k))
+        information[np.arange(count), :, np.arange(count)] = self._problem.information[group]
+        information = information.reshape(k * count, k * count)
+        errors = self._errors[group].ravel()
+        sign = -1.0 if kept else 1.0
+        matrix = (1.0 + _ROUNDING) * np.eye(len(errors)) + sign * (predicted @ information)
+        return float(errors @ information @ np.linalg.solve(matrix, errors))
+
+    def _predicted(self, edge: int, axis: int, group: NDArray[np.int64]) -> Matrix:
+        """Covariance (G, k) of one component of an edge's residual with those of a group, as predicted."""
+        selection = np.zeros((len(self._problem.variable), self._problem.freedom))
+        i, j = self._problem.edges[edge]
+        selection[j], selection[i] = self._jacobians[edge, axis], -self._jacobians[edge, axis]
+        packing = self._sparse.packing
+        moved = self._sparse.cholesky.solve(packing.rows(selection[self._problem.free]))
+        selection[:] = 0.0
+        selection[self._problem.free] = packing.spread_rows(moved)
+        i, j = self._problem.edges[group].T
+        return np.einsum("eab,eb->ea", self._jacobians[group], selection[j] - selection[i])
