@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import isfinite
 from pathlib import Path
 
@@ -84,6 +84,7 @@ class Metrics(Struct, frozen=True):
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
     ``calibrated_from`` on; 0 where no error was found.
+    ``odometry_errors`` : systematic drift and slips of odometry that loop closures show, corrected in the graph
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 
@@ -125,6 +126,7 @@ class Metrics(Struct, frozen=True):
     compile_s: float = 0.0
     elevation_offset_rad: float = 0.0
     calibrated_from: int = 0
+    odometry_errors: tuple[str, ...] = ()
 
     @property
     def expected_ate(self) -> str:
@@ -237,6 +239,7 @@ def measure(
         compile_s=compile_s,
         elevation_offset_rad=result.elevation_offset_rad,
         calibrated_from=result.calibrated_from,
+        odometry_errors=tuple(_odometry_errors(result)),
     )
 
 
@@ -268,6 +271,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         *_calibration_lines(m),
+        *(f"odometry       {error}" for error in m.odometry_errors),
         f"time           {m.run_s:.1f} s{m.compiling}, "
         f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
@@ -335,3 +339,15 @@ def _calibration_lines(m: Metrics) -> list[str]:
         f"calibration    vertical angles corrected by {offset_deg:+.2f} deg from scan {m.calibrated_from:,} on "
         "(preprocess.calibrate_elevation)"
     ]
+
+
+def _odometry_errors(result: SlamResult) -> Iterator[str]:
+    """Systematic drift and slips that loop closures show, a line each."""
+    if result.graph.drift.any():
+        scale, *turns = result.graph.drift.tolist()
+        turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
+        yield f"corrected by loop closures: length {100.0 * scale:+.1f} %, turn {turn} mrad/m"
+    scans = [keyframe.scan_index for keyframe in result.keyframes]
+    for slip in result.graph.slips:
+        first, last = scans[slip.first], scans[min(slip.first + slip.count, len(scans) - 1)]
+        yield f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between scans {first:,} and {last:,}"
