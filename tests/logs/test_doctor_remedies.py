@@ -29,7 +29,6 @@ from tests.support.naive_logs import (
 from tests.support.scenes import ROOT
 
 ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
-WHOLE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])
 TOUCHED = {"/scan", "/points", "/ground_truth"}
 
 
@@ -157,13 +156,6 @@ def no_point_times(world):
     return clouds(world("town", "vlp-16", 20.0), lambda rows, times_s: None, fields=np.dtype(ROW.descr[:3]))
 
 
-def whole_milliseconds(world):
-    def change(rows, times_s):
-        rows["t"] = np.rint(1e3 * times_s)
-
-    return clouds(world("town", "vlp-16", 20.0), change, fields=WHOLE)
-
-
 def hundredths_of_a_second(world):
     def change(rows, times_s):
         rows["time"] = 100.0 * times_s
@@ -222,7 +214,6 @@ FAULTS = {
     a_range_for_no_return: "no return",
     wheels_far_from_an_unmounted_lidar: "mounting",
     no_point_times: "point times",
-    whole_milliseconds: "point times",
     hundredths_of_a_second: "point times",
     a_wide_world: "ranges",
     a_narrow_world: "ranges",
