@@ -160,7 +160,7 @@ def hundredths_of_a_second(world):
     def change(rows, times_s):
         rows["time"] = 100.0 * times_s
 
-    return clouds(world("town", "vlp-16", 20.0), change)
+    return clouds(world("town", "vlp-16", 20.0), change, count=40)
 
 
 def timed(rows, times_s):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from scanchain.errors import InputError
 from scanchain.landmarks.files.write import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Study
@@ -49,8 +51,10 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
 def _sections(study: Study, number: int) -> Iterator[Section]:
     """The estimate, then the linear solvers."""
     facts = [(fact.label, fact.value) for fact in study.facts]
-    chips = (Chip("before", BEFORE), Chip("after", AFTER), Chip("truth", "var(--ink)", is_dashed=True))
-    marks = "Circles: landmarks; crosses: true ones"
+    is_known = bool(len(study.true_poses) or np.isfinite(study.true_landmarks).any())
+    truth = (Chip("truth", "var(--ink)", is_dashed=True),) if is_known else ()
+    chips = (Chip("before", BEFORE), Chip("after", AFTER), *truth)
+    marks = "Circles: landmarks" + ("; crosses: true ones" if is_known else "")
     drawings = (
         Drawing("Before optimization", f"{marks}.", svg_before(study, number)),
         Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study, number)),

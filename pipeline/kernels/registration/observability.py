@@ -213,7 +213,7 @@ def signal_along(problem, T, twist) -> float:
                 most, dominant = informative[i], voxel
     if dominant >= 0:
         total -= _sum_around(voxels, dominant, problem.correspondence, informative)
-    return total / max(noise, 1e-300)
+    return max(total, 0.0) / max(noise, 1e-300)
 
 
 @njit(cache=True, inline="always")
