@@ -59,6 +59,26 @@ class Explanation:
         return of_slips + penalty(self.drift) + (_WORTH * price if self.drift.any() else 0.0)
 
 
+def corrections(
+    explanation: Explanation, edges: NDArray[np.int64], names: NDArray[np.int64], noun: str
+) -> list[str]:
+    """What an explanation corrects, a line each.
+
+    edges : (O, 2) those of odometry; names (K,), noun : numbers of the poses for the reader, and what they number
+    """
+    lines = []
+    if explanation.drift.any():
+        scale, *turns = explanation.drift.tolist()
+        turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
+        lines.append(f"corrected by loop closures: length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
+    for slip in explanation.slips:
+        first, last = (names[pose] for pose in (edges[slip.edges][0, 0], edges[slip.edges][-1, 1]))
+        lines.append(
+            f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between {noun} {first:,} and {last:,}"
+        )
+    return lines
+
+
 @dataclass(frozen=True, slots=True)
 class Explained:
     """A minimum under an explanation."""

@@ -16,7 +16,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
-from scanchain.graph.explanation import Explainer, Explanation
+from scanchain.graph.explanation import Explainer, Explanation, corrections
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -104,6 +104,10 @@ class PoseGraph:
     def slips(self) -> tuple[Slip, ...]:
         """Stretches of odometry that loop edges show to be off by more than their edges say."""
         return self._explanation.slips
+
+    def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
+        """``drift`` and ``slips`` in words, a line each; ``names`` (K,) number the poses for the reader."""
+        return corrections(self._explanation, self.edges[~self.is_loop], names, noun)
 
     @property
     def information(self) -> Matrix:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 
@@ -200,6 +200,7 @@ def measure(
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
     rejected = Counter(item.rejected_by for item in final)
+    scan_numbers = np.array([keyframe.scan_index for keyframe in result.keyframes])
     return Metrics(
         scans=len(steps),
         dimension=result.trajectory.dimension,
@@ -239,7 +240,7 @@ def measure(
         compile_s=compile_s,
         elevation_offset_rad=result.elevation_offset_rad,
         calibrated_from=result.calibrated_from,
-        odometry_errors=tuple(_odometry_errors(result)),
+        odometry_errors=tuple(result.graph.corrections(scan_numbers, "scans")),
     )
 
 
@@ -339,15 +340,3 @@ def _calibration_lines(m: Metrics) -> list[str]:
         f"calibration    vertical angles corrected by {offset_deg:+.2f} deg from scan {m.calibrated_from:,} on "
         "(preprocess.calibrate_elevation)"
     ]
-
-
-def _odometry_errors(result: SlamResult) -> Iterator[str]:
-    """Systematic drift and slips that loop closures show, a line each."""
-    if result.graph.drift.any():
-        scale, *turns = result.graph.drift.tolist()
-        turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
-        yield f"corrected by loop closures: length {100.0 * scale:+.1f} %, turn {turn} mrad/m"
-    scans = [keyframe.scan_index for keyframe in result.keyframes]
-    for slip in result.graph.slips:
-        first, last = scans[slip.first], scans[min(slip.first + slip.count, len(scans) - 1)]
-        yield f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between scans {first:,} and {last:,}"

@@ -1,4 +1,5 @@
 import math
+import re
 
 import numpy as np
 import pytest
@@ -246,6 +247,8 @@ def test_loops_that_agree_show_a_systematic_drift_of_odometry_instead_of_being_r
     answer = graph.optimize(GraphConfig(), initialize="odometry")
     assert not answer.rejected.any()
     assert graph.drift[1] == pytest.approx(drift[1], abs=1e-3)
+    (line,) = graph.corrections(np.arange(len(graph)))
+    assert re.fullmatch(r"corrected by loop closures: length [+-]0\.\d %, turn -(9|10)\.\d mrad/m", line)
     assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.2
 
 
@@ -255,6 +258,10 @@ def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected():
     assert not answer.rejected.any() and not graph.drift.any()
     (slip,) = graph.slips
     assert slip.first < 80 and slip.first + slip.count > 70 and slip.size_m == pytest.approx(-1.5, abs=0.3)
+    first, last = 10 * slip.first, 10 * (slip.first + slip.count)
+    assert graph.corrections(10 * np.arange(len(graph)), "scans") == [
+        f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between scans {first:,} and {last:,}"
+    ]
     assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.7
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -19,10 +18,9 @@ from rerun.chunk import RrdReader
 
 from scanchain.api import open_recorder
 from scanchain.errors import InputError
-from scanchain.graph.robust.slips import Slip
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Job, Unwatched
-from scanchain.runs.metrics import _odometry_errors, summary
+from scanchain.runs.metrics import summary
 from scanchain.runs.resume.rescue import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
@@ -451,14 +449,3 @@ def test_a_killed_run_is_marked_partial_and_its_recording_can_be_read(tmp_path, 
     assert names(tmp_path) == [folder.name]
     assert run_file(folder)["complete"] is False
     assert list(RrdReader(str(folder / "recording.rrd")).stream())
-
-
-def test_errors_of_odometry_that_closures_show_are_told():
-    keyframes = [SimpleNamespace(scan_index=10 * k) for k in range(8)]
-    slips = (Slip(2, 4, 1.84),)
-    graph = SimpleNamespace(drift=np.array([0.031, 0.0098]), slips=slips)
-    told = list(_odometry_errors(SimpleNamespace(graph=graph, keyframes=keyframes)))
-    assert told == [
-        "corrected by loop closures: length +3.1 %, turn +9.8 mrad/m",
-        "corrected by loop closures: a slip of +1.8 m between scans 20 and 60",
-    ]
