@@ -34,6 +34,8 @@ def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    for name, value in (("period_ms", 1000), ("timeout_ms", 2000), ("failure_threshold", 2)):
+        monkeypatch.setenv(f"RAY_health_check_{name}", str(value))  # a dead node is noticed within seconds
     logs = [tmp_path / f"log_{k}.mcap" for k in range(6)]
     for seed, log in enumerate(logs):
         simulate("office", log, duration_s=2.0, seed=seed)

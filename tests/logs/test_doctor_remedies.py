@@ -160,7 +160,7 @@ def hundredths_of_a_second(world):
     def change(rows, times_s):
         rows["time"] = 100.0 * times_s
 
-    return clouds(world("town", "vlp-16", 20.0), change, count=40)
+    return clouds(world("town", "vlp-16", 20.0), change, count=25)
 
 
 def timed(rows, times_s):
@@ -168,7 +168,7 @@ def timed(rows, times_s):
 
 
 def a_wide_world(world):
-    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0, count=55, every=3)
+    return clouds(world("town", "vlp-16", 20.0), timed, scale=8.0, count=35, every=3)
 
 
 def a_narrow_world(world):
