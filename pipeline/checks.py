@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, one_line, shown
 from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
@@ -251,7 +251,7 @@ def _array(value: object, name: str, wanted: str) -> NDArray[Any]:
     try:
         return np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise InputError(f"{name} is {shown(value)}, no array ({_one_line(error)}); wanted {wanted}") from None
+        raise InputError(f"{name} is {shown(value)}, no array ({one_line(error)}); wanted {wanted}") from None
 
 
 def _is_ready(value: object, dtype: DTypeLike) -> bool:
@@ -273,7 +273,3 @@ def _kind(array: NDArray[Any]) -> str:
     return {"b": "booleans", "c": "complex numbers", "O": "objects", "U": "text", "S": "text"}.get(
         array.dtype.kind, f"{array.dtype}"
     )
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -27,6 +27,11 @@ def shown(value: object) -> str:
     return text if len(text) <= 40 and text.isprintable() else f"a {type(value).__name__}"
 
 
+def one_line(error: BaseException) -> str:
+    """Message of an error without line breaks."""
+    return " ".join(str(error).split())
+
+
 _NO_SPACE = "the disk is full; free some space on it, or write to another one"
 _REMEDIES = {
     errno.ENOSPC: _NO_SPACE,

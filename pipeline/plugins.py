@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 
 
 def is_class_name(text: str) -> bool:
@@ -59,7 +59,7 @@ def _imported(module_name: str, name: str) -> ModuleType:
                 f"{name}: there is no module {module_name} in {here} or on PYTHONPATH; go to its folder, or set "
                 "PYTHONPATH to it"
             ) from None
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(
             f"{name}: importing {module_name} failed with {type(error).__name__}: {reason}"
         ) from error

@@ -15,7 +15,7 @@ from msgspec.structs import fields
 
 from scanchain.config import Config
 from scanchain.config_keys import ConfigKey, Value, section_keys
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, one_line, shown
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 _WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
@@ -183,7 +183,7 @@ def read_layer(file: Path) -> dict[str, Value]:
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"{file}: is not TOML: {reason}; scanchain config dump prints one that is") from None
     layer: dict[str, Value] = {}
     for name, value in _leaves(tree):

@@ -181,7 +181,7 @@ class Slam:
             graph=self.graph,
             state=state,
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
-            calibrated_from=self.front_end.odometry.elevation.since,
+            calibrated_from=self.front_end.odometry.calibrated_from,
         )
 
     def _check_unfinished(self) -> None:

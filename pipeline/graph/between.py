@@ -75,6 +75,12 @@ class BetweenProblem:
         measurements, information = self.measurements[kept], self.information[kept]
         return BetweenProblem(self.edges[kept], measurements, information, self.variable < 0, self.is_point)
 
+    def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
+        """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k)."""
+        sparse = self.restricted(kept)
+        sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
+        return sparse
+
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
         return self._errors(poses, self.edges)

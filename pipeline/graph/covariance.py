@@ -46,6 +46,20 @@ def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
     return flat.T @ problem.cholesky.solve(flat)
 
 
+def residual_covariances(
+    problem: BetweenProblem, factored: BetweenProblem, jacobians: Matrix, edges: NDArray[np.int64]
+) -> Matrix:
+    """Covariances (L, k, k) of the residuals of edges (L,) that a factored problem without them predicts.
+
+    jacobians : (E, k, k) of all edges of the problem
+    """
+    result = np.linalg.pinv(problem.information[edges], hermitian=True)
+    for place, edge in enumerate(edges):
+        joint = difference_covariance(factored, *problem.edges[edge])
+        result[place] += jacobians[edge] @ joint @ jacobians[edge].T
+    return result
+
+
 def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
     """Errors (count, K, d) of all positions, drawn from their joint distribution; those of fixed poses are zero.
 

@@ -62,7 +62,7 @@ class Explanation:
 def corrections(
     explanation: Explanation, edges: NDArray[np.int64], names: NDArray[np.int64], noun: str
 ) -> list[str]:
-    """What an explanation corrects, a line each.
+    """Corrections of odometry in words, a line each.
 
     edges : (O, 2) those of odometry; names (K,), noun : numbers of the poses for the reader, and what they number
     """
@@ -81,8 +81,9 @@ def corrections(
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A minimum under an explanation."""
+    """The minimum of the problem under an explanation."""
 
+    problem: BetweenProblem
     solved: Solved
     explanation: Explanation
 
@@ -120,17 +121,16 @@ class Explainer:
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
-        minimum = best.solved.minimum
-        problem = self._problem_of(best.explanation)
+        minimum, problem = best.solved.minimum, best.problem
         if minimum.price == 0.0 or len(problem.sightings):
             return
-        for explanation in self._candidates(best, problem):
+        for explanation in self._candidates(best):
             trial = self._solved(explanation, best.solved.poses, "given")
             if self._cost(trial, minimum.price) < self._cost(best, minimum.price) - _SETTLED * minimum.price:
                 yield trial
 
-    def _candidates(self, best: Explained, problem: BetweenProblem) -> list[Explanation]:
-        now, poses, price = best.explanation, best.solved.poses, best.solved.minimum.price
+    def _candidates(self, best: Explained) -> list[Explanation]:
+        problem, now, poses, price = best.problem, best.explanation, best.solved.poses, best.solved.minimum.price
         kept = best.solved.minimum.weights > REJECTED_WEIGHT
         count = len(apart(problem.edges, np.flatnonzero(self._is_loop & ~kept)))
         if count < _FEWEST:
@@ -150,13 +150,13 @@ class Explainer:
     def _solved(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         problem = self._problem_of(explanation)
         solved = solve(problem, poses, self._is_loop, self._config, initialize, self._rejection)
-        return Explained(solved, explanation)
+        return Explained(problem, solved, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:
         """Cost of a minimum at this price of a loop edge, and of its explanation."""
         minimum, explanation = explained.solved.minimum, explained.explanation
         kept = minimum.weights > REJECTED_WEIGHT
         chi2 = float(minimum.estimate.chi2[kept].sum())
-        information = self._problem_of(explanation).information
+        information = explained.problem.information
         own = explanation.cost(self._measured, information, self._is_loop, price)
         return chi2 + price * int((self._is_loop & ~kept).sum()) + own

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
 from scanchain.preprocess import Sweep
+from scanchain.registration.correlative import evenly
 
 _SCANS = 8  # number of scans that are adjusted together
 _SPACING_VOXELS = 2.0  # least distance between two of them
@@ -60,13 +61,10 @@ class ElevationCalibration:
     Attributes
     ----------
     offset_rad : what points are corrected by
-    since : number of scans that were not
     """
 
     def __init__(self, *, is_wanted: bool) -> None:
         self.offset_rad = 0.0
-        self.since = 0
-        self.scans = 0
         self.windows_left = _WINDOWS if is_wanted else 0
         self.collected: list[tuple[Points, Pose]] = []
 
@@ -84,7 +82,6 @@ class ElevationCalibration:
         Then ``offset_rad`` includes it, and the scans of the window are returned, corrected, with adjusted poses,
         of which the last one stays as it was.
         """
-        self.scans += 1
         if not self.windows_left:
             return []
         if self.collected and lie.apart(self.collected[-1][1], T_odom_lidar)[0] < _SPACING_VOXELS * voxel_m:
@@ -93,20 +90,14 @@ class ElevationCalibration:
         if len(self.collected) < _SCANS:
             return []
         clouds, poses = zip(*self.collected, strict=True)
-        adjustment = adjusted([thinned(cloud) for cloud in clouds], np.array(poses), voxel_m)
+        adjustment = adjusted([evenly(cloud, _POINTS) for cloud in clouds], np.array(poses), voxel_m)
         self.windows_left = 0 if adjustment.shows_none else self.windows_left - 1
         self.forget()
         if not adjustment.is_significant:
             return []
-        self.since = self.since or self.scans
         self.offset_rad += adjustment.offset_rad
         corrected = (raised(cloud, adjustment.offset_rad) for cloud in clouds)
         return list(zip(corrected, adjustment.poses, strict=True))
-
-
-def thinned(points: Points) -> Points:
-    """At most so many of the points (N, 3), at even steps."""
-    return points[:: max(1, -(-len(points) // _POINTS))]
 
 
 def raised(points: Points, offset_rad: float) -> Points:

@@ -66,6 +66,7 @@ class Odometry:
         self.map = MapKeeper(self.dimension, config.local_map)
         is_wanted = self.dimension == 3 and config.preprocess.calibrate_elevation
         self.elevation = ElevationCalibration(is_wanted=is_wanted)
+        self.calibrated_from = 0  # the first scan whose points are corrected by it
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
         self.live_stamps = LiveStamps()
@@ -213,6 +214,7 @@ class Odometry:
             return
         corrected = self.elevation.take(points, self.predictor.T_odom_lidar, self.local_map.voxels.size_m)
         if corrected:
+            self.calibrated_from = self.calibrated_from or self.scans
             self.map.replace(corrected)
 
     def _at_stamp(self, tracked: Tracked, sweep: Sweep, prediction: Prediction) -> Tracked:

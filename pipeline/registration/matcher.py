@@ -10,7 +10,7 @@ import numpy as np
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, one_line, shown
 from scanchain.registration.voxel_map import VoxelMap
 
 _COUNTS = ("inliers", "points", "iterations")
@@ -46,7 +46,7 @@ class CheckedMatcher:
         try:
             self.own = kind(config)
         except Exception as error:  # of the user's own code
-            reason = " ".join(str(error).split())
+            reason = one_line(error)
             raise InputError(
                 f"{name}: cannot be made with a MatchingConfig ({type(error).__name__}: {reason}); "
                 "wanted __init__(self, config)"
@@ -59,7 +59,7 @@ class CheckedMatcher:
         try:
             match = self.own.align(points, target, T_first, prior, wide=wide)
         except Exception as error:  # of the user's own code
-            reason = " ".join(str(error).split())
+            reason = one_line(error)
             raise InputError(f"{self.name}: align failed with {type(error).__name__}: {reason}") from error
         if not isinstance(match, Match):
             raise InputError(f"{self.name}: align returned {shown(match)}; wanted a scanchain.Match")

@@ -82,7 +82,7 @@ def main():
             without = errors(tracked(log, offset_deg, is_calibrated=False)[0], true)
             poses, odometry = tracked(log, offset_deg, is_calibrated=True)
             z, pitch_deg = errors(poses, true)
-            found = f"{math.degrees(odometry.elevation.offset_rad):+.2f} | {odometry.elevation.since}"
+            found = f"{math.degrees(odometry.elevation.offset_rad):+.2f} | {odometry.calibrated_from}"
             shown = f"{100 * without[0]:.3f} | {100 * z:.3f} | {without[1]:.4f} | {pitch_deg:.4f}"
             print(f"| {name} | {found} | {shown} |", flush=True)
 

@@ -78,5 +78,5 @@ def test_the_vertical_angles_of_kitti_are_corrected_and_its_pitch_drifts_less():
         error[is_wanted] = pitch_per_meter(poses, truth)
         offset_deg[is_wanted] = math.degrees(odometry.elevation.offset_rad)
     assert offset_deg[False] == 0.0 and 0.15 < offset_deg[True] < 0.3  # readers of KITTI correct it by 0.205
-    assert 0 < odometry.elevation.since < 20
+    assert 0 < odometry.calibrated_from < 20
     assert error[True] < 0.5 * error[False]

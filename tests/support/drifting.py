@@ -25,6 +25,10 @@ class DriftingOdometry:
         return self.odometry.elevation
 
     @property
+    def calibrated_from(self):
+        return self.odometry.calibrated_from
+
+    @property
     def first_points(self):
         return self.odometry.first_points
 

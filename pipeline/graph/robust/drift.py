@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import difference_covariance
+from scanchain.graph.covariance import residual_covariances
 from scanchain.graph.robust.groups import apart
 
 Vector = NDArray[np.float64]
@@ -75,8 +75,7 @@ def drift_step(
     k, p = problem.freedom, len(drift)
     errors = problem.errors(poses)
     jacobians = problem.jacobians(poses, errors)
-    sparse = problem.restricted(kept)
-    sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    sparse = problem.factored(poses, errors, kept)
     odometry = np.flatnonzero(~is_loop)
     twists = lie.log(problem.measurements[odometry])
     B = np.stack([_changed(twists, unit) - twists for unit in np.eye(p)], axis=-1)  # (O, k, p)
@@ -96,10 +95,7 @@ def drift_step(
     out = out[:: max(1, -(-len(out) // _MOST))]
     i, j = problem.edges[out].T
     V = jacobians[out] @ (response[j] - response[i])
-    noise = np.linalg.pinv(problem.information[out], hermitian=True)
-    for place, edge in enumerate(out):
-        joint = difference_covariance(sparse, *problem.edges[edge])
-        noise[place] += jacobians[edge] @ joint @ jacobians[edge].T
+    noise = residual_covariances(problem, sparse, jacobians, out)
     return _consensus(errors[out], V, noise, curvature, slope, out, price)
 
 

@@ -64,8 +64,7 @@ def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool
     """
     errors, k = problem.errors(poses), problem.freedom
     jacobians = problem.jacobians(poses, errors)
-    sparse = problem.restricted(kept)
-    sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    sparse = problem.factored(poses, errors, kept)
     blocks = sparse.packing.blocks(sparse.cholesky.inverse_blocks())
     blocks = np.concatenate([blocks, np.zeros((1, k, k))])  # found by -1, a fixed pose
     i, j = problem.variable[problem.edges].T

@@ -16,7 +16,7 @@ from scipy.special import gammaincinv
 
 from scanchain import plugins
 from scanchain.config import LOSSES
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 
 Array = NDArray[np.float64]
 
@@ -244,7 +244,7 @@ def _check(loss: RobustLoss) -> None:
     except InputError:
         raise
     except Exception as error:  # of the user's own code
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(
             f"{loss.kernel}: fails for χ² (N,) ({type(error).__name__}: {reason}); wanted weight(self, chi2, s, "
             "mu) and loss(self, chi2, s, mu)"

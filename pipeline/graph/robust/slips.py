@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import difference_covariance
+from scanchain.graph.covariance import residual_covariances
 from scanchain.graph.robust.groups import apart
 
 SIGMA_M = 1.0  # standard deviation of a slip
@@ -79,7 +79,7 @@ def next_slip(
     slips: tuple[Slip, ...],
     price: float,
 ) -> tuple[float, tuple[Slip, ...]]:
-    """How far one more slip, or the change of one, lowers the cost at most, to first order; and the slips with it.
+    """The fall of the cost by one more slip, or the change of one, to first order, and the slips with it.
 
     measured : (E, d+1, d+1) as odometry has it
     With g = Σ JᵀΩu/n, a slip s moves the poses by H⁻¹g s, and the residual e of a loop edge left out by V s. The
@@ -90,8 +90,7 @@ def next_slip(
     odometry = np.flatnonzero(~is_loop)
     errors = problem.errors(poses)
     jacobians = problem.jacobians(poses, errors)
-    sparse = problem.restricted(kept)
-    sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
+    sparse = problem.factored(poses, errors, kept)
     information = problem.information[odometry]
     u = directions(information, measured[odometry])
     pull = np.einsum("eab,eb->ea", information, u)
@@ -99,7 +98,7 @@ def next_slip(
     claimed, bent = (u * pull).sum(axis=1), (pull * errors[odometry]).sum(axis=1)
     out = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
     out = out[:: max(1, -(-len(out) // _MOST))]
-    M = _predicted_information(problem, sparse, jacobians, out)
+    M = np.asarray(np.linalg.inv(residual_covariances(problem, sparse, jacobians, out)), np.float64)
     i, j = problem.edges[out].T
     left_out = errors[out]
     best, most = slips, 0.0
@@ -128,17 +127,6 @@ def next_slip(
             others = tuple(each for each in slips if each is not slip)
             best, most = (*others, replace(slip, size_m=slip.size_m + float(s[which]))), float(gain[which])
     return most, best
-
-
-def _predicted_information(
-    problem: BetweenProblem, sparse: BetweenProblem, jacobians: Matrix, edges: NDArray[np.int64]
-) -> Matrix:
-    """Inverse covariance (L, k, k) of the residuals of edges that the factored problem predicts."""
-    result = np.linalg.pinv(problem.information[edges], hermitian=True)
-    for place, edge in enumerate(edges):
-        joint = difference_covariance(sparse, *problem.edges[edge])
-        result[place] += jacobians[edge] @ joint @ jacobians[edge].T
-    return np.asarray(np.linalg.inv(result), np.float64)
 
 
 def _stretches(count: int, slips: tuple[Slip, ...]) -> Iterator[Slip]:

@@ -7,7 +7,7 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 from scanchain.logs.files import size_of
 from scanchain.logs.formats.on_demand import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
@@ -45,7 +45,7 @@ def parts_of_bag(folder: Path) -> list[Path]:
         parts = [folder / Path(name).name for name in stated["relative_file_paths"]]
         is_packed = str(stated.get("compression_mode", "")).lower() not in ("", "none")
     except (OSError, YAMLError, KeyError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
     is_mcap = bool(parts) and all(part.suffix == ".mcap" and part.is_file() for part in parts)
     return parts if is_mcap and not is_packed else [folder]
@@ -125,7 +125,7 @@ def _open(path: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return one_line(error) or type(error).__name__
 
 
 def _is_valid(connection: Any) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanchain import plugins
 from scanchain.checks import point_times
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, one_line, shown
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writing.pack import LATEST_NS
@@ -106,7 +106,7 @@ def _guarded(call: Callable[[], T], where: str) -> T:
         raise
     except Exception as error:  # of the user's own code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         line = f"{Path(last.filename).name}, line {last.lineno}"
         raise InputError(f"{where} failed with {type(error).__name__}: {reason} ({line})") from error
 

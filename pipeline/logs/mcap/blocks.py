@@ -13,6 +13,7 @@ from io import BytesIO
 import lz4.frame
 import zstandard
 
+from scanchain.errors import one_line
 from scanchain.logs.mcap.records import (
     CHANNEL,
     MESSAGE,
@@ -111,7 +112,9 @@ def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
                 f"{_name(index, block)}: compression {block.compression!r} is not known (none, lz4 and zstd are)"
             )
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError) as error:
-        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({_one_line(error)})") from error
+        raise DamagedBlockError(
+            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
+        ) from error
     if len(payload) != size:
         raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
     if crc and zlib.crc32(payload) != crc:
@@ -137,7 +140,3 @@ def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
 
 def _name(index: FileIndex, block: Block) -> str:
     return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
