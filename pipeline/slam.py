@@ -48,6 +48,7 @@ class SlamResult:
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule.
+    ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
     trajectory: Trajectory
@@ -56,6 +57,7 @@ class SlamResult:
     closures: tuple[Closure, ...]
     graph: PoseGraph
     state: GraphState
+    components: NDArray[np.int64]
     elevation_offset_rad: float = 0.0
     calibrated_from: int = 0
 
@@ -180,6 +182,7 @@ class Slam:
             closures=tuple(self.closures),
             graph=self.graph,
             state=state,
+            components=self.closer.segments.components(self.graph),
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,
         )
