@@ -31,12 +31,14 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.loops import LoopCloser, refined, spread
+from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
+_ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
@@ -77,10 +79,12 @@ class Slam:
         points_file: Path | None = None,
         *,
         dimension: int | None = None,
+        prior: SavedMap | None = None,
     ) -> None:
         """Arguments as in ``Odometry``.
 
         points_file : where points go, which stay out of memory; without one, into a temporary file
+        prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
@@ -101,8 +105,24 @@ class Slam:
         self.moves_map = False
         self.lost_scans = 0
         self.optimized_at = 0
+        self.first = 0  # number of the first keyframe of this log
         self.live_stamps = LiveStamps()
         self.is_finished = False
+        if prior is not None:
+            self._begin_in(prior)
+
+    def _begin_in(self, prior: SavedMap) -> None:
+        """Take the keyframes of a map, fixed where they are; the log begins somewhere, perhaps in it."""
+        if prior.dimension != self.dimension:
+            raise InputError(
+                f"{prior.folder}: is a {prior.dimension}D map, the log has {self.dimension}D scans; give a map of "
+                "the same kind"
+            )
+        self.keyframes += prior.keyframes
+        self.first = self.optimized_at = len(self.keyframes)
+        for keyframe in self.keyframes:
+            self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
+        self.traveled_m = self.closer.begin_in(self.keyframes)
 
     def track(
         self,
@@ -160,7 +180,7 @@ class Slam:
         Raises InputError without a scan, and when called again.
         """
         self._check_unfinished()
-        if not self.keyframes:
+        if not self.odometry_poses:
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
         if self.config.loops.enabled:
@@ -170,11 +190,13 @@ class Slam:
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
-        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
-        corrected = spread(state.poses, numbers, odometry)
+        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
+        corrected = spread(state.poses[self.first :], numbers, odometry)
         if self.keeps_scans:
             progress(f"refining {counted(len(odometry), 'scan')}")
-            corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
+            fixed, poses = self.keyframes[: self.first], corrected[numbers]
+            world = (fixed, state.poses[: self.first]) if fixed else (self.keyframes, poses)
+            corrected = refined(corrected, self.spans.rows, self.points, *world, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),
             odometry=Trajectory(stamps_ns, odometry),
@@ -199,7 +221,8 @@ class Slam:
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
-            self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(located.first_points))
+            stored = self.points.add(located.first_points)
+            self.keyframes[self.first] = replace(self.keyframes[self.first], stored=stored)
         self.lost_scans += tracked.state is State.LOST
         if not located.is_keyframe and not self.keeps_scans:
             return -1
@@ -227,8 +250,9 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
-            if tracked.elsewhere_m > 0.0:
-                sigmas = (tracked.elsewhere_m, np.pi)
+            elsewhere_m = tracked.elsewhere_m if keyframe.index > self.first else _ANYWHERE_M
+            if elsewhere_m > 0.0:
+                sigmas = (elsewhere_m, np.pi)
                 self.closer.start_segment(keyframe.index)
             self.graph.add_edge(
                 last.index,
@@ -272,7 +296,7 @@ class Slam:
         grown = len(self.keyframes) - self.optimized_at
         enough = _OPTIMIZE_EVERY
         if not self.moves_map:
-            enough = max(enough, _GROWTH * len(self.keyframes))
+            enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:
             return None
         return self._optimize("edges" if self.moves_map else "gnc")

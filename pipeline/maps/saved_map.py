@@ -1,8 +1,8 @@
 """A map to localize in and to merge: keyframes with their final poses, and the edges between them, in a folder.
 
     map.json       version, dimension, number of keyframes and points, the sessions it was made of
-    keyframes.npz  poses (K, d+1, d+1) T_map_lidar, stamps_ns, scan_index, session, traveled_m, scale, first, count,
-                   step_m (K,)
+    keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, first, count
+                   and step_m (K,)
     edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
     points.i16     int16 (N, d), little-endian: of a keyframe the rows first to first + count, times its step_m
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +75,16 @@ class Edges:
         number = np.full(max(int(self.pairs.max(initial=-1)), int(chosen.max(initial=-1))) + 1, -1)
         number[chosen] = np.arange(len(chosen))
         pairs = number[self.pairs]
-        kept = (pairs >= 0).all(axis=1)
+        return replace(self, pairs=pairs).where((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
+
+    def where(self, kept: NDArray[np.bool_]) -> Edges:
+        """Those for which ``kept`` (E,) holds."""
         return Edges(
-            pairs[kept], self.measurements[kept], self.information[kept], self.is_loop[kept], self.weight[kept]
+            self.pairs[kept],
+            self.measurements[kept],
+            self.information[kept],
+            self.is_loop[kept],
+            self.weight[kept],
         )
 
 
@@ -90,7 +97,7 @@ class SavedPoints:
 
     def read(self) -> Points:
         """(M, d) meters."""
-        return self.rows * self.step_m
+        return self.rows.astype(np.float64) * self.step_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +240,7 @@ def _points(path: Path, index: _Index) -> NDArray[np.int16]:
     wanted = index.points * index.dimension * _NUMBER.itemsize
     size = path.stat().st_size if path.is_file() else 0
     if size != wanted:
-        raise InputError(f"{path}: has {counted(size, 'byte')} of {wanted:,}; the map is damaged, run the log again")
+        raise InputError(f"{path}: has {counted(size, 'byte')} of {wanted:,}; run the log again")
     if not index.points:
         return np.empty((0, index.dimension), np.int16)
     return np.memmap(path, _NUMBER, "r", shape=(index.points, index.dimension))

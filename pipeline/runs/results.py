@@ -82,16 +82,12 @@ def _write_saved_map(path: Path, results: Results) -> None:
     result, graph = results.result, results.result.graph
     chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
     keyframes = [result.keyframes[index] for index in chosen.tolist()]
-    kept = ~graph.is_rejected
-    edges = Edges(
-        graph.edges[kept], graph.measurements[kept], graph.information[kept], graph.is_loop[kept], graph.weight[kept]
-    )
+    edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
+    in_force = edges.where(~graph.is_rejected).among(chosen)
     stamps_ns = result.trajectory.stamps_ns
-    session = Session(results.log.name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
+    session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
-    write_saved_map(
-        path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), edges.among(chosen)
-    )
+    write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
 
 
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
