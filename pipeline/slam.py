@@ -286,17 +286,22 @@ class Slam:
         error = lie.log(lie.between(Z_ij, expected))
         self.waiting_closures += 1
         self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
-        self.joins_segment |= self._joins_segment(closure)
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
+        if self._joins_segment(closure):
+            self._move_segment(closure)
         return replace(closure, chi2_before=float(error @ information @ error))
 
     def _joins_segment(self, closure: Closure) -> bool:
         """True for the first closure of the newest segment to an older one."""
         start = self.closer.segments.starts[-1]
-        joins = self.joined_start < start and closure.target < start <= closure.source
-        if joins:
-            self.joined_start = start
-        return joins
+        return self.joined_start < start and closure.target < start <= closure.source
+
+    def _move_segment(self, closure: Closure) -> None:
+        """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
+        self.joined_start, self.joins_segment = self.closer.segments.starts[-1], True
+        T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
+        T_new_old = T_world_source @ lie.inverse(self.graph.poses[closure.source])
+        self.graph.move(self.joined_start, lie.normalize(T_new_old))
 
     def _optimize_when_due(self) -> GraphState | None:
         """Optimize when closures wait: at once where one joins a segment, soon where it moves the map.

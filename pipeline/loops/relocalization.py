@@ -33,7 +33,7 @@ _BACKOFF = 0.2  # share of the distance searched in vain that is traveled before
 _APART_M = 0.5  # least distance traveled between two searches
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
-_CHANCE = 3.0  # what a search over all poses finds by chance: that much over the root of the number of points more
+_CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
 _RIVAL = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
 _SOURCES, _SUBMAPS = (
@@ -194,7 +194,7 @@ class Relocalizer:
             self._aligned(source, find.moved_to(source, keyframes), anchors, keyframes, T_world)
             for source in sources.tolist()
         ]
-        return tuple(closure for closure in closures if closure is not None)
+        return tuple(sorted((each for each in closures if each is not None), key=_rank, reverse=True))
 
     def _aligned(
         self,
