@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,15 +9,17 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import residual_covariances
-from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.left_out import LeftOut
 
 SIGMA_M = 1.0  # standard deviation of a slip
-_MOST = 20  # largest number of loop edges left out that are looked at
+_FEWEST = 2  # least number of loop edges left out, none near another, that a slip must explain
+_MOST = 100  # largest number of stretches whose information is worked out
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
 _PROBABILITY = 1e-3  # of a slip that begins at an edge
 _LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
+
+
+Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,73 +67,78 @@ def price_of(slip: Slip, odometry: Matrix, information: Matrix) -> float:
     """
     part = information[slip.edges]
     u = directions(part, odometry[slip.edges]) / slip.count
-    own = float(np.einsum("ea,eab,eb->", u, part, u))
-    return float(np.log1p(SIGMA_M**2 * own) - 2.0 * np.log(_PROBABILITY)) + (slip.size_m / SIGMA_M) ** 2
+    return float(_fixed_price(np.einsum("ea,eab,eb->", u, part, u))) + (slip.size_m / SIGMA_M) ** 2
+
+
+def _fixed_price(claimed: Vector) -> Vector:
+    return np.log1p(SIGMA_M**2 * claimed) - 2.0 * np.log(_PROBABILITY)
 
 
 def next_slip(
-    problem: BetweenProblem,
-    measured: Matrix,
-    poses: Matrix,
-    is_loop: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    slips: tuple[Slip, ...],
-    price: float,
+    left_out: LeftOut, measured: Matrix, slips: tuple[Slip, ...], price: float
 ) -> tuple[float, tuple[Slip, ...]]:
     """The fall of the cost by one more slip, or the change of one, to first order, and the slips with it.
 
-    measured : (E, d+1, d+1) as odometry has it
-    With g = Σ JᵀΩu/n, a slip s moves the poses by H⁻¹g s, and the residual e of a loop edge left out by V s. The
-    cost changes by A s² − 2 b s, A = Σ uᵀΩu/n² − gᵀH⁻¹g + 1/σ² and b = Σ uᵀΩe/n, and by what each loop edge,
-    predicted with covariance C, then costs less than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them
-    gives a candidate. Loop edges near each other count as one, for they may share a mistake.
+    measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
+    A slip s changes the cost by A s² − 2 b s, prior included, and by what each loop edge left out then costs less
+    than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them gives a candidate. Stretches are tried in the
+    order of what this is with no information but the prior, as long as that is more than the best.
     """
-    odometry = np.flatnonzero(~is_loop)
-    errors = problem.errors(poses)
-    jacobians = problem.jacobians(poses, errors)
-    sparse = problem.factored(poses, errors, kept)
-    information = problem.information[odometry]
-    u = directions(information, measured[odometry])
-    pull = np.einsum("eab,eb->ea", information, u)
-    moved = np.einsum("eab,ea->eb", jacobians[odometry], pull)
-    claimed, bent = (u * pull).sum(axis=1), (pull * errors[odometry]).sum(axis=1)
-    out = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
-    out = out[:: max(1, -(-len(out) // _MOST))]
-    M = np.asarray(np.linalg.inv(residual_covariances(problem, sparse, jacobians, out)), np.float64)
-    i, j = problem.edges[out].T
-    left_out = errors[out]
+    information = left_out.problem.information[left_out.odometry]
+    u = directions(information, measured)
+    tried = [*slips, *_stretches(len(u), slips)]
+    first, count = np.array([(slip.first, slip.count) for slip in tried]).reshape(-1, 2).T
+
+    def over(each: Matrix) -> Matrix:
+        sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+        return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
+
+    claimed = over((u * (information @ u[..., None])[..., 0]).sum(axis=1)) / count
+    V = over((left_out.shifts @ u[:, None, :, None])[..., 0])
+    M = np.asarray(np.linalg.inv(left_out.covariances), np.float64)
+    e = left_out.errors[left_out.edges]
+    sizes = np.array([slip.size_m for slip in tried])
+    worth = -_fixed_price(claimed)
+    worth[: len(slips)] = 0.0
+
+    def best_size(which: NDArray[np.int64] | slice, A: Vector, b: Vector) -> tuple[Vector, Vector]:
+        """Largest fall of the cost, and the size that has it, of each of these stretches."""
+        v = V[which]
+        vM = np.einsum("sla,lab->slb", v, M)
+        vMv, vMe = (vM * v).sum(axis=2), (vM * e).sum(axis=2)
+        eMe = np.einsum("la,lab,lb->l", e, M, e)
+        gain, size = np.full(len(v), -np.inf), np.zeros(len(v))
+        for s in np.concatenate([b[None] / A, ((b[:, None] - vMe) / (A[:, None] + vMv)).T]):
+            left = price - (eMe + 2.0 * s[:, None] * vMe + s[:, None] ** 2 * vMv)
+            total = 2.0 * b * s - A * s**2 + np.maximum(left, 0.0).sum(axis=1) + worth[which]
+            total[((left > 0.0).sum(axis=1) < _FEWEST) & (worth[which] < 0.0)] = -np.inf
+            size, gain = np.where(total > gain, s, size), np.maximum(gain, total)
+        return gain, size
+
+    none = np.zeros(len(tried))
+    hoped, _ = best_size(slice(None), none + 1.0 / SIGMA_M**2, none)
+    hoped[: len(slips)] = np.inf
     best, most = slips, 0.0
-    for slip in _stretches(len(odometry), slips):
-        n = slip.count
-        whole = np.zeros((len(problem.variable), problem.freedom))
-        begin, end = problem.edges[odometry[slip.edges]].T
-        np.add.at(whole, end, moved[slip.edges] / n)
-        np.add.at(whole, begin, -moved[slip.edges] / n)
-        g = sparse.packing.rows(whole[problem.free])
-        x = sparse.cholesky.solve(g)
-        A = claimed[slip.edges].sum() / n**2 - g @ x + 1.0 / SIGMA_M**2
-        b = bent[slip.edges].sum() / n - slip.size_m / SIGMA_M**2
-        whole[:] = 0.0
-        whole[problem.free] = sparse.packing.spread_rows(x)
-        V = np.einsum("eab,eb->ea", jacobians[out], whole[j] - whole[i])
-        VM = np.einsum("ea,eab->eb", V, M)
-        s = np.append(b / A, (b - (VM * left_out).sum(axis=1)) / (A + (VM * V).sum(axis=1)))
-        left = left_out + s[:, None, None] * V  # (candidates, loop edges, k)
-        explained = np.maximum(price - np.einsum("cea,eab,ceb->ce", left, M, left), 0.0).sum(axis=1)
-        gain = 2.0 * b * s - A * s**2 + explained
-        if slip not in slips:
-            gain -= price_of(slip, measured[odometry], information)
-        which = int(np.argmax(gain))
-        if gain[which] > most:
+    for index in np.argsort(-hoped)[:_MOST]:
+        if not hoped[index] > most:
+            break
+        slip = tried[index]
+        twists = np.zeros((*u.shape, 1))
+        twists[slip.edges, :, 0] = u[slip.edges] / slip.count
+        b, A, _ = left_out.quadratic(twists)
+        prior = 1.0 / SIGMA_M**2
+        (gain,), (size,) = best_size(np.array([index]), A[0] + prior, b - prior * sizes[index])
+        if gain > most:
             others = tuple(each for each in slips if each is not slip)
-            best, most = (*others, replace(slip, size_m=slip.size_m + float(s[which]))), float(gain[which])
+            best, most = (*others, replace(slip, size_m=slip.size_m + float(size))), float(gain)
     return most, best
 
 
-def _stretches(count: int, slips: tuple[Slip, ...]) -> Iterator[Slip]:
-    """Slips known already, and stretches of every length that overlap none of them, each half beside the last."""
-    yield from slips
-    for length in _LENGTHS:
-        for first in range(0, count - length + 1, max(1, length // 2)):
-            if all(first >= slip.first + slip.count or slip.first >= first + length for slip in slips):
-                yield Slip(first, length)
+def _stretches(count: int, slips: tuple[Slip, ...]) -> list[Slip]:
+    """Stretches of every length that overlap none of the slips, each half beside the last."""
+    return [
+        Slip(first, length)
+        for length in _LENGTHS
+        for first in range(0, count - length + 1, length // 2)
+        if all(first >= slip.first + slip.count or slip.first >= first + length for slip in slips)
+    ]
