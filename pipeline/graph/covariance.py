@@ -53,6 +53,18 @@ def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
     return moved[j] - moved[i]
 
 
+def inverse_blocks(problem: BetweenProblem) -> Matrix:
+    """Blocks (…, k, k) of H⁻¹ where H may be nonzero, and a last one of zeros, found by −1, of the fixed poses."""
+    blocks = problem.packing.blocks(problem.cholesky.inverse_blocks())
+    return np.concatenate([blocks, np.zeros((1, *blocks.shape[1:]))])
+
+
+def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
+    """Cov(ξ_j − ξ_i), (E, k, k), of the left twists of the ends of every edge, of these ``inverse_blocks``."""
+    i, j, pair = problem.slots.T
+    return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
+
+
 def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
     """Errors (count, K, d) of all positions, drawn from their joint distribution; those of fixed poses are zero.
 

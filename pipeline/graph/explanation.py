@@ -77,7 +77,8 @@ def corrections(
 ) -> list[str]:
     """Corrections of odometry in words, a line each.
 
-    edges : (O, 2) those of odometry, in the order of the poses; names (K,), noun : numbers of the poses for the reader, and what they number
+    edges : (O, 2) those of odometry, in the order of the poses
+    names (K,), noun : numbers of the poses for the reader, and what they number
     """
     lines = []
     if explanation.drift.any():
@@ -113,7 +114,7 @@ class Explainer:
         config: GraphConfig,
         rejection: OutlierRejection,
     ) -> None:
-        """problem_of : the problem under an explanation; measured, information : of all edges, as they were added."""
+        """problem_of : the problem under an explanation; measured, information : of all edges, as added."""
         self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
         self._measured, self._information = measured, information
         self._rejection: OutlierRejection = rejection

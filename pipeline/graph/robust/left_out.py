@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import responses
+from scanchain.graph.covariance import edge_covariances, inverse_blocks, responses
 from scanchain.graph.robust.groups import apart
 
 _MOST = 30  # largest number of loop edges that are looked at
@@ -25,6 +25,7 @@ class LeftOut:
     edges : (L,) these loop edges; odometry : (O,) the edges of odometry in the order of the poses
     errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
     covariances : (L, k, k) of their residuals, by their own noise and the graph without them
+    predicted : (O, k, k) covariances of what the graph predicts of odometry
     shifts : (O, L, k, k) ∂e of each by a right twist on the measurement of each odometry edge
     """
 
@@ -35,6 +36,7 @@ class LeftOut:
     errors: Matrix
     jacobians: Matrix
     covariances: Matrix
+    predicted: Matrix
     shifts: Matrix
 
     @classmethod
@@ -50,7 +52,9 @@ class LeftOut:
         jacobians = problem.jacobians(poses, errors)
         factored = problem.factored(poses, errors, kept)
         covariances = np.linalg.pinv(problem.information[edges], hermitian=True)
-        pull = np.swapaxes(jacobians[odometry], 1, 2) @ problem.information[odometry]
+        joint = edge_covariances(factored, inverse_blocks(factored))[np.cumsum(kept)[odometry] - 1]
+        J = jacobians[odometry]
+        pull = np.swapaxes(J, 1, 2) @ problem.information[odometry]
         shifts = np.empty((len(odometry), len(edges), *covariances.shape[1:]))
         begin, end = problem.edges[odometry].T
         for place, edge in enumerate(edges):
@@ -58,10 +62,20 @@ class LeftOut:
             moved = responses(factored, i, j)
             covariances[place] += jacobians[edge] @ (moved[j] - moved[i]) @ jacobians[edge].T
             shifts[:, place] = jacobians[edge] @ np.swapaxes(moved[end] - moved[begin], 1, 2) @ pull
-        return cls(problem, factored, edges, odometry, errors, jacobians, covariances, shifts)
+        return cls(
+            problem,
+            factored,
+            edges,
+            odometry,
+            errors,
+            jacobians,
+            covariances,
+            J @ joint @ np.swapaxes(J, 1, 2),
+            shifts,
+        )
 
     def quadratic(self, twists: Matrix) -> tuple[NDArray[np.float64], Matrix, Matrix]:
-        """b (p,), A (p, p) and V (L, k, p) of right twists τ (O, k, p) on the measurements of odometry.
+        """Slope b (p,), curvature A (p, p), and V (L, k, p) of right twists τ (O, k, p) on the odometry.
 
         With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ and these edges' residuals by V δ; the cost of the kept
         edges changes by δᵀAδ − 2 bᵀδ, where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.

@@ -12,7 +12,6 @@ from scanchain.data import Matrix
 from scanchain.graph.robust.left_out import LeftOut
 
 SIGMA_M = 1.0  # standard deviation of a slip
-_FEWEST = 2  # least number of loop edges left out, none near another, that a slip must explain
 _MOST = 100  # largest number of stretches whose information is worked out
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
 _PROBABILITY = 1e-3  # of a slip that begins at an edge
@@ -81,57 +80,72 @@ def next_slip(
 
     measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
     A slip s changes the cost by A s² − 2 b s, prior included, and by what each loop edge left out then costs less
-    than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them gives a candidate. Stretches are tried in the
-    order of what this is with no information but the prior, as long as that is more than the best.
+    than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them gives a candidate. A takes a solve, so that
+    stretches are tried in the order of an estimate: along a chain whose ends are well known, the information on a
+    slip of all edges is what they claim, that on a slip of one the share of its redundancy; these add up to one.
     """
-    information = left_out.problem.information[left_out.odometry]
-    u = directions(information, measured)
+    u = directions(left_out.problem.information[left_out.odometry], measured)
     tried = [*slips, *_stretches(len(u), slips)]
-    first, count = np.array([(slip.first, slip.count) for slip in tried]).reshape(-1, 2).T
-
-    def over(each: Matrix) -> Matrix:
-        sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
-        return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
-
-    claimed = over((u * (information @ u[..., None])[..., 0]).sum(axis=1)) / count
-    V = over((left_out.shifts @ u[:, None, :, None])[..., 0])
-    M = np.asarray(np.linalg.inv(left_out.covariances), np.float64)
-    e = left_out.errors[left_out.edges]
+    own, redundancy, bent, V = (_means(each, tried) for each in _edge_by_edge(left_out, u))
+    count = np.array([slip.count for slip in tried])
+    claimed = own / count
     sizes = np.array([slip.size_m for slip in tried])
-    worth = -_fixed_price(claimed)
+    worth, prior = -_fixed_price(claimed), SIGMA_M**-2.0
     worth[: len(slips)] = 0.0
-
-    def best_size(which: NDArray[np.int64] | slice, A: Vector, b: Vector) -> tuple[Vector, Vector]:
-        """Largest fall of the cost, and the size that has it, of each of these stretches."""
-        v = V[which]
-        vM = np.einsum("sla,lab->slb", v, M)
-        vMv, vMe = (vM * v).sum(axis=2), (vM * e).sum(axis=2)
-        eMe = np.einsum("la,lab,lb->l", e, M, e)
-        gain, size = np.full(len(v), -np.inf), np.zeros(len(v))
-        for s in np.concatenate([b[None] / A, ((b[:, None] - vMe) / (A[:, None] + vMv)).T]):
-            left = price - (eMe + 2.0 * s[:, None] * vMe + s[:, None] ** 2 * vMv)
-            total = 2.0 * b * s - A * s**2 + np.maximum(left, 0.0).sum(axis=1) + worth[which]
-            total[((left > 0.0).sum(axis=1) < _FEWEST) & (worth[which] < 0.0)] = -np.inf
-            size, gain = np.where(total > gain, s, size), np.maximum(gain, total)
-        return gain, size
-
-    none = np.zeros(len(tried))
-    hoped, _ = best_size(slice(None), none + 1.0 / SIGMA_M**2, none)
+    information = prior + np.minimum(redundancy * count, 1.0) * claimed
+    hoped, _ = _largest_falls(left_out, V, information, bent - prior * sizes, worth, price)
     hoped[: len(slips)] = np.inf
     best, most = slips, 0.0
-    for index in np.argsort(-hoped)[:_MOST]:
+    for index in np.argsort(-hoped, kind="stable")[:_MOST]:
         if not hoped[index] > most:
             break
-        slip = tried[index]
+        slip, one = tried[index], slice(index, index + 1)
         twists = np.zeros((*u.shape, 1))
         twists[slip.edges, :, 0] = u[slip.edges] / slip.count
         b, A, _ = left_out.quadratic(twists)
-        prior = 1.0 / SIGMA_M**2
-        (gain,), (size,) = best_size(np.array([index]), A[0] + prior, b - prior * sizes[index])
+        falls = _largest_falls(left_out, V[one], prior + A[0], b - prior * sizes[one], worth[one], price)
+        gain, size_m = float(falls[0][0]), float(falls[1][0])
         if gain > most:
             others = tuple(each for each in slips if each is not slip)
-            best, most = (*others, replace(slip, size_m=slip.size_m + float(size))), float(gain)
+            best, most = (*others, replace(slip, size_m=slip.size_m + size_m)), gain
     return most, best
+
+
+def _edge_by_edge(left_out: LeftOut, u: Matrix) -> tuple[Vector, Vector, Vector, Matrix]:
+    """Of each edge along its twist u (O, k): uᵀΩu (O,), redundancy (O,), uᵀΩe (O,), and ∂e of the loop edges."""
+    pull = (left_out.problem.information[left_out.odometry] @ u[..., None])[..., 0]
+    own = (u * pull).sum(axis=1)
+    known = (pull * (left_out.predicted @ pull[..., None])[..., 0]).sum(axis=1)
+    redundancy = 1.0 - known / np.maximum(own, np.finfo(np.float64).tiny)
+    bent = (pull * left_out.errors[left_out.odometry]).sum(axis=1)
+    return own, redundancy, bent, (left_out.shifts @ u[:, None, :, None])[..., 0]
+
+
+def _means(each: Matrix, stretches: list[Slip]) -> Matrix:
+    """Mean (S, ...) over the edges of each stretch, of values (O, ...)."""
+    sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    first, count = np.array([(slip.first, slip.count) for slip in stretches], np.int64).reshape(-1, 2).T
+    return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
+
+
+def _largest_falls(
+    left_out: LeftOut, V: Matrix, A: Vector, b: Vector, worth: Vector, price: float
+) -> tuple[Vector, Vector]:
+    """Largest fall of the cost by each stretch (S,), and the change of its slip that does it.
+
+    worth : (S,) minus the price of a new slip, which must explain a loop edge; 0 for one that is there
+    """
+    e, M = left_out.errors[left_out.edges], np.linalg.inv(left_out.covariances)
+    VM = np.einsum("sla,lab->slb", V, M)
+    VMV, VMe = (VM * V).sum(axis=2), (VM * e).sum(axis=2)
+    eMe = np.einsum("la,lab,lb->l", e, M, e)
+    fall, size_m = np.full(len(V), -np.inf), np.zeros(len(V))
+    for s in np.concatenate([b[None] / A, ((b[:, None] - VMe) / (A[:, None] + VMV)).T]):
+        explained = np.maximum(price - (eMe + 2.0 * s[:, None] * VMe + s[:, None] ** 2 * VMV), 0.0)
+        total = 2.0 * b * s - A * s**2 + explained.sum(axis=1) + worth
+        total[(worth < 0.0) & ~explained.any(axis=1)] = -np.inf
+        fall, size_m = np.maximum(fall, total), np.where(total > fall, s, size_m)
+    return fall, size_m
 
 
 def _stretches(count: int, slips: tuple[Slip, ...]) -> list[Slip]:
