@@ -14,6 +14,7 @@ from scanchain.graph.robust.left_out import LeftOut
 SIGMA_M = 1.0  # standard deviation of a slip
 _MOST = 100  # largest number of stretches whose information is worked out
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
+_MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
 _PROBABILITY = 1e-3  # of a slip that begins at an edge
 _LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
 
@@ -36,15 +37,20 @@ class Slip:
 
 
 def directions(information: Matrix, measurements: Matrix) -> Matrix:
-    """Twist (E, k) along which each edge may slip: its weakest translation, or its motion where none is weak."""
+    """Twist (E, k) along which each edge may slip: its weakest translation, or its motion where none is weak.
+
+    Zero where the motion is no longer than its noise: its direction is then that of the noise, which a slip would
+    seem to explain.
+    """
     d = measurements.shape[-1] - 1
     values, vectors = np.linalg.eigh(information[:, :d, :d])
     motion = measurements[:, :d, d]
     length = np.linalg.norm(motion, axis=1, keepdims=True)
     is_even = (values[:, :1] * _WEAKER > values[:, -1:]) & (length > 0.0)
     weakest = vectors[:, :, 0] * np.where((vectors[:, :, 0] * motion).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+    moves = np.einsum("ea,eab,eb->e", motion, information[:, :d, :d], motion) > _MOVES**2
     result = np.zeros(information.shape[:2])
-    result[:, :d] = np.where(is_even, motion / np.maximum(length, 1e-12), weakest)
+    result[:, :d] = moves[:, None] * np.where(is_even, motion / np.maximum(length, 1e-12), weakest)
     return result
 
 
