@@ -36,6 +36,7 @@ class LoopCloser:
     def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
         """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
         self.near.of_map = len(keyframes)
+        self.near.submaps.begin_in(keyframes)
         return self.places.begin_in(keyframes)
 
     def start_segment(self, keyframe: int) -> None:

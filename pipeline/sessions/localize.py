@@ -246,10 +246,13 @@ def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> t
         return Reliability.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
-    if not parts:
-        return Reliability.TRUSTWORTHY, f"{where}, and followed in it over {tried}"
-    largest = sorted(parts, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
-    more = len(parts) - len(largest)
+    doubtful = [part for part in parts if part.kind != MapState.WITHOUT_MAP]
+    outside = int((found.states == MapState.WITHOUT_MAP).sum())
+    if not doubtful:
+        share = f", {100.0 * outside / scans:.0f} % of them outside the map" if outside else ""
+        return Reliability.TRUSTWORTHY, f"{where}, and followed over {tried}{share}"
+    largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
+    more = len(doubtful) - len(largest)
     listed = "; ".join(part.text for part in largest) + (f"; and {more:,} more" if more else "")
     return Reliability.CHECK, f"{where}; {listed}"
 
