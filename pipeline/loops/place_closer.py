@@ -162,9 +162,7 @@ class PlaceCloser:
         target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
         return self.submap_verifier.verify(source, target, T_first)
 
-    def _problem(
-        self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None
-    ) -> str:
+    def _problem(self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None) -> str:
         """Reason why an aligned candidate is no closure, empty if it is one.
 
         graph : None between unconnected keyframes, where the distance that odometry has them apart means nothing

@@ -93,7 +93,9 @@ class FrontEnd:
         """Information with the doubt added to the covariance."""
         if not self.doubt.any():
             return information
-        return np.asarray(np.linalg.solve(np.eye(len(information)) + information @ self.doubt, information), np.float64)
+        return np.asarray(
+            np.linalg.solve(np.eye(len(information)) + information @ self.doubt, information), np.float64
+        )
 
     def _moved_enough(self, tracked: Tracked) -> bool:
         distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)
@@ -105,10 +107,11 @@ def _doubt_of(tracked: Tracked) -> Matrix:
     """Covariance (k, k) that a scan adds to the motion where its correspondences contradict the pose.
 
     Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans are
-    aligned to holds this one, so that they inherit its error.
+    aligned to holds this one, so that they inherit its error. In the plane most of the poses that so few correspondences
+    contradict are right, and doubt would let drift gather there.
     """
     prior, match = tracked.prior, tracked.match
-    if tracked.state is State.LOST or match.fit >= LEAST_FIT:
+    if len(prior.covariance) == 3 or tracked.state is State.LOST or match.fit >= LEAST_FIT:
         return np.zeros_like(prior.covariance)
     innovation = lie.log(lie.between(prior.T_target_source, match.T_target_source))
     return prior.covariance + np.outer(innovation, innovation)
