@@ -106,9 +106,9 @@ class FrontEnd:
 def _doubt_of(tracked: Tracked) -> Matrix:
     """Covariance (k, k) that a scan adds to the motion where its correspondences contradict the pose.
 
-    Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans are
-    aligned to holds this one, so that they inherit its error. In the plane most of the poses that so few correspondences
-    contradict are right, and doubt would let drift gather there.
+    Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans
+    are aligned to holds this one, so that they inherit its error. In the plane most of the poses that so few
+    correspondences contradict are right, and doubt would let drift gather there.
     """
     prior, match = tracked.prior, tracked.match
     if len(prior.covariance) == 3 or tracked.state is State.LOST or match.fit >= LEAST_FIT:
