@@ -239,6 +239,22 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
     assert (without > 1e4).all()  # what came before the first reading is unknown up to the next keyframe
 
 
+@pytest.mark.parametrize("is_measured", [True, False])
+def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predicted(is_measured):
+    front_end = FrontEnd(configured(3, {"odometry.keyframe_distance_m": 100.0}), np.eye(4))
+    off, nothing, told = np.array([0.0, 0.4, 0.0, 0.0, 0.0, 0.1]), np.empty((0, 3)), []
+    for fit in (1.0, 1.0, 0.5, 1.0):
+        T = lie.lift(lie.pose_2d(0.1 * len(told), 0.0, 0.0))
+        prior = Prior(T @ lie.exp(off), 1e-4 * np.eye(6), np.ones(6), is_measured)
+        match = replace(first_match(T, nothing, configured(3).matching), information=1e6 * np.eye(6), fit=fit)
+        tracked = Tracked(None, nothing, nothing, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
+        front_end.odometry.process = lambda scan, tracked=tracked: tracked
+        told.append(np.linalg.inv(front_end.locate(None).information))
+    sigmas = np.sqrt(np.diagonal(told, axis1=1, axis2=2))
+    assert np.all(sigmas[:2] <= 1e-3 * (1.0 + 1e-9))
+    assert np.allclose(sigmas[2:], np.hypot(np.abs(off), 0.01), atol=0.02) and sigmas[3, 0] > 0.009
+
+
 SEES_ACROSS, NOTHING = np.diag([0.0, 1e6, 1e6]), np.empty((0, 2))
 
 
