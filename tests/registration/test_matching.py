@@ -128,6 +128,29 @@ def test_the_information_predicts_the_spread_of_repeated_matches(dimension):
     assert (0.5 if dimension == 2 else 0.1) < np.mean(squares) / k < 2.0
 
 
+def test_a_smooth_floor_between_rough_walls_holds_height_and_tilt_as_its_own_residuals_say():
+    rng = np.random.default_rng(4)
+
+    def room(count):
+        points = rng.uniform([-8, -8, 0], [8, 8, 6], (count, 3))
+        side = rng.integers(0, 3, count)
+        rows = np.arange(count)
+        points[rows, side] = np.where(side == 2, 0.0, np.sign(points[rows, side]) * 8.0)
+        points[rows, side] += rng.normal(size=count) * np.where(side == 2, 0.003, 0.06)
+        return points - np.array([0.0, 0.0, 2.0])
+
+    target = VoxelMap(3, LocalMapConfig(voxel_size_m=1.0))
+    target.insert(room(60_000), lie.identity(3))
+    matcher = create_matcher(MatchingConfig())
+    matches = [matcher.align(room(2_000), target, lie.identity(3)) for _ in range(40)]
+    errors = np.array([lie.log(match.T_target_source) for match in matches])
+    covariances = np.array([np.linalg.inv(match.information) for match in matches])
+    squares = ((errors - errors.mean(axis=0)) ** 2).mean(axis=0) / np.diagonal(covariances, axis1=1, axis2=2).mean(
+        axis=0
+    )
+    assert ((squares > 0.2) & (squares < 3.0)).all(), squares
+
+
 def test_a_corridor_is_reported_as_degenerate_along_its_axis():
     rng = np.random.default_rng(0)
     x = rng.uniform(-10, 10, 4000)

@@ -29,7 +29,9 @@ from scanchain.kernels.registration.observability import (
     weak_prior,
     worst,
 )
+from scanchain.kernels.registration.residuals import gradient_spread
 
+_POOLED = 0.02  # weight of the variance that all residuals have in common against that of each surface
 _SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
 
@@ -93,6 +95,7 @@ def match(voxels, points, T_first, expected, settings):
             for j in range(k):
                 prior[i, j] += remapped[i, j]
         T = T_first.copy()
+    spread = _spread(problem, T, fit)
     last = fit
     if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
         last = fit_at(problem, T, fit)
@@ -100,7 +103,7 @@ def match(voxels, points, T_first, expected, settings):
         add_signals(problem, T, spectrum)
     if is_fused:
         remove_noise(spectrum, fit.H, fit.total_weight, settings)
-    return _result(problem, T, T_first, fit, last, spectrum, range_m)
+    return _result(problem, T, T_first, fit, last, spectrum, range_m, spread)
 
 
 @njit(cache=True, nogil=True)
@@ -116,20 +119,20 @@ def assess(voxels, points, T, fit, settings):
     last = fit_at(problem, T, fit)
     spectrum = spectrum_of(last.H, last.total_weight, range_m)
     add_signals(problem, T, spectrum)
-    return _result(problem, T, T, fit, last, spectrum, range_m)
+    return _result(problem, T, T, fit, last, spectrum, range_m, np.zeros((0, 0)))
 
 
 @njit(cache=True, nogil=True)
-def _result(problem, T, T_first, fit, last, spectrum, range_m: float):
+def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
     """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
 
-    The variance of a residual is that of the fit, or the sensor's where the fit is closer than that.
+    spread : (k, k) covariance of the gradient, empty to have one variance for all residuals
     """
     m = worst(spectrum)
-    residual_m = _residual_of(fit)
-    information, direction = seen_from_source(
-        T, T_first, fit.H, spectrum.vectors[:, m], max(problem.settings.variance, residual_m**2)
-    )
+    H, variance = fit.H, _variance(problem, fit)
+    if len(spread):
+        H, variance = congruent(H, definite_inverse(spread)), 1.0
+    information, direction = seen_from_source(T, T_first, H, spectrum.vectors[:, m], variance)
     on_surfaces = 0
     for i in range(problem.weight.shape[0]):
         on_surfaces += problem.weight[i] > 0.0
@@ -148,6 +151,36 @@ def _result(problem, T, T_first, fit, last, spectrum, range_m: float):
         fit.iterations,
         fit.ending if last.pairs else NO_CORRESPONDENCES,
     )
+
+
+@njit(cache=True, nogil=True)
+def _spread(problem, T, fit):
+    """Covariance (6, 6) of the gradient at T, by which each surface errs as its residuals say; empty in the plane.
+
+    The variance of all residuals counts for a part as well: few surfaces fit by chance.
+    """
+    if fit.H.shape[0] == 3:
+        return np.zeros((0, 0))
+    spread = gradient_spread(
+        problem.voxels,
+        problem.points,
+        T,
+        problem.origin,
+        problem.correspondence,
+        problem.weight,
+        problem.settings.scale_m,
+    )
+    variance = _variance(problem, fit)
+    for i in range(6):
+        for j in range(6):
+            spread[i, j] += _POOLED * variance * fit.H[i, j]
+    return spread
+
+
+@njit(cache=True, nogil=True)
+def _variance(problem, fit) -> float:
+    """Variance of a residual, by the fit, or the sensor's where the fit is closer than that; m²."""
+    return max(problem.settings.variance, _residual_of(fit) ** 2)
 
 
 @njit(cache=True, nogil=True)

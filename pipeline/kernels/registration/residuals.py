@@ -5,6 +5,8 @@ from numba import njit
 
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, SHAPE, move
 
+_SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)
+
 
 @njit(cache=True, nogil=True)
 def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H, b):
@@ -71,6 +73,41 @@ def information(voxels, points, T, origin, correspondence, weight, scale_m: floa
         _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, planar)
     _mirror(H)
     _mirror(unweighted)
+
+
+@njit(cache=True, nogil=True)
+def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: float):
+    """Covariance (6, 6) of b in ``normal_equations``, by how b differs from voxel to voxel: Σ b_v b_vᵀ.
+
+    Points with a correspondence in one voxel share the error of its plane, so that only their sums b_v are
+    independent (cluster-robust covariance; Liang & Zeger 1986). Smooth floors then say more than rough walls.
+    """
+    size = 64
+    while size < 2 * points.shape[0]:
+        size *= 2
+    slots, sums = np.full(size, -1, np.int32), np.zeros((size, 6))
+    H, s2 = np.zeros((6, 6)), scale_m * scale_m
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0 or weight[i] == 0.0:
+            continue
+        slot = (voxel * _SCATTER) & (size - 1)
+        while slots[slot] >= 0 and slots[slot] != voxel:
+            slot = (slot + 1) & (size - 1)
+        slots[slot] = voxel
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        _add(H, sums[slot], weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, False)
+    spread = np.zeros((6, 6))
+    for slot in range(size):
+        if slots[slot] >= 0:
+            for m in range(6):
+                for n in range(6):
+                    spread[m, n] += sums[slot, m] * sums[slot, n]
+    return spread
 
 
 @njit(cache=True, nogil=True)
