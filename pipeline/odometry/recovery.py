@@ -67,7 +67,9 @@ class Recovery:
                 tried.append(other)
                 if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
-        best, rival = self._decided(best, tried, surfaces, prediction)
+        rival = None
+        if prediction.is_guess:
+            best, rival = self._decided(best, tried, surfaces, prediction)
         if surfaces.dimension == 2 or _is_sound(best):
             cost = best.cost / len(points)
             self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
@@ -142,7 +144,7 @@ class Recovery:
         distinct = [
             match
             for match in tried
-            if self._fit_cost(match, prediction) < AMBIGUOUS * self._fit_cost(best, prediction)
+            if match.cost < AMBIGUOUS * best.cost
             and match.inlier_share >= self.config.min_inlier_share
             and _is_sound(match)
             and not _is_near(match.T_target_source, best.T_target_source, surfaces.voxels.size_m)
@@ -153,10 +155,6 @@ class Recovery:
         if _away(rival, prediction) < _away(best, prediction):
             best, rival = rival, best
         return Aligned(best, lie.log(lie.between(best.T_target_source, rival.T_target_source)))
-
-    def _fit_cost(self, match: Match, prediction: Prediction) -> float:
-        """Cost by which poses are alike, m²: after a gap no motion is likelier than another."""
-        return match.cost if prediction.is_guess else self._cost(match, prediction)
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""
@@ -189,6 +187,8 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     half_width_m, half_width_rad = prediction.window()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
-    window = Window(half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, _SEEDS)
+    window = Window(
+        half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, _SEEDS if prediction.is_guess else 1
+    )
     seeds = CorrelativeMap(surfaces, T_predicted, reach_m).search(points, T_predicted, window)
     return (*alternatives, *(lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist()))
