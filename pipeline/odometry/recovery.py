@@ -25,6 +25,7 @@ _UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradi
 _CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
 _SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
 _SEEDS = 3  # number of poses from the bird's-eye search that are aligned
+_LONG_S = 1.0  # shortest gap after which a robot may have turned around
 _SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of those of the search in the plane: distance, share of the best score
 _NEAR_PERCENT = 95.0  # share of the points within the radius of the bird's-eye image
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
@@ -68,7 +69,7 @@ class Recovery:
                 if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
         rival = None
-        if prediction.is_guess:
+        if _is_free(prediction):
             best, rival = self._decided(best, tried, surfaces, prediction)
         if surfaces.dimension == 2 or _is_sound(best):
             cost = best.cost / len(points)
@@ -104,10 +105,12 @@ class Recovery:
         )
 
     def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
-        """True after a gap, or if the cost per point is far above the usual one and not a small one as such."""
+        """True if the cost per point is far above the usual one, and above a share of the greatest possible."""
         if not self.usual_cost:
             return False
-        return prediction.is_guess or cost > max(_UNCERTAIN * self.usual_cost, self.rough_cost)
+        if prediction.is_guess:
+            return cost > self.usual_cost
+        return cost > max(_UNCERTAIN * self.usual_cost, self.rough_cost)
 
     def _searched(
         self,
@@ -161,6 +164,11 @@ class Recovery:
         return match.cost + 0.5 * self.config.sensor_noise_m**2 * _away(match, prediction)
 
 
+def _is_free(prediction: Prediction) -> bool:
+    """True after a gap so long that any motion within the search window is possible, not after uneven stamps."""
+    return prediction.is_guess and prediction.interval_s > _LONG_S
+
+
 def _away(match: Match, prediction: Prediction) -> float:
     """Squared distance from the predicted pose, in the largest standard deviations of a prediction."""
     prior = prediction.prior
@@ -187,8 +195,7 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     half_width_m, half_width_rad = prediction.window()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
-    window = Window(
-        half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, _SEEDS if prediction.is_guess else 1
-    )
+    window = Window(half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, answers=2)
     seeds = CorrelativeMap(surfaces, T_predicted, reach_m).search(points, T_predicted, window)
+    seeds = seeds[: 2 if _is_free(prediction) else 1]
     return (*alternatives, *(lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist()))
