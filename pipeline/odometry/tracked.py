@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.config import MatchingConfig, PreprocessConfig
 from scanchain.data import Match, Points, Pose, Prior, Scan, State
 from scanchain.odometry.prediction import Prediction
-from scanchain.registration import with_source_frame
+from scanchain.registration import as_ambiguous, with_source_frame
 
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
 
@@ -90,6 +90,14 @@ def blurred(match: Match, error: NDArray[np.float64]) -> Match:
     return replace(
         match, information=match.information @ np.linalg.inv(np.eye(len(blur)) + blur @ match.information)
     )
+
+
+def spread(match: Match, rival: NDArray[np.float64]) -> Match:
+    """The same match with a covariance that covers another pose, a twist (k,) away, that fits as well."""
+    Omega_rival = match.information @ rival
+    information = match.information - np.outer(Omega_rival, Omega_rival) / (1.0 + rival @ Omega_rival)
+    T_rival = match.T_target_source @ lie.exp(rival)
+    return as_ambiguous(replace(match, information=information), *lie.apart(match.T_target_source, T_rival))
 
 
 def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:

@@ -1,6 +1,7 @@
 """Odometry and the whole chain on simulated drives with exact truth, and on the real logs' published bars."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -170,6 +171,36 @@ def test_a_gap_is_bridged_at_constant_velocity(town):
     kept = [scan for scan in scans if not 40 <= scan.index < 52]
     steps = tracked(kept, T_base_lidar, configured(3, {"odometry.prior": "constant-velocity"}))
     assert ate_m(trajectory(steps), truth) < 0.05
+
+
+@pytest.mark.parametrize(("niche_m", "state"), [(0.0, State.DEGENERATE), (3.0, State.OK)])
+def test_after_a_gap_a_room_that_looks_the_same_turned_around_is_ambiguous(niche_m, state):
+    odometry = Odometry(configured(2, {"odometry.prior": "constant-velocity"}), np.eye(3))
+    for index in range(10):
+        odometry.process(scan_of_room(lie.pose_2d(0.3, 0.2, 0.0), niche_m, index, index * 10**8))
+    T_room_lidar = lie.pose_2d(0.5, -0.3, 1.2)
+    step = odometry.process(scan_of_room(T_room_lidar, niche_m, 10, 29 * 10**8))
+    T_turned_lidar = lie.pose_2d(0.0, 0.0, np.pi) @ T_room_lidar
+    poses = [lie.between(lie.pose_2d(0.3, 0.2, 0.0), T) for T in (T_room_lidar, T_turned_lidar)]
+    away_m, other_m = (lie.apart(step.T_odom_lidar, T)[0] for T in poses)
+    assert step.state is state
+    assert min(away_m, other_m) < 0.02
+    if state is State.DEGENERATE:
+        assert step.reason.startswith("ambiguous: a pose 1.2 m away, turned by 3.14 rad")
+        assert np.linalg.inv(step.match.information)[2, 2] > 3.1**2
+    else:
+        assert away_m < 0.02
+
+
+def scan_of_room(T_room_lidar, niche_m, index, stamp_ns):
+    """A scan of the walls of a room of 10 m by 6 m, which have a niche or none."""
+    corners = [[5, 3], [-5, 3], [-5, -3], [5, -3], [5, 0], [5 + niche_m, 0], [5 + niche_m, 2], [5, 2], [5, 3]]
+    wall = np.array(corners, np.float64)
+    along = np.linspace(0.0, 1.0, 100)[:, None]
+    points = np.concatenate([a + along * (b - a) for a, b in pairwise(wall)])
+    points += 0.005 * np.random.default_rng(index).normal(size=points.shape)
+    seen = lie.transform(lie.inverse(T_room_lidar), points).astype(np.float32)
+    return Scan(index, stamp_ns, stamp_ns, seen, np.empty(0, np.float32), 0, None)
 
 
 @pytest.mark.parametrize("odd_ns", [0, 1_000, -3_600_000_000_000])
