@@ -231,7 +231,7 @@ class Odometry:
         """A scan that was aligned as seen from its middle, as seen from its stamp.
 
         The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
-        changes at the rate of the last two motions, an error of which is no larger; in translation that would be noise.
+        changes at the rate of the last two motions, with an error as large; in translation that would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.interval_s <= 0.0:
             return tracked
