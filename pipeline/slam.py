@@ -106,6 +106,7 @@ class Slam:
         self.lost_scans = 0
         self.optimized_at = 0
         self.first = 0  # number of the first keyframe of this log
+        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
         if prior is not None:
@@ -267,8 +268,10 @@ class Slam:
     def _close_loops(self) -> tuple[Closure, ...]:
         closures = self._take(self.closer.close(self.keyframes, self.graph))
         for closure in closures if self.first else ():
-            if closure.verdict is Verdict.ACCEPTED and closure.target < self.first:
-                self.T_world_odom = self.by_map(closure)
+            is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
+            if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
+                self.by_map = closure
+                self.T_world_odom = self._by_map(closure)
         return closures
 
     def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
@@ -280,7 +283,7 @@ class Slam:
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
         self._optimize("gnc")
 
-    def by_map(self, closure: Closure) -> Pose:
+    def _by_map(self, closure: Closure) -> Pose:
         """T_world_odom by a closure with a keyframe of the map."""
         T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
         return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))

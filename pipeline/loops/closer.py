@@ -96,7 +96,9 @@ class ProximityCloser:
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
         T_first = lie.between(T_world[target], T_world[-1])
-        verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
+        verified = self.verifier.verify(
+            keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
+        )
         closure = verified.closure(target, newest)
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)
