@@ -287,9 +287,11 @@ class OutputsConfig(Section, frozen=True, forbid_unknown_fields=True):
     """Files of a run directory beside those that are always there.
 
     mcap : whether ``results.mcap`` is written: poses and maps as ROS 2 messages
+    map : whether the folder ``map`` is written, which other logs are localized in and merged with
     """
 
     mcap: bool = False
+    map: bool = True
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):

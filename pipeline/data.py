@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.errors import InputError
-from scanchain.point_store import StoredPoints
 from scanchain.words import FREEDOM, counted
 
 Pose = NDArray[np.float64]
@@ -182,6 +181,14 @@ class Match:
         return self.at_minimum and self.fit >= LEAST_FIT
 
 
+class KeyframePoints(Protocol):
+    """Points of a keyframe that lie on disk."""
+
+    def read(self) -> Points:
+        """(M, d) meters."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Keyframe:
     """A scan that stands in the pose graph.
@@ -199,7 +206,7 @@ class Keyframe:
     index: int
     scan_index: int
     stamp_ns: int
-    stored: StoredPoints
+    stored: KeyframePoints
     T_odom_lidar: Pose
     traveled_m: float
     scale: float = 1.0

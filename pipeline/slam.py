@@ -31,12 +31,14 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.loops import LoopCloser, refined, spread
+from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
+_ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
@@ -48,6 +50,7 @@ class SlamResult:
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule.
+    ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
     trajectory: Trajectory
@@ -56,6 +59,7 @@ class SlamResult:
     closures: tuple[Closure, ...]
     graph: PoseGraph
     state: GraphState
+    components: NDArray[np.int64]
     elevation_offset_rad: float = 0.0
     calibrated_from: int = 0
 
@@ -75,10 +79,12 @@ class Slam:
         points_file: Path | None = None,
         *,
         dimension: int | None = None,
+        prior: SavedMap | None = None,
     ) -> None:
         """Arguments as in ``Odometry``.
 
         points_file : where points go, which stay out of memory; without one, into a temporary file
+        prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
@@ -99,8 +105,25 @@ class Slam:
         self.moves_map = False
         self.lost_scans = 0
         self.optimized_at = 0
+        self.first = 0  # number of the first keyframe of this log
+        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
+        if prior is not None:
+            self._begin_in(prior)
+
+    def _begin_in(self, prior: SavedMap) -> None:
+        """Take the keyframes of a map, fixed where they are; the log begins somewhere, perhaps in it."""
+        if prior.dimension != self.dimension:
+            raise InputError(
+                f"{prior.folder}: is a {prior.dimension}D map, the log has {self.dimension}D scans; give a map of "
+                "the same kind"
+            )
+        self.keyframes += prior.keyframes
+        self.first = self.optimized_at = len(self.keyframes)
+        for keyframe in self.keyframes:
+            self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
+        self.traveled_m = self.closer.begin_in(self.keyframes)
 
     def track(
         self,
@@ -158,7 +181,7 @@ class Slam:
         Raises InputError without a scan, and when called again.
         """
         self._check_unfinished()
-        if not self.keyframes:
+        if not self.odometry_poses:
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
         if self.config.loops.enabled:
@@ -168,11 +191,13 @@ class Slam:
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
         odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
-        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes])
-        corrected = spread(state.poses, numbers, odometry)
+        numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
+        corrected = spread(state.poses[self.first :], numbers, odometry)
         if self.keeps_scans:
             progress(f"refining {counted(len(odometry), 'scan')}")
-            corrected = refined(corrected, self.spans.rows, self.points, self.keyframes, self.config)
+            fixed, poses = self.keyframes[: self.first], corrected[numbers]
+            world = (fixed, state.poses[: self.first]) if fixed else (self.keyframes, poses)
+            corrected = refined(corrected, self.spans.rows, self.points, *world, self.config)
         return SlamResult(
             trajectory=Trajectory(stamps_ns, corrected),
             odometry=Trajectory(stamps_ns, odometry),
@@ -180,6 +205,7 @@ class Slam:
             closures=tuple(self.closures),
             graph=self.graph,
             state=state,
+            components=self.closer.segments.components(self.graph),
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,
         )
@@ -196,7 +222,8 @@ class Slam:
         self.stamps_ns.append(tracked.scan.stamp_ns)
         self.odometry_poses.append(tracked.T_odom_lidar)
         if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
-            self.keyframes[0] = replace(self.keyframes[0], stored=self.points.add(located.first_points))
+            stored = self.points.add(located.first_points)
+            self.keyframes[self.first] = replace(self.keyframes[self.first], stored=stored)
         self.lost_scans += tracked.state is State.LOST
         if not located.is_keyframe and not self.keeps_scans:
             return -1
@@ -224,8 +251,9 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
-            if tracked.elsewhere_m > 0.0:
-                sigmas = (tracked.elsewhere_m, np.pi)
+            elsewhere_m = tracked.elsewhere_m if keyframe.index > self.first else _ANYWHERE_M
+            if elsewhere_m > 0.0:
+                sigmas = (elsewhere_m, np.pi)
                 self.closer.start_segment(keyframe.index)
             self.graph.add_edge(
                 last.index,
@@ -238,7 +266,33 @@ class Slam:
         return keyframe.index
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        return self._take(self.closer.close(self.keyframes, self.graph))
+        closures = self._take(self.closer.close(self.keyframes, self.graph))
+        for closure in closures if self.first else ():
+            is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
+            if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
+                self.by_map = closure
+                self.T_world_odom = self._by_map(closure)
+        return closures
+
+    def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
+        """Join the first scan of this log to the nearest keyframe of the map: it is at this pose, to m and rad."""
+        positions = self.graph.poses[: self.first, :-1, -1]
+        nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
+        T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
+        information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
+        self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
+        self._optimize("gnc")
+
+    def _by_map(self, closure: Closure) -> Pose:
+        """T_world_odom by a closure with a keyframe of the map."""
+        T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+        return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))
+
+    @property
+    def is_in_map(self) -> bool:
+        """True if a closure in force joins the newest keyframe to the map."""
+        components = self.closer.segments.components(self.graph)
+        return self.first > 0 and bool(components[-1] == components[0])
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
@@ -267,9 +321,9 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = _OPTIMIZE_EVERY
+        enough = 1 if self.first and self.moves_map else _OPTIMIZE_EVERY
         if not self.moves_map:
-            enough = max(enough, _GROWTH * len(self.keyframes))
+            enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:
             return None
         return self._optimize("edges" if self.moves_map else "gnc")

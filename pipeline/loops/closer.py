@@ -33,6 +33,12 @@ class LoopCloser:
         self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
+    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
+        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
+        self.near.of_map = len(keyframes)
+        self.near.submaps.begin_in(keyframes)
+        return self.places.begin_in(keyframes)
+
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
@@ -66,6 +72,7 @@ class ProximityCloser:
         self.verifier = verifier
         self.search = search
         self.drift = Drift(config.drift)
+        self.of_map = 0  # number of the first keyframes that belong to a map
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, connected: NDArray[np.bool_]
@@ -83,11 +90,15 @@ class ProximityCloser:
         near = np.flatnonzero(
             connected[:old] & (distance_m <= np.maximum(uncertainty_m, self.config.min_radius_m))
         )
+        if (near < self.of_map).any():
+            near = near[near < self.of_map]
         if not len(near):
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
         T_first = lie.between(T_world[target], T_world[-1])
-        verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
+        verified = self.verifier.verify(
+            keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
+        )
         closure = verified.closure(target, newest)
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)

@@ -63,6 +63,7 @@ class Drift:
         is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
         lengths = np.where(is_open, self.lengths.rows, np.inf)
         meters = shortest_paths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
+        meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift against each other
         return np.minimum(self.drift * meters, limit_m)
 
     def _measure_new_edges(self, graph: PoseGraph) -> None:

@@ -41,6 +41,18 @@ class PlaceCloser:
         self.next_m = 0.0
         self.last: Closure | None = None
 
+    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
+        """Add the submaps of a map; the path, in meters, from which on all of them are candidates."""
+        if self.recognizer is not None:
+            for anchor in self._anchors(keyframes, finish=True):
+                self.recognizer.add(self._submap(anchor, keyframes))
+                self.added.append(anchor.index)
+        self.examined = len(keyframes)
+        last, limits = keyframes[-1], self.config.loops
+        apart_m = max((RADII_BEHIND + RADII_AHEAD) * self._radius_m(last), limits.min_travel_m)
+        self.next_m = last.traveled_m + 2.0 * apart_m
+        return self.next_m
+
     def close(
         self,
         keyframes: Sequence[Keyframe],

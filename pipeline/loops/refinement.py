@@ -44,14 +44,16 @@ def refined(
     spans: NDArray[np.int64],
     store: PointStore,
     keyframes: Sequence[Keyframe],
+    T_world_keyframes: Matrix,
     config: Config,
 ) -> Matrix:
-    """T_world_lidar (N, 3, 3) of all scans, each aligned once more to the map of all corrected keyframes.
+    """T_world_lidar (N, 3, 3) of all scans, each aligned once more to the map of all keyframes.
 
     In directions that the map does not constrain, the prior of an edge of odometry keeps a pose where it is.
     spans : (N, 2) first row and number of each scan's points in the store
+    keyframes, T_world_keyframes : of the map
     """
-    surfaces, least_share = _map_of(poses, keyframes, config), config.matching.min_inlier_share
+    surfaces, least_share = _map_of(T_world_keyframes, keyframes, config), config.matching.min_inlier_share
     settings = settings_of(config.matching, surfaces, wide=False)
     settings = settings._replace(reach=1, last_reach=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
@@ -76,10 +78,10 @@ def _points_of(spans: NDArray[np.int64], store: PointStore) -> Points:
     return np.concatenate([np.empty((0, 2)), *scans], dtype=np.float64)
 
 
-def _map_of(poses: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
+def _map_of(T_world_keyframes: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
     """All keyframes in a map that forgets nothing."""
     whole = msgspec.structs.replace(config.local_map, max_distance_m=inf, max_insertions=len(keyframes) + 1)
     result = VoxelMap(2, whole)
-    for keyframe in keyframes:
-        result.insert(keyframe.points, poses[keyframe.scan_index])
+    for keyframe, T_world_lidar in zip(keyframes, T_world_keyframes, strict=True):
+        result.insert(keyframe.points, T_world_lidar)
     return result

@@ -7,19 +7,26 @@ from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_reso
 from scanchain.maps.pcd import write_pcd
 from scanchain.maps.ply import read_ply, write_ply
 from scanchain.maps.point_map import PointMap, build_point_map
+from scanchain.maps.saved_map import MAP_FOLDER, Edges, SavedMap, Session, open_saved_map, write_saved_map
 
 __all__ = [
+    "MAP_FOLDER",
+    "Edges",
     "OccupancyGrid",
     "PointMap",
+    "SavedMap",
+    "Session",
     "View",
     "build_point_map",
     "draw_grid",
     "fitting_resolution",
     "moved",
+    "open_saved_map",
     "read_map",
     "read_ply",
     "write_laz",
     "write_map",
     "write_pcd",
     "write_ply",
+    "write_saved_map",
 ]

@@ -92,6 +92,8 @@ class RunDirectory:
         try:
             yield folder
             for file in folder.iterdir():
+                if file.is_dir():
+                    shutil.rmtree(self.path / file.name, ignore_errors=True)
                 file.replace(self.path / file.name)
         finally:
             shutil.rmtree(folder, ignore_errors=True)

@@ -16,7 +16,10 @@ from scanchain.data import Points, Pose
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.maps import (
+    MAP_FOLDER,
+    Edges,
     OccupancyGrid,
+    Session,
     View,
     build_point_map,
     draw_grid,
@@ -26,6 +29,7 @@ from scanchain.maps import (
     write_map,
     write_pcd,
     write_ply,
+    write_saved_map,
 )
 from scanchain.runs.closures import FinalClosure, write_closures
 from scanchain.runs.job import Recorder
@@ -73,6 +77,19 @@ def _write_graph(path: Path, results: Results) -> None:
         write_g2o(rejected_path(path), graph, edges="rejected")
 
 
+def _write_saved_map(path: Path, results: Results) -> None:
+    """The map of the largest piece of the log."""
+    result, graph = results.result, results.result.graph
+    chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
+    keyframes = [result.keyframes[index] for index in chosen.tolist()]
+    edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
+    in_force = edges.where(~graph.is_rejected).among(chosen)
+    stamps_ns = result.trajectory.stamps_ns
+    session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
+    numbers = np.zeros(len(keyframes), np.int64)
+    write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
+
+
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
     Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
     Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
@@ -87,6 +104,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
         lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
     ),
     Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory, r.log.T_base_lidar)),
+    Output(MAP_FOLDER, _write_saved_map, lambda config: config.outputs.map),
     Output(  # after the maps, which it reads
         "results.mcap",
         lambda path, r: write_results_mcap(path, r.log, r.steps, r.result),
