@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-
 if TYPE_CHECKING:
     from typing import Any
 
-    from scanchain.api import compare, downsample, optimize, run
+    from scanchain.api import compare, downsample, merge, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
@@ -45,6 +45,7 @@ _HOMES = {
     "downsample": "api",
     "evaluate": "evaluation.metrics",
     "load_settings": "settings",
+    "merge": "api",
     "open_log": "logs",
     "optimize": "api",
     "read_g2o": "graph.files.g2o",
@@ -66,6 +67,7 @@ _COMPILED = {
     "create_matcher",
     "downsample",
     "evaluate",
+    "merge",
     "run",
     "simulate",
 }
@@ -90,6 +92,7 @@ __all__ = [
     "downsample",
     "evaluate",
     "load_settings",
+    "merge",
     "open_log",
     "optimize",
     "read_g2o",

@@ -21,6 +21,7 @@ from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
+from scanchain.commands.merge import merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
@@ -46,7 +47,7 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config,
+    run, check, batch, merge, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config,
     sequence,
 )  # fmt: skip
 for _command in _COMMANDS:

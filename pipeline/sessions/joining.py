@@ -106,7 +106,9 @@ def join_all(
 
 def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined | None:
     """Both in the frame of the world; None where no closures in force join them."""
-    apart = msgspec.structs.replace(config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0)
+    apart = msgspec.structs.replace(
+        config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0
+    )
     between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
     tried: list[Pose] = []
     for found, T_world_guest in _sought(world, guest, between):
