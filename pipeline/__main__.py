@@ -47,8 +47,8 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, check, batch, merge, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config,
-    sequence,
+    run, check, batch, merge, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks,
+    config, sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)

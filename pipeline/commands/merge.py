@@ -29,10 +29,10 @@ def merge(
 ) -> None:
     """Merge the maps of several runs into one map in one frame.
 
-    RUN is a run directory, or that of an earlier merge; where each began is not known. Loops are closed between
-    the runs and the graph of all of them is optimized and certified. The map is in the frame of the first RUN. Runs
-    that too few closures join to the others are named and stay apart; where no two belong together, the exit code
-    is 1. The order of the others does not matter. DIR is a map like any other: it can be merged further.
+    RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
+    between the runs, and the graph of all of them is optimized and certified. The map is in the frame of the first
+    RUN; the order of the others does not matter. Runs that too few closures join to the others are named and stay
+    apart; where no two belong together, the exit code is 1. DIR is a map like any other: it can be merged further.
 
     \b
     Examples:

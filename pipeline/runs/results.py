@@ -148,10 +148,14 @@ class Posed(Protocol):
     """Keyframes and their final poses, (K, d+1, d+1)."""
 
     @property
-    def keyframes(self) -> Sequence[Keyframe]: ...
+    def keyframes(self) -> Sequence[Keyframe]:
+        """In order."""
+        ...
 
     @property
-    def T_world_keyframes(self) -> Matrix: ...
+    def T_world_keyframes(self) -> Matrix:
+        """Their poses."""
+        ...
 
 
 def cloud_of(result: Posed, config: Config) -> Cloud:

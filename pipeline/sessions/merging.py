@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
@@ -147,7 +146,8 @@ def _opened(job: MergeJob) -> list[SavedMap]:
     for run, saved in zip(job.runs, maps, strict=True):
         if saved.dimension != maps[0].dimension:
             raise InputError(
-                f"{run}: is a {saved.dimension}D map, {job.runs[0]} a {maps[0].dimension}D one; merge maps of one kind"
+                f"{run}: is a {saved.dimension}D map, {job.runs[0]} a {maps[0].dimension}D one; merge maps of one "
+                "kind"
             )
         if not saved.keyframes:
             raise InputError(f"{run}: its map has no keyframe; leave it out")
@@ -157,8 +157,9 @@ def _opened(job: MergeJob) -> list[SavedMap]:
     for run, saved in zip(job.runs, maps, strict=True):
         for session in saved.sessions:
             key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
-            if (other := holders.setdefault(key, run)) is not run:
-                raise InputError(f"{run}: holds the session {session.name} that {other} holds, too; leave one out")
+            if key in holders:
+                raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
+            holders[key] = run
     return maps
 
 

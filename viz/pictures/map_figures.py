@@ -89,6 +89,7 @@ def _above_ground(points: Points) -> Points:
 def draw_points(
     figure: SvgFigure, points: Points, low: Floats, high: Floats, color: str = _POINTS, *, by_height: bool = False
 ) -> None:
+    """Draw points (M, 3) as seen from above, within corners, in one color or by their height."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
