@@ -33,7 +33,7 @@ class MergedMap:
     ----------
     joined : the graph
     T_world_keyframes : (K, d+1, d+1) final poses; in the plane finer than those of the graph
-    sessions : of all maps, with names that differ, in the order in which they joined
+    sessions : of all maps, with names that differ, in the order of time
     session : (K,) number of each keyframe's session
     trajectories : of the sessions; of all scans where a run has them, else of the keyframes
     cloud : the point cloud of all keyframes
@@ -97,6 +97,7 @@ def merged_map(
         poses = T_first_world @ poses
         joined = joined.placed(T_first_world @ joined.poses)
     chosen = [(number, index) for number in joined.maps for index in range(len(maps[number].sessions))]
+    chosen.sort(key=lambda each: maps[each[0]].sessions[each[1]].first_stamp_ns)
     session = np.empty(len(poses), np.int64)
     sessions, trajectories = [], []
     for new, (number, index) in enumerate(chosen):

@@ -63,7 +63,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
 
     Attributes
     ----------
-    sessions : those in the map, in the order in which they joined
+    sessions : those in the map, in the order of time
     apart : those that are not, each with the other sessions of its own place, if any
     closures_tried, closures_in_force : between maps
     chi2, degrees_of_freedom, certified, certificate : of the pose graph
