@@ -3,8 +3,8 @@
 Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
 ATE over all scans of both after rigid alignment. CSAIL is added to the parts of Intel. Eight parts of Intel of
-2,000 scans each are merged; their time is that of their runs together. Runs stay in the cache; what is there is not
-run again, its time is that of then. Prints a Markdown table.
+2,000 scans each are merged; their time is that of their runs together. Runs stay in the cache; what is there is
+not run again, its time is that of then. Prints a Markdown table.
 """
 
 from __future__ import annotations
