@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Verdict
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser
 from scanchain.maps import Edges, SavedMap
 from scanchain.slam import edge_information
@@ -24,6 +26,13 @@ _SAME_M, _SAME_RAD = 2.0, 0.2  # distance within which two of these are the same
 _FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found, and of one session to the next
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
 _MIN_CLOSURES = 3  # least number of keyframes with a closure in force that join two maps
+_MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other map
+_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
+_BINS = 360  # of azimuth, 1°; as fine in elevation
+_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
+_CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
+_RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
+_PIECE_M = 15.0  # path of a piece that is sought by itself
 _MIN_SHARE = 0.3  # least share of these among the keyframes that closures were tried from
 
 
@@ -105,20 +114,28 @@ def join_all(
 
 
 def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined | None:
-    """Both in the frame of the world; None where no closures in force join them."""
+    """Both in the frame of the world; None where too few closures join them, or as many do elsewhere.
+
+    Where most of the guest overlaps the world, there is no elsewhere to be looked for.
+    """
     apart = msgspec.structs.replace(
         config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0
     )
     between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
-    tried: list[Pose] = []
+    old, tried, trials = len(world.keyframes), list[Pose](), list[Joined]()
     for found, T_world_guest in _sought(world, guest, between):
-        if any(_same(T_world_guest, other) for other in tried):
-            continue
-        tried.append(T_world_guest)
-        joined = _Closing(world, guest, found, T_world_guest, between, held).finish()
-        if joined is not None or len(tried) == _MAX_TRIES:
-            return joined
-    return None
+        if len(tried) == _MAX_TRIES:
+            break
+        if not any(_same(T_world_guest, other) for other in tried):
+            tried.append(T_world_guest)
+            trial = _Closing(world, guest, found, T_world_guest, between, held).finish()
+            if trial is not None and _joining(trial, old) > _CLEAR * len(guest.keyframes):
+                return trial
+            trials += [] if trial is None else [trial]
+    trials.sort(key=lambda trial: -_joining(trial, old))
+    if len(trials) > 1 and _joining(trials[1], old) > _RIVAL * _joining(trials[0], old):
+        return None
+    return trials[0] if trials else None
 
 
 def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
@@ -161,21 +178,34 @@ def _body(joined: Joined, held: int) -> int:
 
 
 def _sought(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[Closure, Pose]]:
-    """Closures of the guest's keyframes in the world, without an expected pose, with T_world_guest by each."""
-    closer, keyframes, graph = LoopCloser(config, world.dimension), list(world.keyframes), graph_of(world)
-    begin_m = closer.begin_in(keyframes)
-    closer.start_segment(len(keyframes))
-    for keyframe in _after(guest, len(keyframes), begin_m):
-        keyframes.append(keyframe)
-        graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
-        closures = closer.close(keyframes, graph)
-        if keyframe.index + 1 == len(world.keyframes) + len(guest.keyframes):
-            closures += closer.finish(keyframes, graph)
-        for closure in closures:
-            if closure.verdict is Verdict.ACCEPTED:
-                T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
-                T_guest_source = keyframes[closure.source].T_odom_lidar
-                yield closure, lie.normalize(T_world_source @ lie.inverse(T_guest_source))
+    """Closures of the guest's keyframes in the world, without an expected pose, with T_world_guest by each.
+
+    In the plane pieces of the guest are sought one by one: what is sought in vain for long is sought seldom.
+    """
+    for piece in _pieces(guest) if guest.dimension == 2 else [guest.keyframes]:
+        closer, keyframes, graph = LoopCloser(config, world.dimension), list(world.keyframes), graph_of(world)
+        begin_m = closer.begin_in(keyframes)
+        closer.start_segment(len(keyframes))
+        for keyframe in _after(piece, len(keyframes), begin_m):
+            keyframes.append(keyframe)
+            graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+            closures = closer.close(keyframes, graph)
+            if keyframe.index + 1 == len(world.keyframes) + len(piece):
+                closures += closer.finish(keyframes, graph)
+            for closure in closures:
+                if closure.verdict is Verdict.ACCEPTED:
+                    T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
+                    T_guest_source = keyframes[closure.source].T_odom_lidar
+                    yield closure, lie.normalize(T_world_source @ lie.inverse(T_guest_source))
+
+
+def _pieces(guest: Joined) -> Iterator[Sequence[Keyframe]]:
+    """Keyframes in pieces of some length."""
+    numbers = np.array([keyframe.traveled_m for keyframe in guest.keyframes])
+    numbers = ((numbers - numbers[0]) // _PIECE_M).astype(np.int64)
+    for number in np.unique(numbers).tolist():
+        first, last = np.searchsorted(numbers, [number, number + 1]).tolist()
+        yield guest.keyframes[first:last]
 
 
 class _Closing:
@@ -201,7 +231,7 @@ class _Closing:
             self.graph.fix(index)
         edges = self.guest.edges
         last_end = edges.pairs.max(axis=1, initial=-1)
-        for keyframe in _after(self.guest, old, begin_m):
+        for keyframe in _after(self.guest.keyframes, old, begin_m):
             self._add(keyframe, edges.where(last_end == keyframe.index - old))
             self._take(self.closer.close(self.keyframes, self.graph))
             due = max(_OPTIMIZE_EVERY, _GROWTH * len(self.keyframes))
@@ -255,7 +285,7 @@ class _Closing:
         )
         joined = Joined(
             maps=world.maps + guest.maps,
-            keyframes=(*world.keyframes, *_after(guest, old, world.keyframes[-1].traveled_m + _APART_M)),
+            keyframes=(*world.keyframes, *_after(guest.keyframes, old, world.keyframes[-1].traveled_m + _APART_M)),
             of_map=np.concatenate([world.of_map, guest.of_map]),
             edges=Edges.chained(world.edges, replace(guest.edges, pairs=guest.edges.pairs + old), closed),
             closures=(*world.closures, *self.closures),
@@ -263,20 +293,51 @@ class _Closing:
         return joined.placed(self.graph.poses.copy())
 
 
-def _after(guest: Joined, index: int, begin_m: float) -> Iterator[Keyframe]:
-    """The guest's keyframes, numbered from an index on, on a path that begins there."""
-    first_m = guest.keyframes[0].traveled_m
-    for number, keyframe in enumerate(guest.keyframes, start=index):
+def _after(keyframes: Sequence[Keyframe], index: int, begin_m: float) -> Iterator[Keyframe]:
+    """Keyframes numbered from an index on, on a path that begins there."""
+    first_m = keyframes[0].traveled_m
+    for number, keyframe in enumerate(keyframes, start=index):
         yield replace(keyframe, index=number, traveled_m=begin_m + keyframe.traveled_m - first_m)
 
 
 def _is_joined(joined: Joined, old: int) -> bool:
-    """True if enough closures in force join the keyframes before ``old`` to the others."""
-    pairs = joined.edges.pairs
-    in_force = (pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE)
-    joining = len(np.unique(pairs[in_force, 1]))
+    """True if enough closures in force join the keyframes before ``old`` to the others, and free space agrees."""
     tried = len({closure.source for closure in joined.closures if closure.source >= old})
-    return joining >= max(_MIN_CLOSURES, _MIN_SHARE * tried)
+    if _joining(joined, old) < max(_MIN_CLOSURES, _MIN_SHARE * tried):
+        return False
+    return contradiction(joined.keyframes[:old], joined.keyframes[old:]) <= _MAX_CONTRADICTION
+
+
+def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
+    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
+    d = some[0].T_odom_lidar.shape[0] - 1
+    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
+    agreeing = contradicting = 0
+    for viewers, viewed in ((some, others), (others, some)):
+        near = KDTree([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
+        for viewer in viewers:
+            away_m, index = near.query(viewer.T_odom_lidar[:d, d])
+            if away_m <= _NEAR_M[d]:
+                nearest_ranges(_in_space(viewer), ranges_m)
+                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, viewed[index].T_odom_lidar))
+                margin_m = _MARGIN_M[d] * viewer.scale
+                yes, no = compare_ranges(
+                    _in_space(viewed[index]), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
+                )
+                agreeing, contradicting = agreeing + yes, contradicting + no
+    return contradicting / max(agreeing + contradicting, 1)
+
+
+def _in_space(keyframe: Keyframe) -> Points:
+    """(N, 3); points of the plane get height 0."""
+    points = keyframe.points
+    return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
+
+
+def _joining(joined: Joined, old: int) -> int:
+    """Number of keyframes from ``old`` on that a closure in force joins to those before."""
+    pairs = joined.edges.pairs
+    return len(np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1]))
 
 
 def _information(closure: Closure, config: Config) -> Matrix:

@@ -13,7 +13,7 @@ from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.maps import Edges, open_saved_map
 from scanchain.runs.job import Unwatched
-from scanchain.sessions.joining import Joined, graph_of
+from scanchain.sessions.joining import Joined, contradiction, graph_of
 from scanchain.sessions.merging import MergeJob, merge
 from scanchain.trajectory import read_tum
 
@@ -226,3 +226,22 @@ def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
 def _joined(poses, edges):
     keyframes = tuple(Keyframe(i, i, i, None, pose, float(i)) for i, pose in enumerate(poses))
     return Joined((0, 1), keyframes, np.array([0, 0, 0, 1, 1, 1, 1]), edges)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_free_space_tells_a_map_that_lies_where_the_other_saw_through(dimension):
+    room, behind = _room(dimension, 4.0), _room(dimension, 9.0)
+    assert contradiction([room], [room]) == 0.0
+    assert contradiction([room], [behind]) > 0.3
+
+
+def _room(dimension, half_m):
+    """A keyframe in the middle of a square room, or of a cube."""
+    rays = np.random.default_rng(1).normal(size=(60_000, dimension))
+    points = half_m * rays / np.abs(rays).max(axis=1, keepdims=True)
+
+    class Points:
+        def read(self):
+            return points
+
+    return Keyframe(0, 0, 0, Points(), lie.identity(dimension), 0.0)
