@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -24,8 +23,11 @@ _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong
 _LEAST_POINTS = {2: 3, 3: 6}  # of a cluster
 _LEAST_AGREEMENT = 0.4  # least share of same points among those that both maps had in sight
 _ANGLES = 90  # headings that a box around a cluster is tried at, over 90°
-_ALIKE_SHARE, _ALIKE_VOXELS = 0.15, 2.0  # by which lengths of one object may differ that was seen from two sides
-_AMBIGUOUS = 0.7  # share of the next best difference that the best must stay below to be a counterpart
+_ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ that was seen from two sides
+_MOVED_SIZES = 5.0  # farthest that an object is known again by its size alone, in lengths of it
+_UNRIVALED = 0.33  # share of the distance of any other cluster as large, below which it is known again
+_FLAT_VOXELS = 2.0  # height of a cluster, in voxels, below which it can be ground that rays grazed
+_BESIDE_VOXELS = 4.0  # distance to ground that is the same, in voxels, of such a cluster's points
 
 
 class Label(IntEnum):
@@ -185,19 +187,29 @@ def _clusters(
     dimension = points.shape[1]
     found: list[tuple[Cluster, NDArray[np.int64]]] = []
     kinds: tuple[tuple[Kind, Label], ...] = (("vanished", Label.VANISHED), ("appeared", Label.APPEARED))
+    same = cKDTree(points[labels == Label.SAME])
     for kind, label in kinds:
         chosen = np.flatnonzero(labels == label)
         group = _groups(points[chosen], _JOINED_VOXELS[dimension] * size_m)
         for number in np.flatnonzero(np.bincount(group) >= _LEAST_POINTS[dimension]).tolist():
             members = chosen[group == number]
             center, size, yaw_rad = _box(points[members], size_m)
-            if size.max() >= min_size_m:
+            if size.max() >= min_size_m and not _is_ground(points[members], same, size_m):
                 found.append((Cluster(kind, 0, center, size, yaw_rad, len(members)), members))
     found.sort(key=lambda each: -each[0].points)
     of_cluster = np.zeros(len(points), np.int64)
     for number, (_, members) in enumerate(found, start=1):
         of_cluster[members] = number
     return of_cluster, [replace(cluster, number=k) for k, (cluster, _) in enumerate(found, start=1)]
+
+
+def _is_ground(points: Points, same: cKDTree, size_m: float) -> bool:
+    """True for points in space, as flat as one surface, most of which lie beside, and level with, what is the same."""
+    if points.shape[1] == 2 or np.ptp(points[:, 2]) + size_m >= _FLAT_VOXELS * size_m:
+        return False
+    near = same.query_ball_point(points, _BESIDE_VOXELS * size_m)
+    level = [np.abs(same.data[found, 2] - z).min(initial=np.inf) < size_m for found, z in zip(near, points[:, 2])]
+    return bool(np.mean(level) > 0.5)
 
 
 def _groups(points: Points, reach_m: float) -> NDArray[np.int64]:
@@ -229,22 +241,29 @@ def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
-    """With the counterparts of what moved: one that vanished, and one as large that appeared and no other fits."""
+    """With the counterparts of what moved: of those as large the nearest, where all others are much farther away."""
     gone = [cluster for cluster in clusters if cluster.kind == "vanished"]
     come = [cluster for cluster in clusters if cluster.kind == "appeared"]
     if not gone or not come:
         return tuple(clusters)
-    cost = np.array([[_unlike(a, b, size_m) for b in come] for a in gone])
+    away_m = np.array([[np.linalg.norm(a.center - b.center) for b in come] for a in gone])
+    away_m[[[not _alike(a, b, size_m) for b in come] for a in gone]] = np.inf
     counterpart: dict[int, int] = {}
-    for row, column in zip(*linear_sum_assignment(np.minimum(cost, 10.0)), strict=True):
-        rivals = np.concatenate([np.delete(cost[row], column), np.delete(cost[:, column], row)])
-        if cost[row, column] < min(1.0, _AMBIGUOUS * float(rivals.min(initial=np.inf))):
+    for row, column in zip(*np.nonzero(away_m < _MOVED_SIZES * _lengths(gone, come)), strict=True):
+        rivals = np.concatenate([np.delete(away_m[row], column), np.delete(away_m[:, column], row)])
+        if away_m[row, column] < _UNRIVALED * float(rivals.min(initial=np.inf)):
             a, b = gone[row].number, come[column].number
             counterpart |= {a: b, b: a}
     return tuple(replace(each, counterpart=counterpart.get(each.number, 0)) for each in clusters)
 
 
-def _unlike(a: Cluster, b: Cluster, size_m: float) -> float:
-    """Largest difference of two boxes' lengths, 1 where they can just be one object."""
+def _lengths(gone: Sequence[Cluster], come: Sequence[Cluster]) -> Matrix:
+    """Longest side of each pair of clusters, meters."""
+    longest = ([cluster.size_m.max() for cluster in part] for part in (gone, come))
+    return np.maximum.outer(*longest)
+
+
+def _alike(a: Cluster, b: Cluster, size_m: float) -> bool:
+    """True if the boxes can be those of one object, seen from two sides."""
     longer = np.maximum(a.size_m, b.size_m)
-    return float((np.abs(a.size_m - b.size_m) / (_ALIKE_SHARE * longer + _ALIKE_VOXELS * size_m)).max())
+    return bool((np.abs(a.size_m - b.size_m) < _ALIKE_SHARE * longer + _ALIKE_VOXELS * size_m).all())

@@ -28,10 +28,11 @@ from scanchain.settings import load_settings
 from scanchain.simulation import Change, Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.log import record
-from scanchain.simulation.solids import Solids
+from scanchain.simulation.solids import FIXED, Solids
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
+REACH_M = {2: 8.6, 3: 34.0}  # farthest that scans are compared at: docs/maps.md
 MARGIN_M = {2: 0.1, 3: 0.3}  # around an object, within which points belong to it
 
 
@@ -104,6 +105,14 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
         for kind, drive, there in (("vanished", first, change.before), ("appeared", second, change.after)):
             if np.isfinite(there).all():
                 events.append((change, kind, _on(points, drive.solids, change.owner, MARGIN_M[d])))
+    in_sight = {}
+    drives = (("vanished", (first, a), (second, b)), ("appeared", (second, b), (first, a)))
+    for kind, (here, saved_here), (there, saved_there) in drives:
+        owners = [change.owner for change, side, _ in events if side == kind]
+        both = _with_objects(there.solids, here.solids, owners)
+        in_sight[kind] = np.minimum(
+            _rays_by_owner(here, saved_here, here.solids), _rays_by_owner(there, saved_there, both)
+        )
     count = found.of_cluster.max(initial=0) + 1
     right = np.zeros(count, bool)
     owner = np.full(count, -1)
@@ -116,8 +125,7 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
         covers = is_kind & (mine > 0.5 * size)
         right |= covers
         owner[covers] = change.owner
-        solids = (first if kind == "vanished" else second).solids
-        rays = min(_rays_on(drive, saved, solids, change.owner) for drive, saved in ((first, a), (second, b)))
+        rays = in_sight[kind][change.owner]
         length_m = change.size_m[:d].max()
         if length_m >= LEAST_M and rays >= LEAST_RAYS[d]:
             named += 1
@@ -130,6 +138,12 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
         for cluster in found.clusters:
             if not right[cluster.number]:
                 print("  wrong", cluster.kind, cluster.center.round(1), cluster.size_m.round(2), cluster.points)
+    if verbose:
+        for each in found.clusters:
+            if each.kind == "vanished" and each.counterpart:
+                other = found.clusters[each.counterpart - 1]
+                print("  pair", owner[each.number], owner[other.number], each.size_m.round(2), other.size_m.round(2),
+                      each.points, other.points, np.linalg.norm(each.center - other.center).round(2))
     moved = [cluster for cluster in found.clusters if cluster.kind == "vanished" and cluster.counterpart]
     matched = sum(0 <= owner[each.number] == owner[each.counterpart] for each in moved)
     return Score(named, hit, len(found.clusters), int(right[1:].sum()), len(moved), matched)
@@ -161,23 +175,34 @@ def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarr
     return on
 
 
-_CAST: dict[tuple[int, int], np.ndarray] = {}
+def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
+    """The solids, and besides them these objects of another day, by the same numbers; where both have one, that one."""
+    rows, owner = [], []
+    for k, name in enumerate(("boxes", "cylinders", "ellipsoids")):
+        kept = ~np.isin(own := _owner(solids, k), owners)
+        added = np.isin(of_others := _owner(others, k), owners)
+        # what stands there now hides what stood there, but does not count as it
+        rows.append(np.vstack([getattr(solids, name), getattr(others, name)[added]]))
+        owner.append(np.concatenate([np.where(kept, own, FIXED), of_others[added]]))
+    return Solids(*rows, ground=solids.ground, owner=np.concatenate(owner))
 
 
-def _rays_on(drive: Drive, saved: SavedMap, solids: Solids, owner: int) -> int:
-    """Number of rays of a drive's keyframes that end on an object in a world, that of the drive or the other one."""
-    key = (id(drive), id(solids))
-    if key not in _CAST:
-        counts = np.zeros(int(solids.owner.max()) + 2, np.int64)
-        for keyframe in saved.keyframes:
-            start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
-            rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
-            poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
-            _, solid = solids.strike(poses, rays.instant_of_ray, rays.directions, drive.sensor.max_range_m)
-            hit = solid[(solid >= 0) & (solid < len(solids.owner))]
-            counts += np.bincount(solids.owner[hit] + 1, minlength=len(counts))
-        _CAST[key] = counts
-    return int(_CAST[key][owner + 1])
+def _owner(solids: Solids, kind: int) -> np.ndarray:
+    ends = np.cumsum([0, len(solids.boxes), len(solids.cylinders), len(solids.ellipsoids)])
+    return solids.owner[ends[kind] : ends[kind + 1]]
+
+
+def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
+    """Number of rays of a drive's keyframes that end on each object (O,) of a world, its own or another one."""
+    counts = np.zeros(10_000, np.int64)
+    for keyframe in saved.keyframes:
+        start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
+        rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
+        poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
+        _, solid = solids.strike(poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension]))
+        owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
+        counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
+    return counts
 
 
 if __name__ == "__main__":
