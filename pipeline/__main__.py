@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import click
 
 from scanchain.commands.batch import batch
+from scanchain.commands.changes import changes
 from scanchain.commands.check import check
 from scanchain.commands.compare import compare
 from scanchain.commands.config import config

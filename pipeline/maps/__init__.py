@@ -2,7 +2,7 @@
 
 from scanchain.maps.laz import write_laz
 from scanchain.maps.map_files import read_map, write_map
-from scanchain.maps.moving import View, clearly_through, moved, sightings
+from scanchain.maps.moving import View, clearly_through, moved, reach_of, sightings
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution
 from scanchain.maps.pcd import write_pcd
 from scanchain.maps.ply import read_ply, write_ply
@@ -24,6 +24,7 @@ __all__ = [
     "moved",
     "open_saved_map",
     "read_map",
+    "reach_of",
     "read_ply",
     "sightings",
     "write_laz",

@@ -56,20 +56,19 @@ def clearly_through(seen: NDArray[np.int32], seen_through: NDArray[np.int32]) ->
     return (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
 
 
+def reach_of(voxel_size_m: float) -> float:
+    """Range up to which scans are compared with the points of a map of such voxels, meters."""
+    return _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi)
+
+
 def sightings(
-    voxels: Points,
-    voxel_size_m: float,
-    views: Iterable[View],
-    *,
-    enough: int = _EVERY,
-    reach_bins: float = _REACH_BINS,
+    voxels: Points, voxel_size_m: float, views: Iterable[View], *, enough: int = _EVERY
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Numbers of scans that saw a surface at each point (N, d) of a map, one a voxel, and that saw through it.
 
     enough : a point that so many scans saw is not tested again
-    reach_bins : width of a bin of directions, half a degree, in voxels at the farthest range that scans are used to
     """
-    index = _Cells(_in_space(voxels), reach_bins * voxel_size_m * _COLUMNS / (2.0 * np.pi))
+    index = _Cells(_in_space(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points
 from scanchain.errors import InputError
-from scanchain.maps import View, build_point_map, clearly_through, moved, sightings
+from scanchain.maps import View, build_point_map, clearly_through, moved, reach_of, sightings
 
 _SAME_VOXELS = 1.5  # distance, in voxels, within which the other map has the same surface
 _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong to one cluster
@@ -112,6 +112,11 @@ class Changes:
     def dimension(self) -> int:
         """2 or 3."""
         return self.points.shape[1]
+
+    @property
+    def reach_m(self) -> float:
+        """Range up to which scans were compared with points."""
+        return reach_of(self.voxel_size_m)
 
 
 def changes_between(
@@ -244,7 +249,7 @@ def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
     """With the counterparts of what moved: of those as large the nearest, where all others are much farther away."""
     gone = [cluster for cluster in clusters if cluster.kind == "vanished"]
     come = [cluster for cluster in clusters if cluster.kind == "appeared"]
-    if not gone or not come:
+    if not gone or not come or len(gone[0].center) == 2:  # outlines of furniture are too alike
         return tuple(clusters)
     away_m = np.array([[np.linalg.norm(a.center - b.center) for b in come] for a in gone])
     away_m[[[not _alike(a, b, size_m) for b in come] for a in gone]] = np.inf
