@@ -55,8 +55,8 @@ def changes(
     newest session is compared with all before it. A change is named only where the scans of the other map look
     through the place; what was not seen is unknown.
 
-    Writes changes.ply (label 0 same, 1 appeared, 2 vanished, 3 unknown), changes.csv and .parquet with a row for each
-    cluster, summary.txt, metrics.json, report.html and recording.rrd.
+    Writes changes.ply (label 0 same, 1 appeared, 2 vanished, 3 unknown), changes.csv and .parquet with a row
+    for each cluster, summary.txt, metrics.json, report.html and recording.rrd.
 
     \b
     Examples:

@@ -50,8 +50,8 @@ def align_maps(target: SavedMap, source: SavedMap, config: Config | None = None)
         tried = sum(closure.target < fixed for closure in slam.closures)
         accepted = sum(closure.verdict is Verdict.ACCEPTED and closure.target < fixed for closure in slam.closures)
         raise InputError(
-            f"{source.name}: is not found in {target.name} ({counted(tried, 'place')} tried, {accepted} fit); give "
-            "maps of one place, or the transform between them"
+            f"{source.name}: is not found in {target.name} ({counted(tried, 'place')} tried, {accepted} fit); "
+            "give maps of one place, or the transform between them"
         )
     return Alignment(result.trajectory.poses, loops)
 
@@ -71,10 +71,9 @@ def _located(keyframe: Keyframe, information: Matrix, first_points: Points, conf
     """A keyframe of a map as odometry would hand it on, its final pose for that of odometry."""
     points, T = keyframe.points, keyframe.T_odom_lidar
     raw: RawPoints = points.astype(np.float32)
-    scan = Scan(
-        keyframe.scan_index, keyframe.stamp_ns, keyframe.stamp_ns, raw, np.empty(0, np.float32), 0, None
-    )
+    scan = Scan(keyframe.scan_index, keyframe.stamp_ns, keyframe.stamp_ns, raw, np.empty(0, np.float32), 0, None)
     match = first_match(T, points, config.matching)
-    prior = Prior(T, np.linalg.inv(information), np.zeros(len(information)))
+    covariance = np.linalg.inv(information).astype(np.float64)
+    prior = Prior(T, covariance, np.zeros(len(information)))
     tracked = Tracked(scan, points, points, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
     return Located(tracked, True, keyframe.scale, points[:0], information, first_points)

@@ -29,8 +29,8 @@ class Comparison:
 
     Attributes
     ----------
-    earlier, later : run directories; without a later one the newest session of the earlier one is compared with all
-        before it
+    earlier, later : run directories; without a later one the newest session of the earlier one is compared with
+        all before it
     out : the directory to create
     transform : T_earlier_later (d+1, d+1) where it is known; None to find it
     voxel_size_m, min_size_m : as in ``changes_between``
@@ -46,7 +46,9 @@ class Comparison:
 
 
 def compare_maps(
-    comparison: Comparison, present: Callable[[Path, Changes], None], say: Callable[[str], None] = lambda stage: None
+    comparison: Comparison,
+    present: Callable[[Path, Changes], None],
+    say: Callable[[str], None] = lambda stage: None,
 ) -> Changes:
     """The changes, written into the directory of the comparison.
 
@@ -77,8 +79,8 @@ def _parts(first: SavedMap, comparison: Comparison, say: Callable[[str], None]) 
     second = open_saved_map(comparison.later)
     if second.dimension != first.dimension:
         raise InputError(
-            f"{comparison.later}: is a {second.dimension}D map, {comparison.earlier} a {first.dimension}D one; give "
-            "maps of the same kind"
+            f"{comparison.later}: is a {second.dimension}D map, {comparison.earlier} a {first.dimension}D one; "
+            "give maps of the same kind"
         )
     names = first.name, second.name
     if names[0] == names[1]:

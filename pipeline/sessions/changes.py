@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points
@@ -170,7 +170,7 @@ def _labels(
 ) -> NDArray[np.uint8]:
     """Labels (N,) of points by the cloud of the other map and what its scans saw."""
     seen, seen_through = sightings(points, size_m, _views(other, config))
-    distance_m = cKDTree(others).query(points, distance_upper_bound=_SAME_VOXELS * size_m)[0]
+    distance_m = KDTree(others).query(points, distance_upper_bound=_SAME_VOXELS * size_m)[0]
     is_same = np.isfinite(distance_m)
     is_changed = clearly_through(seen, seen_through) & ~is_same
     labels = np.full(len(points), Label.UNKNOWN, np.uint8)
@@ -192,7 +192,7 @@ def _clusters(
     dimension = points.shape[1]
     found: list[tuple[Cluster, NDArray[np.int64]]] = []
     kinds: tuple[tuple[Kind, Label], ...] = (("vanished", Label.VANISHED), ("appeared", Label.APPEARED))
-    same = cKDTree(points[labels == Label.SAME])
+    same = KDTree(points[labels == Label.SAME])
     for kind, label in kinds:
         chosen = np.flatnonzero(labels == label)
         group = _groups(points[chosen], _JOINED_VOXELS[dimension] * size_m)
@@ -208,12 +208,16 @@ def _clusters(
     return of_cluster, [replace(cluster, number=k) for k, (cluster, _) in enumerate(found, start=1)]
 
 
-def _is_ground(points: Points, same: cKDTree, size_m: float) -> bool:
-    """True for points in space, as flat as one surface, most of which lie beside, and level with, what is the same."""
+def _is_ground(points: Points, same: KDTree, size_m: float) -> bool:
+    """True for points in space, as flat as one surface, most of which are level with what is the same beside them."""
     if points.shape[1] == 2 or np.ptp(points[:, 2]) + size_m >= _FLAT_VOXELS * size_m:
         return False
     near = same.query_ball_point(points, _BESIDE_VOXELS * size_m)
-    level = [np.abs(same.data[found, 2] - z).min(initial=np.inf) < size_m for found, z in zip(near, points[:, 2])]
+    heights = np.asarray(same.data)[:, 2]
+    level = [
+        np.abs(heights[found] - z).min(initial=np.inf) < size_m
+        for found, z in zip(near, points[:, 2], strict=True)
+    ]
     return bool(np.mean(level) > 0.5)
 
 
@@ -222,13 +226,13 @@ def _groups(points: Points, reach_m: float) -> NDArray[np.int64]:
     count = len(points)
     if not count:
         return np.zeros(0, np.int64)
-    pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(reach_m, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return connected_components(links, directed=False)[1].astype(np.int64)
 
 
 def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Center (d,), size (d,) and heading of the upright box of least area around points, a voxel larger than them."""
+    """Center (d,), size (d,) and heading of the upright box of least area around points, a voxel larger."""
     yaws = np.arange(_ANGLES) * (0.5 * np.pi / _ANGLES)
     axes = np.stack([np.cos(yaws), np.sin(yaws), -np.sin(yaws), np.cos(yaws)], axis=-1).reshape(-1, 2, 2)
     turned = axes @ points[:, :2].T
@@ -246,7 +250,7 @@ def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
-    """With the counterparts of what moved: of those as large the nearest, where all others are much farther away."""
+    """With the counterparts of what moved: the nearest that is as large, all others being much farther away."""
     gone = [cluster for cluster in clusters if cluster.kind == "vanished"]
     come = [cluster for cluster in clusters if cluster.kind == "appeared"]
     if not gone or not come or len(gone[0].center) == 2:  # outlines of furniture are too alike

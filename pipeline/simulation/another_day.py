@@ -18,11 +18,25 @@ _REMOVED, _MOVED, _ADDED = 0.12, 0.15, 0.08  # shares of the objects that go, mo
 _APART_M = (0.5, 4.0)  # distance of the move
 _TURN_RAD = 0.15  # standard deviation of the turn, beside quarter turns
 _TRIES = 20
-_ROOM_M, _SPARE_M = 0.05, 0.25  # distance kept from other solids, and from the path besides half the vehicle's width
+_ROOM_M, _SPARE_M = (
+    0.05,
+    0.25,
+)  # distance kept from other solids, and from the path besides half the vehicle's width
 _SAMPLE_M = 0.1  # spacing of the points of a footprint
 _NEAR_M = 8.0  # solids so far from an object can be in its way
 _BELOW_M = 2.0  # solids that begin higher are in nobody's way
-_COLUMNS = ("kind", "x_before", "y_before", "z_before", "x_after", "y_after", "z_after", "length", "width", "height")
+_COLUMNS = (
+    "kind",
+    "x_before",
+    "y_before",
+    "z_before",
+    "x_after",
+    "y_after",
+    "z_after",
+    "length",
+    "width",
+    "height",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +138,7 @@ def another_day(
 
 
 def write_changes(path: Path, changes: Sequence[Change]) -> None:
-    """Write a line for each change: kind, middle before and after, size, in meters; empty where it is not there."""
+    """Write a line for each change: kind, middle before and after, size; meters, empty where it is not there."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_COLUMNS)

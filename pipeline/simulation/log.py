@@ -41,8 +41,8 @@ def simulate(
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own; with
-    ``changed``, a seed, it is another day: furniture or parked cars came, went and moved, as .changes.csv beside the
-    log lists, and the drive is repeated with other deviations and noise;
+    ``changed``, a seed, it is another day: furniture or parked cars came, went and moved, as .changes.csv beside
+    the log lists, and the drive is repeated with other deviations and noise;
     ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.

@@ -3,9 +3,9 @@
     python -m tests.benchmarks.changes FOLDER [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
         [--later-seconds S] [--unchanged]
 
-For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs stay
-in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so many rays
-of their keyframes' scans end on it, or would. A cluster is right where most of its points lie on an object that
+For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
+stay in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so many
+rays of their keyframes' scans end on it, or would. A cluster is right where most of its points lie on an object that
 vanished or appeared. With ``--later-seconds`` the second drive sees a part of the first one's world only, with
 ``--unchanged`` nothing changed: every cluster is wrong.
 """
@@ -25,7 +25,7 @@ from scanchain.maps import SavedMap, open_saved_map
 from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Part, changes_between
 from scanchain.settings import load_settings
-from scanchain.simulation import Change, Drive, plan
+from scanchain.simulation import Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.log import record
 from scanchain.simulation.solids import FIXED, Solids
@@ -98,55 +98,39 @@ def _run(drive: Drive, path: Path, seed: int, changed: int | None) -> SavedMap:
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap, *, verbose: bool) -> Score:
-    d = a.dimension
-    points = _in_world(found.points, first, a)
-    events = []  # the change, the side, and the points that lie on the object there
-    for change in second.changes:
-        for kind, drive, there in (("vanished", first, change.before), ("appeared", second, change.after)):
-            if np.isfinite(there).all():
-                events.append((change, kind, _on(points, drive.solids, change.owner, MARGIN_M[d])))
-    in_sight = {}
-    drives = (("vanished", (first, a), (second, b)), ("appeared", (second, b), (first, a)))
-    for kind, (here, saved_here), (there, saved_there) in drives:
-        owners = [change.owner for change, side, _ in events if side == kind]
-        both = _with_objects(there.solids, here.solids, owners)
-        in_sight[kind] = np.minimum(
-            _rays_by_owner(here, saved_here, here.solids), _rays_by_owner(there, saved_there, both)
-        )
-    count = found.of_cluster.max(initial=0) + 1
-    right = np.zeros(count, bool)
-    owner = np.full(count, -1)
-    named = 0
-    hit = 0
-    for change, kind, on in events:
-        mine = np.bincount(found.of_cluster[on], minlength=count)
-        size = np.bincount(found.of_cluster, minlength=count)
-        is_kind = np.array([False, *(cluster.kind == kind for cluster in found.clusters)])
-        covers = is_kind & (mine > 0.5 * size)
-        right |= covers
-        owner[covers] = change.owner
-        rays = in_sight[kind][change.owner]
-        length_m = change.size_m[:d].max()
-        if length_m >= LEAST_M and rays >= LEAST_RAYS[d]:
-            named += 1
-            partly = is_kind & (mine > 0)
-            hit += bool((covers | (partly & (mine > 0.2 * on.sum()))).any())
-            if verbose and not covers.any():
+    d, points = a.dimension, _in_world(found.points, first, a)
+    count = len(found.clusters) + 1
+    size = np.bincount(found.of_cluster, minlength=count)
+    right, owner = np.zeros(count, bool), np.full(count, -1)
+    events = hits = 0
+    for kind, here, there in (("vanished", (first, a), (second, b)), ("appeared", (second, b), (first, a))):
+        solids, is_kind = here[0].solids, np.array([False, *(each.kind == kind for each in found.clusters)])
+        changed = [
+            each for each in second.changes if np.isfinite(each.before if here[0] is first else each.after).all()
+        ]
+        both = _with_objects(there[0].solids, solids, [change.owner for change in changed])
+        rays = np.minimum(_rays_by_owner(*here, solids), _rays_by_owner(*there, both))
+        for change in changed:
+            on = _on(points, solids, change.owner, MARGIN_M[d])
+            mine = np.bincount(found.of_cluster[on], minlength=count)
+            covers = is_kind & (mine > 0.5 * size)
+            right |= covers
+            owner[covers] = change.owner
+            if change.size_m[:d].max() < LEAST_M or rays[change.owner] < LEAST_RAYS[d]:
+                continue
+            events += 1
+            is_hit = bool((covers | (is_kind & (mine > 0.2 * on.sum()))).any())
+            hits += is_hit
+            if verbose and not is_hit:
                 labels = np.bincount(found.labels[on], minlength=4)
-                print("  missed", change.kind, kind, change.size_m.round(2), f"{rays} rays", "labels", labels)
-    if verbose:
-        for cluster in found.clusters:
-            if not right[cluster.number]:
-                print("  wrong", cluster.kind, cluster.center.round(1), cluster.size_m.round(2), cluster.points)
+                print(f"  missed {change.kind} {kind} {change.size_m.round(2)} {rays[change.owner]} rays {labels}")
     if verbose:
         for each in found.clusters:
-            if each.kind == "vanished" and each.counterpart:
-                other = found.clusters[each.counterpart - 1]
-                print("  pair", owner[each.number], owner[other.number], each.size_m.round(2), other.size_m.round(2),
-                      each.points, other.points, np.linalg.norm(each.center - other.center).round(2))
+            if not right[each.number]:
+                print("  wrong", each.kind, each.center.round(1), each.size_m.round(2), each.points)
     moved = [cluster for cluster in found.clusters if cluster.kind == "vanished" and cluster.counterpart]
     matched = sum(0 <= owner[each.number] == owner[each.counterpart] for each in moved)
-    return Score(named, hit, len(found.clusters), int(right[1:].sum()), len(moved), matched)
+    return Score(events, hits, len(found.clusters), int(right[1:].sum()), len(moved), matched)
 
 
 def _in_world(points: Matrix, drive: Drive, saved: SavedMap) -> Matrix:
@@ -176,12 +160,11 @@ def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarr
 
 
 def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
-    """The solids, and besides them these objects of another day, by the same numbers; where both have one, that one."""
+    """The solids, which no longer count as these objects, and the objects as they stand on another day."""
     rows, owner = [], []
     for k, name in enumerate(("boxes", "cylinders", "ellipsoids")):
         kept = ~np.isin(own := _owner(solids, k), owners)
         added = np.isin(of_others := _owner(others, k), owners)
-        # what stands there now hides what stood there, but does not count as it
         rows.append(np.vstack([getattr(solids, name), getattr(others, name)[added]]))
         owner.append(np.concatenate([np.where(kept, own, FIXED), of_others[added]]))
     return Solids(*rows, ground=solids.ground, owner=np.concatenate(owner))
@@ -199,7 +182,9 @@ def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
         start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
         rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
         poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
-        _, solid = solids.strike(poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension]))
+        _, solid = solids.strike(
+            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension])
+        )
         owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
         counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
     return counts
