@@ -209,7 +209,7 @@ def _clusters(
 
 
 def _is_ground(points: Points, same: KDTree, size_m: float) -> bool:
-    """True for points in space, as flat as one surface, most of which are level with what is the same beside them."""
+    """True for points in space, as flat as one surface, most of them level with what is the same beside them."""
     if points.shape[1] == 2 or np.ptp(points[:, 2]) + size_m >= _FLAT_VOXELS * size_m:
         return False
     near = same.query_ball_point(points, _BESIDE_VOXELS * size_m)
