@@ -23,6 +23,7 @@ from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.localize import localize
+from scanchain.commands.map import map_group
 from scanchain.commands.optimize import optimize
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
@@ -48,7 +49,7 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, localize, changes, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize,
+    run, localize, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize,
     landmarks, config, sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
