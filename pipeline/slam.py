@@ -108,6 +108,7 @@ class Slam:
         self.lost_scans = 0
         self.optimized_at = 0
         self.first = 0  # number of the first keyframe of this log
+        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
         if prior is not None:
@@ -267,7 +268,33 @@ class Slam:
         return keyframe.index
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        return self._take(self.closer.close(self.keyframes, self.graph))
+        closures = self._take(self.closer.close(self.keyframes, self.graph))
+        for closure in closures if self.first else ():
+            is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
+            if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
+                self.by_map = closure
+                self.T_world_odom = self._by_map(closure)
+        return closures
+
+    def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
+        """Join the first scan of this log to the nearest keyframe of the map: it is at this pose, to m and rad."""
+        positions = self.graph.poses[: self.first, :-1, -1]
+        nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
+        T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
+        information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
+        self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
+        self._optimize("gnc")
+
+    def _by_map(self, closure: Closure) -> Pose:
+        """T_world_odom by a closure with a keyframe of the map."""
+        T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+        return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))
+
+    @property
+    def is_in_map(self) -> bool:
+        """True if a closure in force joins the newest keyframe to the map."""
+        components = self.closer.segments.components(self.graph)
+        return self.first > 0 and bool(components[-1] == components[0])
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
@@ -310,7 +337,8 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = 0 if self.joins_segment else _OPTIMIZE_EVERY
+        is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
+        enough = 0 if is_urgent else _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:

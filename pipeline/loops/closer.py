@@ -36,6 +36,7 @@ class LoopCloser:
     def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
         """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
         self.near.of_map = len(keyframes)
+        self.near.submaps.begin_in(keyframes)
         return self.places.begin_in(keyframes)
 
     def start_segment(self, keyframe: int) -> None:
@@ -52,12 +53,12 @@ class LoopCloser:
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
-        return closures + self.places.close(keyframes, graph.poses, connected)
+        return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the submaps that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        return self.places.close(keyframes, graph.poses, components == components[-1], finish=True)
+        return self.places.close(keyframes, graph, components == components[-1], finish=True)
 
 
 class ProximityCloser:
@@ -95,7 +96,9 @@ class ProximityCloser:
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
         T_first = lie.between(T_world[target], T_world[-1])
-        verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
+        verified = self.verifier.verify(
+            keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
+        )
         closure = verified.closure(target, newest)
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.map_search import MapSearch
+from scanchain.loops.planar_map_search import MapSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
