@@ -7,7 +7,7 @@ from scanchain import lie
 from scanchain.data import Keyframe
 from scanchain.kernels.search.branch_and_bound import fill_pyramid
 from scanchain.kernels.search.whole_map import FREE, NEAR, SURFACE, score_cells, search_map
-from scanchain.loops.map_search import MapSearch
+from scanchain.loops.planar_map_search import MapSearch
 from tests.support.scenes import stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
