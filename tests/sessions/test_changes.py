@@ -38,6 +38,16 @@ def room(*boxes: tuple[float, float]) -> Solids:
     return scenery.finish()
 
 
+def hall() -> Solids:
+    """Another place: 20 x 4 m with three pillars."""
+    scenery = Scenery()
+    for center, size in (((6, 0), (20, 0.2)), ((6, 4), (20, 0.2)), ((-4, 2), (0.2, 4)), ((16, 2), (0.2, 4))):
+        scenery.box(center, size, (0.0, 2.5))
+    for x in (-1.0, 5.0, 12.5):
+        scenery.box((x, 2.8), (0.8, 0.8), (0.0, 2.5))
+    return scenery.finish()
+
+
 def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
     """A map of views along the room, in the plane."""
     angle = np.linspace(-np.pi, np.pi, 720, endpoint=False)
@@ -156,7 +166,7 @@ def test_the_newest_session_of_a_merged_map_is_compared_with_those_before(tmp_pa
 )
 def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys, words, message):
     saved(tmp_path / "A", part("a", room(BOX), count=3))
-    saved(tmp_path / "B", part("b", room(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
+    saved(tmp_path / "B", part("b", hall(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
     words = [str(tmp_path / word) if word in ("A", "B", "none") else word for word in words]
     assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
