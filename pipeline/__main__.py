@@ -49,8 +49,8 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, localize, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize,
-    landmarks, config, sequence,
+    run, localize, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate, evaluate,
+    optimize, landmarks, config, sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)
