@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-
 if TYPE_CHECKING:
     from typing import Any
 
-    from scanchain.api import changes, compare, downsample, localize, optimize, run
+    from scanchain.api import changes, compare, downsample, localize, merge, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
@@ -49,6 +49,7 @@ _HOMES = {
     "evaluate": "evaluation.metrics",
     "load_settings": "settings",
     "localize": "api",
+    "merge": "api",
     "open_log": "logs",
     "optimize": "api",
     "read_g2o": "graph.files.g2o",
@@ -73,6 +74,7 @@ _COMPILED = {
     "downsample",
     "evaluate",
     "localize",
+    "merge",
     "run",
     "simulate",
 }
@@ -100,6 +102,7 @@ __all__ = [
     "evaluate",
     "load_settings",
     "localize",
+    "merge",
     "open_log",
     "optimize",
     "read_g2o",

@@ -1,4 +1,4 @@
-"""The commands as functions: process a log, compare methods on it, optimize a graph, downsample points."""
+"""The commands as functions: process a log, merge maps, compare methods, optimize a graph, downsample points."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from scanchain.runs.job import Recorder, SinkName
     from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
+    from scanchain.sessions.merging import Merged
 
 Logs = str | Path | Sequence[str | Path]
 
@@ -88,6 +89,35 @@ def localize(
         force=force,
     )
     return localize_log(job, Unwatched(), draw_localization if recording else lambda folder, localized: None)[0]
+
+
+def merge(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    fixed: bool = False,
+    force: bool = False,
+    **overrides: object,
+) -> Merged:
+    """Merge the maps of run directories into one, as ``scanchain merge`` does; nothing is printed.
+
+    runs : two or more; the map is in the frame of the first, whose poses stay as they are if ``fixed``
+    Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
+    are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
+    """
+    from scanchain.sessions.merging import MergeJob
+    from scanchain.sessions.merging import merge as merge_maps
+
+    job = MergeJob(
+        runs=tuple(checks.path(run, "runs") for run in runs),
+        out=checks.path(out, "out"),
+        config_file=None if config is None else checks.path(config, "config"),
+        overrides=overrides_of(overrides),
+        fixed=checks.truth(fixed, "fixed"),
+        force=force,
+    )
+    return merge_maps(job, Unwatched(), present_merge)
 
 
 def changes(
@@ -204,6 +234,15 @@ def draw_localization(folder: Path, localized: LocalizedLog) -> None:
 
     write_localization_report(folder, localized)
     record_localization(folder / RECORDING_FILE, localized)
+
+
+def present_merge(directory: Path) -> None:
+    """Add report.html and a recording to the directory of a merge."""
+    from scanchain.viz.recording.merge import record_merge
+    from scanchain.viz.report.merge import write_merge_report
+
+    write_merge_report(directory)
+    record_merge(directory)
 
 
 def present_comparison(directory: Path) -> None:
