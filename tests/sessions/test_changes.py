@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,11 @@ def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
         keyframes.append(Keyframe(k, k, k, Held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
         poses.append(pose)
     return Part(name, keyframes, np.array(poses))
+
+
+def _finite(keyframe: Keyframe) -> Keyframe:
+    points = keyframe.points
+    return replace(keyframe, stored=Held(points[np.isfinite(points).all(axis=1)]))
 
 
 def compared(before: Solids, after: Solids, **options) -> Changes:
@@ -156,7 +162,16 @@ def test_the_newest_session_of_a_merged_map_is_compared_with_those_before(tmp_pa
 )
 def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys, words, message):
     saved(tmp_path / "A", part("a", room(BOX), count=3))
-    saved(tmp_path / "B", part("b", room(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
+    elsewhere = Scenery()
+    for x, y in np.random.default_rng(5).uniform([-20.0, -15.0], [30.0, 20.0], (40, 2)):
+        elsewhere.cylinder((x, y), 0.2, (0.0, 2.5))
+    elsewhere.cylinder((5.0, 0.0), 60.0, (3.0, 4.0))
+    elsewhere.box((5.0, 30.0), (100.0, 0.3), (0.0, 2.5))
+    elsewhere.box((5.0, -30.0), (100.0, 0.3), (0.0, 2.5))
+    elsewhere.box((40.0, 0.0), (0.3, 80.0), (0.0, 2.5))
+    elsewhere.box((-40.0, 0.0), (0.3, 80.0), (0.0, 2.5))
+    B = part("b", elsewhere.finish(), count=3)
+    saved(tmp_path / "B", Part("b", [_finite(each) for each in B.keyframes], B.poses))
     words = [str(tmp_path / word) if word in ("A", "B", "none") else word for word in words]
     assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
