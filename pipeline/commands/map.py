@@ -39,8 +39,9 @@ def map_group() -> None:
 def import_file(file: Path, out: Path, spacing: float | None, height: float, force: bool) -> None:
     """Make a map to localize in of a point cloud or an occupancy grid.
 
-    FILE is a cloud in meters, z up (.ply, .pcd, .laz, .las, .npy), or map.yaml of nav2's or ROS 1's map_server with
-    its image. The cloud is seen from positions on a grid, where a lidar could be; points that others hide are not.
+    FILE is a cloud in meters, z up (.ply, .pcd, .laz, .las, .npy), or map.yaml of nav2's or ROS 1's map_server
+    with its image. The cloud is seen from positions on a grid, where a lidar could be; points that
+    others hide are not.
 
     \b
     Examples:

@@ -26,8 +26,8 @@ _ANGLES = 90  # headings that a box around a cluster is tried at, over 90°
 _ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ that was seen from two sides
 _MOVED_SIZES = 5.0  # farthest that an object is known again by its size alone, in lengths of it
 _UNRIVALED = 0.33  # share of the distance of any other cluster as large, below which it is known again
-_FLAT_VOXELS = 2.0  # height of a cluster, in voxels, below which it can be ground that rays grazed
-_BESIDE_VOXELS = 4.0  # distance to ground that is the same, in voxels, of such a cluster's points
+_THIN_VOXELS = 1.25  # thickness of a cluster, in voxels, below which it can be a surface that rays grazed
+_BESIDE_VOXELS = 4.0  # distance of such a cluster's points to that surface, in voxels
 
 
 class Label(IntEnum):
@@ -192,14 +192,14 @@ def _clusters(
     dimension = points.shape[1]
     found: list[tuple[Cluster, NDArray[np.int64]]] = []
     kinds: tuple[tuple[Kind, Label], ...] = (("vanished", Label.VANISHED), ("appeared", Label.APPEARED))
-    same = KDTree(points[labels == Label.SAME])
+    rest = KDTree(points[(labels == Label.SAME) | (labels == Label.UNKNOWN)])
     for kind, label in kinds:
         chosen = np.flatnonzero(labels == label)
         group = _groups(points[chosen], _JOINED_VOXELS[dimension] * size_m)
         for number in np.flatnonzero(np.bincount(group) >= _LEAST_POINTS[dimension]).tolist():
             members = chosen[group == number]
             center, size, yaw_rad = _box(points[members], size_m)
-            if size.max() >= min_size_m and not _is_ground(points[members], same, size_m):
+            if size.max() >= min_size_m and not _is_grazed(points[members], rest, size_m):
                 found.append((Cluster(kind, 0, center, size, yaw_rad, len(members)), members))
     found.sort(key=lambda each: -each[0].points)
     of_cluster = np.zeros(len(points), np.int64)
@@ -208,17 +208,24 @@ def _clusters(
     return of_cluster, [replace(cluster, number=k) for k, (cluster, _) in enumerate(found, start=1)]
 
 
-def _is_ground(points: Points, same: KDTree, size_m: float) -> bool:
-    """True for points in space, as flat as one surface, most of them level with what is the same beside them."""
-    if points.shape[1] == 2 or np.ptp(points[:, 2]) + size_m >= _FLAT_VOXELS * size_m:
+def _is_grazed(points: Points, rest: KDTree, size_m: float) -> bool:
+    """True for points in space, level or in one line, most of which continue in points that did not change.
+
+    Rays that graze the ground, an edge or a pole pass beside points of it.
+    """
+    if points.shape[1] == 2:
         return False
-    near = same.query_ball_point(points, _BESIDE_VOXELS * size_m)
-    heights = np.asarray(same.data)[:, 2]
-    level = [
-        np.abs(heights[found] - z).min(initial=np.inf) < size_m
-        for found, z in zip(near, points[:, 2], strict=True)
-    ]
-    return bool(np.mean(level) > 0.5)
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    across = axes[1:] if len(axes) > 2 and np.ptp(points @ axes[1]) < _THIN_VOXELS * size_m else np.eye(3)[2:]
+    if np.ptp(points @ across.T, axis=0).max() >= _THIN_VOXELS * size_m:
+        return False
+    others = np.asarray(rest.data)
+    continued = 0
+    for point, found in zip(points, rest.query_ball_point(points, _BESIDE_VOXELS * size_m), strict=True):
+        away = others[found] - point
+        is_beside = (np.abs(away @ across.T) < size_m).all(axis=1) & (away[:, 2] > -size_m)
+        continued += bool(is_beside.any())
+    return continued > 0.5 * len(points)
 
 
 def _groups(points: Points, reach_m: float) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Maps from elsewhere: point clouds and occupancy grids as maps to localize in, seen from where a lidar could be."""
+"""Maps from elsewhere: point clouds and occupancy grids as maps to localize in, as a lidar would see them."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ def import_map(
         keyframes = tuple(_keyframes(surfaces.points, positions, config))
         if not keyframes:
             raise InputError(
-                f"{file}: a lidar {height_m:g} m above the ground sees {_LEAST_POINTS} points nowhere; give a cloud "
-                "in meters with z up, or another --height"
+                f"{file}: a lidar {height_m:g} m above the ground sees {_LEAST_POINTS} points nowhere; give a "
+                "cloud in meters with z up, or another --height"
             )
         poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
         session = Session(file.name, 0, len(keyframes) - 1, len(keyframes))
@@ -152,8 +152,8 @@ def _read_grid(file: Path) -> _Surfaces:
         raise InputError(f"{error.filename or file}: cannot be read ({error.strerror or error})") from error
     except (YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{file}: is no map of map_server ({type(error).__name__}: {error}); wanted image, resolution, origin, "
-            "occupied_thresh, free_thresh"
+            f"{file}: is no map of map_server ({type(error).__name__}: {error}); wanted image, resolution, "
+            "origin, occupied_thresh, free_thresh"
         ) from error
     probability = image / 255.0 if is_negated else 1.0 - image / 255.0
     T_map_image = lie.pose_2d(x, y, yaw_rad)

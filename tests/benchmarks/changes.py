@@ -4,10 +4,10 @@
         [--later-seconds S] [--unchanged]
 
 For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
-stay in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so many
-rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is right where most
-of its points lie on an object that vanished or appeared. With ``--later-seconds`` the second drive sees a part of
-the first one's world only, with ``--unchanged`` nothing changed: every cluster is wrong.
+stay in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so
+many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is right
+where most of its points lie on an object that vanished or appeared. With ``--later-seconds`` the second drive sees
+a part of the first one's world only, with ``--unchanged`` nothing changed: every cluster is wrong.
 """
 
 from __future__ import annotations

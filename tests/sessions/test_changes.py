@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,11 @@ def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
         keyframes.append(Keyframe(k, k, k, Held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
         poses.append(pose)
     return Part(name, keyframes, np.array(poses))
+
+
+def _finite(keyframe: Keyframe) -> Keyframe:
+    points = keyframe.points
+    return replace(keyframe, stored=Held(points[np.isfinite(points).all(axis=1)]))
 
 
 def compared(before: Solids, after: Solids, **options) -> Changes:

@@ -645,3 +645,24 @@ def test_a_misspelt_key_is_refused(tmp_path):
     (tmp_path / "sequence.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
     with pytest.raises(InputError, match="sede"):
         catalog.read(tmp_path / "sequence.toml")
+
+
+def test_another_day_changes_movable_objects_alone_and_keeps_the_path_free():
+    first, later = plan("office", seed=3, duration_s=20.0), plan("office", seed=3, duration_s=20.0, changed=1)
+    kinds = {change.kind for change in later.changes}
+    assert kinds == {"removed", "moved", "added"}
+    for name in ("boxes", "cylinders", "ellipsoids"):
+        rows = [{tuple(row) for row in getattr(drive.solids, name)} for drive in (first, later)]
+        assert rows[0] & rows[1]
+    fixed = [drive.solids.boxes[drive.solids.owner[: len(drive.solids.boxes)] < 0] for drive in (first, later)]
+    assert np.array_equal(*fixed)
+    path = later.motion.base(np.arange(0.0, 20.0, 0.1))[:, :2, 3]
+    assert later.solids.clearance_m(path, 2.0).min() > 0.1
+    assert later.changes[0].owner == plan("office", seed=3, duration_s=20.0, changed=1).changes[0].owner
+
+
+def test_changes_of_another_day_are_listed_beside_the_log(tmp_path):
+    simulate("office", tmp_path / "later.mcap", seed=3, duration_s=1.0, changed=1)
+    lines = (tmp_path / "later.changes.csv").read_text().splitlines()
+    assert lines[0].startswith("kind,x_before,")
+    assert len(lines) > 10
