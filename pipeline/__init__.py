@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-
 if TYPE_CHECKING:
     from typing import Any
 
-    from scanchain.api import compare, downsample, localize, merge, optimize, run
+    from scanchain.api import changes, compare, downsample, localize, merge, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
@@ -42,6 +42,7 @@ _HOMES = {
     "Trajectory": "data",
     "VoxelMap": "registration",
     "align": "registration",
+    "changes": "api",
     "compare": "api",
     "create_matcher": "registration",
     "downsample": "api",
@@ -67,6 +68,7 @@ _COMPILED = {
     "Slam",
     "VoxelMap",
     "align",
+    "changes",
     "compare",
     "create_matcher",
     "downsample",
@@ -93,6 +95,7 @@ __all__ = [
     "Trajectory",
     "VoxelMap",
     "align",
+    "changes",
     "compare",
     "create_matcher",
     "downsample",

@@ -30,7 +30,7 @@ class LoopCloser:
         verifier = ScanVerifier(config, submaps)
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)
-        self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
+        self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
     def begin_in(self, keyframes: Sequence[Keyframe], *, is_fixed: bool = True) -> float:

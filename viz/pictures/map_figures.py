@@ -58,6 +58,22 @@ def path_over_map(
         return figure.svg()
 
 
+def layers_picture(
+    name: str,
+    layers: Sequence[tuple[Points, str]],
+    outlines: Sequence[tuple[Floats, str]],
+    low: Floats,
+    high: Floats,
+) -> Markup:
+    """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
+    with SvgFigure.of_plan(name, low, high) as figure:
+        for points, color in layers:
+            draw_points(figure, points, low, high, color)
+        for outline, color in outlines:
+            figure.axes.plot(*np.vstack([outline, outline[:1]])[:, :2].T, color=color, linewidth=0.8)
+        return figure.svg()
+
+
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
 _MARGIN_M = 1.0  # around their points
 _VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes
