@@ -33,10 +33,14 @@ class LoopCloser:
         self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
-    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
-        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
-        self.near.of_map = len(keyframes)
-        self.near.submaps.begin_in(keyframes)
+    def begin_in(self, keyframes: Sequence[Keyframe], *, is_fixed: bool = True) -> float:
+        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
+
+        is_fixed : whether they stay where they are; else only those of one pass make a submap
+        """
+        if is_fixed:
+            self.near.of_map = len(keyframes)
+            self.near.submaps.begin_in(keyframes)
         return self.places.begin_in(keyframes)
 
     def start_segment(self, keyframe: int) -> None:

@@ -100,12 +100,12 @@ def join_all(
     while waiting:
         world = Joined.of(waiting[0], maps[waiting[0]])
         waiting = waiting[1:]
-        tried: dict[int, int] = {}
-        while untried := [number for number in waiting if tried.get(number) != len(world.maps)]:
-            number = untried[0]
+        tried: set[tuple[int, bool, int]] = set()
+        while (following := _next(waiting, tried, world)) is not None:
+            tried.add(following)
+            number, thorough, _ = following
             say(f"{maps[number].name}: searching in a map of {len(world.keyframes):,} keyframes")
-            tried[number] = len(world.maps)
-            joined = join(world, Joined.of(number, maps[number]), config, held)
+            joined = join(world, Joined.of(number, maps[number]), config, held, thorough=thorough)
             if joined is not None:
                 world = joined
                 waiting.remove(number)
@@ -113,17 +113,27 @@ def join_all(
     return groups
 
 
-def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined | None:
+def _next(
+    waiting: Sequence[int], tried: set[tuple[int, bool, int]], world: Joined
+) -> tuple[int, bool, int] | None:
+    """Number of a map that was not tried in a world of this many maps, thoroughly only once all were tried."""
+    ways = (False, True) if world.dimension == 2 else (True,)
+    untried = ((number, thorough, len(world.maps)) for thorough in ways for number in waiting)
+    return next((each for each in untried if each not in tried), None)
+
+
+def join(world: Joined, guest: Joined, config: Config, held: int = -1, *, thorough: bool = True) -> Joined | None:
     """Both in the frame of the world; None where too few closures join them, or as many do elsewhere.
 
-    Where most of the guest overlaps the world, there is no elsewhere to be looked for.
+    Where much of the guest overlaps the world, it is not sought elsewhere.
+    thorough : whether pieces of the guest are sought one by one and little overlap is enough; takes long
     """
     apart = msgspec.structs.replace(
         config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0
     )
     between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
     old, tried, trials = len(world.keyframes), list[Pose](), list[Joined]()
-    for found, T_world_guest in _sought(world, guest, between):
+    for found, T_world_guest in _sought(world, guest, between, thorough=thorough):
         if len(tried) == _MAX_TRIES:
             break
         if not any(_same(T_world_guest, other) for other in tried):
@@ -131,7 +141,7 @@ def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined
             trial = _Closing(world, guest, found, T_world_guest, between, held).finish()
             if trial is not None and _joining(trial, old) > _CLEAR * len(guest.keyframes):
                 return trial
-            trials += [] if trial is None else [trial]
+            trials += [trial] if trial is not None and thorough else []
     trials.sort(key=lambda trial: -_joining(trial, old))
     if len(trials) > 1 and _joining(trials[1], old) > _RIVAL * _joining(trials[0], old):
         return None
@@ -177,14 +187,14 @@ def _body(joined: Joined, held: int) -> int:
     return int((joined.of_map == held).sum()) or 1
 
 
-def _sought(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[Closure, Pose]]:
+def _sought(world: Joined, guest: Joined, config: Config, *, thorough: bool) -> Iterator[tuple[Closure, Pose]]:
     """Closures of the guest's keyframes in the world, without an expected pose, with T_world_guest by each.
 
-    In the plane pieces of the guest are sought one by one: what is sought in vain for long is sought seldom.
+    What is sought in the plane in vain for long is sought seldom; ``thorough`` : pieces of it one by one.
     """
-    for piece in _pieces(guest) if guest.dimension == 2 else [guest.keyframes]:
+    for piece in _pieces(guest) if thorough and guest.dimension == 2 else [guest.keyframes]:
         closer, keyframes, graph = LoopCloser(config, world.dimension), list(world.keyframes), graph_of(world)
-        begin_m = closer.begin_in(keyframes)
+        begin_m = closer.begin_in(keyframes, is_fixed=False)
         closer.start_segment(len(keyframes))
         for keyframe in _after(piece, len(keyframes), begin_m):
             keyframes.append(keyframe)
@@ -226,7 +236,7 @@ class _Closing:
 
     def finish(self) -> Joined | None:
         """Both joined; None where too few closures between them are in force."""
-        old, begin_m = len(self.keyframes), self.closer.begin_in(self.keyframes)
+        old, begin_m = len(self.keyframes), self.closer.begin_in(self.keyframes, is_fixed=False)
         for index in range(_body(self.world, self.held)):
             self.graph.fix(index)
         edges = self.guest.edges
@@ -317,13 +327,12 @@ def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float
         near = KDTree([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
         for viewer in viewers:
             away_m, index = near.query(viewer.T_odom_lidar[:d, d])
+            other = viewed[int(index)]
             if away_m <= _NEAR_M[d]:
                 nearest_ranges(_in_space(viewer), ranges_m)
-                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, viewed[index].T_odom_lidar))
+                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
                 margin_m = _MARGIN_M[d] * viewer.scale
-                yes, no = compare_ranges(
-                    _in_space(viewed[index]), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
-                )
+                yes, no = compare_ranges(_in_space(other), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE)
                 agreeing, contradicting = agreeing + yes, contradicting + no
     return contradicting / max(agreeing + contradicting, 1)
 
