@@ -28,6 +28,15 @@ from scanchain.words import counted
 @click.option(
     "--dropout", type=float, metavar="SHARE", help="Share of returns that are lost. [default: the sensor's]"
 )
+@click.option(
+    "--day",
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Another drive than on day 0; in the town, other cars are parked and people about.",
+)
+@click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
+@click.option("--start", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
     world: str,
@@ -38,6 +47,9 @@ def simulate(
     drift: float,
     noise: float | None,
     dropout: float | None,
+    day: int,
+    reverse: bool,
+    start: float,
     force: bool,
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
@@ -64,6 +76,7 @@ def simulate(
       scanchain simulate town town.mcap --duration 20 --seed 3
       scanchain simulate highway fast.mcap --sensor os1-32
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
+      scanchain simulate town again.mcap --day 1 --reverse --start 100
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
@@ -80,6 +93,9 @@ def simulate(
             drift=drift,
             noise_m=noise,
             dropout=dropout,
+            day=day,
+            reverse=reverse,
+            start_m=start,
             force=force,
             progress=terminal.count,
         )

@@ -20,6 +20,7 @@ EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
 _DROPOUT_S = 1.0
 _LONGEST_S = 36_000.0
+_FARTHEST_M = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,9 @@ def plan(
     sensor: str | None = None,
     noise_m: float | None = None,
     dropout: float | None = None,
+    day: int = 0,
+    reverse: bool = False,
+    start_m: float = 0.0,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
     place = find_world(world)
@@ -67,18 +71,28 @@ def plan(
     length_s = place.duration_s if duration_s is None else duration_s
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
+    check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    if isinstance(place.route, tuple) and (reverse or start_m):
+        raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = place.build(random_numbers(seed, PLACE))
+    if day and place.another_day is not None:
+        solids = place.another_day(random_numbers(seed, PLACE), random_numbers(seed, PLACE, day))
     motion = place.motion(
-        solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, DEVIATION)
+        solids,
+        duration_s=length_s + lidar.period_ns * 1e-9,
+        rng=random_numbers(seed, DEVIATION, day),
+        reverse=reverse,
+        start_m=start_m,
     )
     return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, _recorded(place, motion, lidar, count))
 
 
-def random_numbers(seed: int, purpose: int) -> np.random.Generator:
-    """Random numbers for one purpose of a drive."""
-    if seed < 0:
-        raise InputError(f"seed {seed} is negative; choose one from 0 up")
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose,)))
+def random_numbers(seed: int, purpose: int, day: int = 0) -> np.random.Generator:
+    """Random numbers for one purpose of a drive; other ones every day."""
+    for name, value in (("seed", seed), ("day", day)):
+        if value < 0:
+            raise InputError(f"{name} {value} is negative; choose one from 0 up")
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, day) if day else (purpose,)))
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:

@@ -30,6 +30,9 @@ def simulate(
     drift: float = 1.0,
     noise_m: float | None = None,
     dropout: float | None = None,
+    day: int = 0,
+    reverse: bool = False,
+    start_m: float = 0.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
@@ -39,7 +42,9 @@ def simulate(
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
-    ``progress`` is called with the scans done and in all.
+    ``progress`` is called with the scans done and in all. On another ``day`` than 0 the drive and what changes in
+    the world, parked cars and people in the town, are others; ``reverse`` drives the other way round, from
+    ``start_m`` along that route.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
@@ -48,8 +53,18 @@ def simulate(
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
         raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
-    drive = plan(world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout)
-    return record(drive, destination, seed=seed, drift=drift, force=force, progress=progress)
+    drive = plan(
+        world,
+        seed=seed,
+        duration_s=duration_s,
+        sensor=sensor,
+        noise_m=noise_m,
+        dropout=dropout,
+        day=day,
+        reverse=reverse,
+        start_m=start_m,
+    )
+    return record(drive, destination, seed=seed, day=day, drift=drift, force=force, progress=progress)
 
 
 def record(
@@ -57,6 +72,7 @@ def record(
     destination: Path,
     *,
     seed: int = 0,
+    day: int = 0,
     drift: float = 1.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -67,8 +83,8 @@ def record(
     with LogWriter(destination, force=force) as log:
         log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
         end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
-        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
-        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
+        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS, day))
+        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, day))):
             stamp_ns = int(truth.stamps_ns[done])
             wheels.write_until(stamp_ns - 1)  # in a dropout
             log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
