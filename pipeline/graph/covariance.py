@@ -36,28 +36,33 @@ def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) 
     return adjoint @ difference_covariance(problem, i, j) @ adjoint.T
 
 
+def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
+    """Cov(ξ, ξ_j − ξ_i), (K, k, k), of the left twists of all poses, by k solves with the factor of H."""
+    result = np.zeros((len(problem.variable), problem.freedom, problem.freedom))
+    result[j] += np.eye(problem.freedom)
+    result[i] -= np.eye(problem.freedom)
+    packing = problem.packing
+    result[problem.free] = packing.spread_rows(problem.cholesky.solve(packing.rows(result[problem.free])))
+    result[problem.variable < 0] = 0.0
+    return result
+
+
 def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
     """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by k solves with the factor of H."""
-    selection = np.zeros((len(problem.free), problem.freedom, problem.freedom))
-    for pose, sign in ((i, -1.0), (j, 1.0)):
-        if problem.variable[pose] >= 0:
-            selection[problem.variable[pose]] += sign * np.eye(problem.freedom)
-    flat = problem.packing.rows(selection)
-    return flat.T @ problem.cholesky.solve(flat)
+    moved = responses(problem, i, j)
+    return moved[j] - moved[i]
 
 
-def residual_covariances(
-    problem: BetweenProblem, factored: BetweenProblem, jacobians: Matrix, edges: NDArray[np.int64]
-) -> Matrix:
-    """Covariances (L, k, k) of the residuals of edges (L,) that a factored problem without them predicts.
+def inverse_blocks(problem: BetweenProblem) -> Matrix:
+    """Blocks (…, k, k) of H⁻¹ where H may be nonzero, and a last one of zeros, found by −1, of the fixed poses."""
+    blocks = problem.packing.blocks(problem.cholesky.inverse_blocks())
+    return np.concatenate([blocks, np.zeros((1, *blocks.shape[1:]))])
 
-    jacobians : (E, k, k) of all edges of the problem
-    """
-    result = np.linalg.pinv(problem.information[edges], hermitian=True)
-    for place, edge in enumerate(edges):
-        joint = difference_covariance(factored, *problem.edges[edge])
-        result[place] += jacobians[edge] @ joint @ jacobians[edge].T
-    return result
+
+def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
+    """Cov(ξ_j − ξ_i), (E, k, k), of the left twists of the ends of every edge, of these ``inverse_blocks``."""
+    i, j, pair = problem.slots.T
+    return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
 def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:

@@ -13,12 +13,12 @@ from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.optimization import Solved, solve
-from scanchain.graph.robust.drift import corrected, drift_step, penalty, size
+from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.left_out import LeftOut
 from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
 
-_WORTH = 3.0  # loop edges, none near another, that a systematic drift must bring in, less what it costs
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
@@ -42,21 +42,34 @@ class Explanation:
         """Odometry as it is."""
         return cls(np.zeros(size(freedom)))
 
-    def measurements(self, measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]) -> Matrix:
-        """Measurements (E, d+1, d+1) with drift and slips taken out of odometry."""
+    def applied(
+        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
+    ) -> tuple[Matrix, Matrix]:
+        """Measurements (E, d+1, d+1) and their information (E, k, k), drift and slips taken out of odometry."""
         if not self.drift.any() and not self.slips:
-            return measured
-        result, odometry = measured.copy(), ~is_loop
-        result[odometry] = corrected(
-            without_slips(measured[odometry], information[odometry], self.slips), self.drift
-        )
-        return result
+            return measured, information
+        odometry = odometry_of(edges, is_loop)
+        measured, information = measured.copy(), information.copy()
+        slipped = without_slips(measured[odometry], information[odometry], self.slips)
+        measured[odometry] = corrected(slipped, self.drift, _sign(edges[odometry]))
+        information[odometry] = rescaled(information[odometry], self.drift)
+        return measured, information
 
-    def cost(self, measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_], price: float) -> float:
-        """Cost of the explanation itself, where a loop edge left out costs this price."""
-        odometry = ~is_loop
-        of_slips = sum(price_of(slip, measured[odometry], information[odometry]) for slip in self.slips)
-        return of_slips + penalty(self.drift) + (_WORTH * price if self.drift.any() else 0.0)
+    def cost(self, measured: Matrix, information: Matrix, price: float) -> float:
+        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry."""
+        of_slips = sum(price_of(slip, measured, information) for slip in self.slips)
+        return of_slips + penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
+
+
+def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Edges of odometry (O,), in the order of the poses."""
+    odometry = np.flatnonzero(~is_loop)
+    return odometry[np.argsort(edges[odometry].min(axis=1), kind="stable")]
+
+
+def _sign(edges: NDArray[np.int64]) -> NDArray[np.float64]:
+    """1 of edges (O, 2) to a later pose, −1 of those to an earlier one."""
+    return np.sign(edges[:, 1] - edges[:, 0]).astype(np.float64)
 
 
 def corrections(
@@ -64,7 +77,8 @@ def corrections(
 ) -> list[str]:
     """Corrections of odometry in words, a line each.
 
-    edges : (O, 2) those of odometry; names (K,), noun : numbers of the poses for the reader, and what they number
+    edges : (O, 2) those of odometry, in the order of the poses
+    names (K,), noun : numbers of the poses for the reader, and what they number
     """
     lines = []
     if explanation.drift.any():
@@ -72,7 +86,7 @@ def corrections(
         turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
         lines.append(f"corrected by loop closures: length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
     for slip in explanation.slips:
-        first, last = (names[pose] for pose in (edges[slip.edges][0, 0], edges[slip.edges][-1, 1]))
+        first, last = (names[pose] for pose in (edges[slip.edges].min(), edges[slip.edges].max()))
         lines.append(
             f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between {noun} {first:,} and {last:,}"
         )
@@ -95,25 +109,22 @@ class Explainer:
         self,
         problem_of: Callable[[Explanation], BetweenProblem],
         measured: Matrix,
+        information: Matrix,
         is_loop: NDArray[np.bool_],
         config: GraphConfig,
         rejection: OutlierRejection,
-        unexplained: int,
     ) -> None:
-        """problem_of : the problem under an explanation; measured : (E, d+1, d+1) as odometry has it.
-
-        unexplained : number of loop edges left out for which no slip was found; until there are more, slips are
-            looked for again where the rejection is "refined" only
-        """
-        self._problem_of, self._measured, self._is_loop = problem_of, measured, is_loop
-        self._config, self.unexplained = config, unexplained
+        """problem_of : the problem under an explanation; measured, information : of all edges, as added."""
+        self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
+        self._measured, self._information = measured, information
         self._rejection: OutlierRejection = rejection
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
         best = self._solved(explanation, poses, initialize)
+        explains = self._rejection != "gnc" and not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
-            better = next(self._better(best), None)
+            better = next(self._better(best), None) if explains and best.solved.minimum.price else None
             if better is None:
                 break
             best = better
@@ -121,29 +132,28 @@ class Explainer:
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
-        minimum, problem = best.solved.minimum, best.problem
-        if minimum.price == 0.0 or len(problem.sightings):
-            return
+        price = best.solved.minimum.price
         for explanation in self._candidates(best):
             trial = self._solved(explanation, best.solved.poses, "given")
-            if self._cost(trial, minimum.price) < self._cost(best, minimum.price) - _SETTLED * minimum.price:
+            if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
     def _candidates(self, best: Explained) -> list[Explanation]:
-        problem, now, poses, price = best.problem, best.explanation, best.solved.poses, best.solved.minimum.price
+        problem, now, price = best.problem, best.explanation, best.solved.minimum.price
         kept = best.solved.minimum.weights > REJECTED_WEIGHT
-        count = len(apart(problem.edges, np.flatnonzero(self._is_loop & ~kept)))
-        if count < _FEWEST:
+        rejected = np.flatnonzero(~kept)
+        if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
+        odometry = odometry_of(problem.edges, self._is_loop)
+        left_out = LeftOut.at(problem, best.solved.poses, odometry, kept)
         found: list[tuple[float, Explanation]] = []
-        if now.drift.any() or (self._is_loop & ~kept).sum() > _WORTH:
-            step = drift_step(problem, poses, self._is_loop, kept, now.drift, price)
-            gain = step.gain - (0.0 if now.drift.any() else _WORTH * price)
-            found.append((gain, replace(now, drift=now.drift + step.change)))
-        if self._rejection == "refined" or count > self.unexplained:
-            self.unexplained = count
-            gain, slips = next_slip(problem, self._measured, poses, self._is_loop, kept, now.slips, price)
-            found.append((gain, replace(now, slips=slips)))
+        if now.drift.any() or len(rejected) > FEWEST:
+            gain, change = drift_step(left_out, _sign(problem.edges[odometry]), now.drift, price)
+            found.append(
+                (gain - (0.0 if now.drift.any() else FEWEST * price), replace(now, drift=now.drift + change))
+            )
+        gain, slips = next_slip(left_out, self._measured[odometry], now.slips, price)
+        found.append((gain, replace(now, slips=slips)))
         found.sort(key=lambda each: -each[0])
         return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
@@ -154,9 +164,7 @@ class Explainer:
 
     def _cost(self, explained: Explained, price: float) -> float:
         """Cost of a minimum at this price of a loop edge, and of its explanation."""
-        minimum, explanation = explained.solved.minimum, explained.explanation
+        minimum, odometry = explained.solved.minimum, odometry_of(explained.problem.edges, self._is_loop)
         kept = minimum.weights > REJECTED_WEIGHT
-        chi2 = float(minimum.estimate.chi2[kept].sum())
-        information = explained.problem.information
-        own = explanation.cost(self._measured, information, self._is_loop, price)
-        return chi2 + price * int((self._is_loop & ~kept).sum()) + own
+        own = explained.explanation.cost(self._measured[odometry], self._information[odometry], price)
+        return float(minimum.estimate.chi2[kept].sum()) + price * int((~kept).sum()) + own

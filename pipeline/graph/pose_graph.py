@@ -16,7 +16,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
-from scanchain.graph.explanation import Explainer, Explanation, corrections
+from scanchain.graph.explanation import Explainer, Explanation, corrections, odometry_of
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -28,7 +28,7 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.optimization import Optimization
 from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.slips import Slip
@@ -57,7 +57,7 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
-        self._explanation, self._unexplained = Explanation.none(k), 0
+        self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
 
@@ -90,7 +90,7 @@ class PoseGraph:
     @property
     def measurements(self) -> Matrix:
         """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift`` and ``slips``."""
-        return self._explanation.measurements(self._measurements.rows, self.information, self.is_loop)
+        return self._applied(self._explanation)[0]
 
     @property
     def drift(self) -> NDArray[np.float64]:
@@ -107,12 +107,13 @@ class PoseGraph:
 
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
         """``drift`` and ``slips`` in words, a line each; ``names`` (K,) number the poses for the reader."""
-        return corrections(self._explanation, self.edges[~self.is_loop], names, noun)
+        edges = self.edges[odometry_of(self.edges, self.is_loop)]
+        return corrections(self._explanation, edges, names, noun)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k)."""
-        return self._information.rows
+        """Ω of every edge, (E, k, k), as ``measurements``."""
+        return self._applied(self._explanation)[1]
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
@@ -233,22 +234,19 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            if rejection != "gnc" and config.robust == "truncated":
-                measured = self._measurements.rows
-                explainer = Explainer(
-                    self._problem_of, measured, self.is_loop, config, rejection, self._unexplained
-                )
-                explained = explainer.solve(self._explanation, self.poses, initialize)
-                self._unexplained = explainer.unexplained
-                solved = explained.solved
-                if explained.explanation is not self._explanation:
-                    self._changed()
-                    self._explanation = explained.explanation
-            else:
-                solved = solve(problem, self.poses, self.is_loop, config, initialize, rejection)
+            explainer = Explainer(
+                self._problem_of,
+                self._measurements.rows,
+                self._information.rows,
+                self.is_loop,
+                config,
+                rejection,
+            )
+            explained = explainer.solve(self._explanation, self.poses, initialize)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
-        minimum = solved.minimum
+        solved, minimum = explained.solved, explained.solved.minimum
+        self._problem, self._explanation = explained.problem, explained.explanation
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
@@ -354,8 +352,11 @@ class PoseGraph:
         """The problem under an explanation; the one that is there already, if it is that."""
         if self._problem is not None and explanation is self._explanation:
             return self._problem
-        measurements = explanation.measurements(self._measurements.rows, self.information, self.is_loop)
-        return BetweenProblem(self.edges, measurements, self.information, self.fixed, self.is_point)
+        return BetweenProblem(self.edges, *self._applied(explanation), self.fixed, self.is_point)
+
+    def _applied(self, explanation: Explanation) -> tuple[Matrix, Matrix]:
+        """Measurements and information of all edges under an explanation."""
+        return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_loop)
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""

@@ -52,12 +52,12 @@ class LoopCloser:
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
-        return closures + self.places.close(keyframes, graph.poses, connected)
+        return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the submaps that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        return self.places.close(keyframes, graph.poses, components == components[-1], finish=True)
+        return self.places.close(keyframes, graph, components == components[-1], finish=True)
 
 
 class ProximityCloser:

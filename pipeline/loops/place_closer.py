@@ -11,12 +11,14 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
 from scanchain.errors import InputError, shown
+from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_recognizer
 from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier, Verification
 
 _PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
+_PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
 _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 
 
@@ -54,14 +56,14 @@ class PlaceCloser:
     def close(
         self,
         keyframes: Sequence[Keyframe],
-        T_world: Matrix,
+        graph: PoseGraph,
         connected: NDArray[np.bool_],
         *,
         finish: bool = False,
     ) -> tuple[Closure, ...]:
         """Closures of the submaps that are complete by now, accepted or not; with ``finish``, of all others, too.
 
-        keyframes : all so far; T_world : (K, d+1, d+1) their best known poses
+        keyframes : all so far; graph : their best known poses, and how sure they are
         connected : (K,) keyframes in the component of the newest
         """
         recognizer = self._recognizer(keyframes)
@@ -69,7 +71,7 @@ class PlaceCloser:
             return ()
         closures: list[Closure] = []
         for anchor in self._anchors(keyframes, finish):
-            closures += self._closures(recognizer, anchor, keyframes, T_world, connected)
+            closures += self._closures(recognizer, anchor, keyframes, graph, connected)
         return tuple(closures)
 
     def _recognizer(self, keyframes: Sequence[Keyframe]) -> Recognizer | None:
@@ -98,11 +100,11 @@ class PlaceCloser:
         recognizer: Recognizer,
         anchor: Keyframe,
         keyframes: Sequence[Keyframe],
-        T_world: Matrix,
+        graph: PoseGraph,
         connected: NDArray[np.bool_],
     ) -> Iterator[Closure]:
         """The first that is accepted, after those that are not."""
-        submap = self._submap(anchor, keyframes)
+        submap, T_world = self._submap(anchor, keyframes), graph.poses
         recognizer.add(submap)
         self.added.append(anchor.index)
         apart_m = max((RADII_BEHIND + RADII_AHEAD) * submap.radius_m, self.config.loops.min_travel_m)
@@ -117,7 +119,7 @@ class PlaceCloser:
             if not is_connected and candidate.proposed_by is Proposal.POSITION:
                 continue
             verified = self._verify(submap, candidate, keyframes)
-            problem = self._problem(candidate, verified, query, is_connected)
+            problem = self._problem(candidate, verified, query, graph if is_connected else None)
             closure = verified.closure(candidate.target, anchor.index, candidate.proposed_by, problem=problem)
             yield closure
             if closure.verdict is Verdict.ACCEPTED:
@@ -172,20 +174,28 @@ class PlaceCloser:
         target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
         return self.submap_verifier.verify(source, target, T_first)
 
-    def _problem(self, candidate: Candidate, verified: Verification, query: Query, is_connected: bool) -> str:
+    def _problem(self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None) -> str:
         """Reason why an aligned candidate is no closure, empty if it is one.
 
-        Between unconnected keyframes the distance that odometry has them apart means nothing.
+        graph : None between unconnected keyframes, where the distance that odometry has them apart means nothing
         """
         limits, anchor = self.config.loops, query.submap.anchor
         if candidate.rival >= 0:
             return f"keyframe {candidate.rival} is as similar"
-        if not is_connected:
+        if graph is None or verified.problem:
             return ""
         T_world_i, T_world_j = query.T_world[candidate.target], query.T_world[anchor.index]
         moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
         moved_m = float(np.linalg.norm(moved[:-1, -1]))
         traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
-        if moved_m > max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
-            return f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between"
-        return ""
+        if moved_m <= max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
+            return ""
+        d = self.dimension
+        covariance = graph.relative_covariance(candidate.target, anchor.index)[:d, :d]
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        if moved_m <= _PLACE_SIGMAS * sigma_m:
+            return ""
+        return (
+            f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between and "
+            f"than {_PLACE_SIGMAS:g} of its standard deviations ({sigma_m:.1f} m)"
+        )

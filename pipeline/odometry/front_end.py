@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Matrix, Points, Pose, Scan, State
+from scanchain.data import LEAST_FIT, Matrix, Points, Pose, Scan, State
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
 
@@ -40,6 +40,7 @@ class FrontEnd:
         self.T_odom_last = lie.identity(self.odometry.dimension)
         self.at_keyframe = np.zeros((lie.twist_size(T_base_lidar),) * 2)
         self.covariance: Matrix | None = self.at_keyframe  # of the motion since the keyframe, None where unknown
+        self.doubt = self.at_keyframe  # of the motion, by scans that their correspondences contradict
         self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0
@@ -53,6 +54,7 @@ class FrontEnd:
         if is_keyframe:
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.at_keyframe, 0
+            self.doubt = self.at_keyframe
         local_map = self.odometry.local_map
         return Located(
             tracked=tracked,
@@ -73,20 +75,43 @@ class FrontEnd:
         self.has_wheels |= tracked.prior.is_measured
         n, T_last_current = self.since_keyframe, lie.between(self.T_odom_last, tracked.T_odom_lidar)
         self.T_odom_last = tracked.T_odom_lidar
+        Ad = lie.adjoint(lie.inverse(T_last_current))
+        self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
         if not self.has_wheels:
             self.covariance = None
         if self.covariance is None:
-            return tracked.match.information
+            return self._doubted(tracked.match.information)
         predicted = n * tracked.prior.covariance
         if n > 1:
-            Ad = lie.adjoint(lie.inverse(T_last_current))
             predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
         matched = np.zeros_like(predicted) if tracked.state is State.LOST else tracked.match.information
         information = np.linalg.inv(predicted) + matched
         self.covariance = np.linalg.inv(information).astype(np.float64, copy=False)
-        return information
+        return self._doubted(information)
+
+    def _doubted(self, information: Matrix) -> Matrix:
+        """Information with the doubt added to the covariance."""
+        if not self.doubt.any():
+            return information
+        return np.asarray(
+            np.linalg.solve(np.eye(len(information)) + information @ self.doubt, information), np.float64
+        )
 
     def _moved_enough(self, tracked: Tracked) -> bool:
         distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)
         is_far = distance_m > self.config.keyframe_distance_m or angle_rad > self.config.keyframe_angle_rad
         return is_far and tracked.state is not State.LOST
+
+
+def _doubt_of(tracked: Tracked) -> Matrix:
+    """Covariance (k, k) that a scan adds to the motion where its correspondences contradict the pose.
+
+    Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans
+    are aligned to holds this one, so that they inherit its error. In the plane most of the poses that so few
+    correspondences contradict are right, and doubt would let drift gather there.
+    """
+    prior, match = tracked.prior, tracked.match
+    if len(prior.covariance) == 3 or tracked.state is State.LOST or match.fit >= LEAST_FIT:
+        return np.zeros_like(prior.covariance)
+    innovation = lie.log(lie.between(prior.T_target_source, match.T_target_source))
+    return prior.covariance + np.outer(innovation, innovation)

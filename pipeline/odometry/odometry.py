@@ -20,7 +20,15 @@ from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import Standstill
-from scanchain.odometry.tracked import NEW_MAP, Tracked, blurred, first_match, nothing_to_match, seen_from
+from scanchain.odometry.tracked import (
+    NEW_MAP,
+    Tracked,
+    blurred,
+    first_match,
+    nothing_to_match,
+    seen_from,
+    spread,
+)
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
@@ -30,16 +38,17 @@ from scanchain.settings import check_dimension, check_order, load_settings
 class _Registered:
     """The match of a scan, the points (N, d) that were aligned, deskewed to the middle, and the prediction.
 
-    ``elsewhere_m`` as in ``Tracked``; ``is_standing`` if the lidar did not move since the scan before.
+    ``elsewhere_m`` as in ``Tracked``, ``rival`` as in ``Aligned``; ``is_standing`` if the lidar did not move since
+    the scan before.
     """
 
     points: Points
     match: Match
     state: State
-    reason: str
     prediction: Prediction
     elsewhere_m: float = 0.0
     is_standing: bool = False
+    rival: NDArray[np.float64] | None = None
 
 
 class Odometry:
@@ -113,14 +122,15 @@ class Odometry:
         points = sweep.from_middle(self.predictor.velocity)
         self._extend(points, registered)
         self._calibrate(points, registered.state)
+        match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
             scan=scan,
             points=points,
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
-            match=registered.match,
+            match=match,
             state=_reported(registered),
-            reason=registered.reason,
+            reason=match.reason,
             prior=prediction.prior,
             preprocess_s=prepared - started,
             match_s=aligned - prepared,
@@ -134,18 +144,18 @@ class Odometry:
         points = sparse.from_middle(prediction.velocity)
         if not len(points):
             match = nothing_to_match(prediction, self.config.preprocess)
-            return _Registered(points, match, State.LOST, match.reason, prediction)
+            return _Registered(points, match, State.LOST, prediction)
         if not len(self.local_map):
             match = first_match(prediction.T_odom_last, points, self.config.matching)
             self.first_sweep, self.first_points = sweep, sweep.points
-            return _Registered(points, match, State.OK, match.reason, prediction)
+            return _Registered(points, match, State.OK, prediction)
         usual_cost = self.recovery.usual_cost
-        match = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
+        match, rival = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
         may_stand = self.dimension == 3 and not prediction.prior.is_measured
         if is_placed and may_stand and self.standstill.confirms(match):
             match = replace(match, T_target_source=self.standstill.T_odom_lidar)
-            return _Registered(points, match, self._judge(match), match.reason, prediction, is_standing=True)
+            return _Registered(points, match, self._judge(match), prediction, is_standing=True)
         if sparse.is_distorted and is_placed:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
@@ -153,7 +163,7 @@ class Odometry:
             self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             return self._reset_map(points, prediction)
-        return _Registered(points, match, state, match.reason, prediction)
+        return _Registered(points, match, state, prediction, rival=None if state is State.LOST else rival)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
         """Deskew once more with the velocity by the match, and align once more.
@@ -189,7 +199,7 @@ class Odometry:
         reason = f"may be {away_m:.0f} m away after a time without scans: {NEW_MAP}"
         match = first_match(prediction.T_odom_last, points, self.config.matching)
         match = replace(match, converged=False, reason=reason)
-        return _Registered(points, match, State.OK, reason, prediction, away_m)
+        return _Registered(points, match, State.OK, prediction, away_m)
 
     def _judge(self, match: Match) -> State:
         if match.inlier_share < self.config.matching.min_inlier_share:
@@ -255,11 +265,17 @@ class Odometry:
 
 
 def _reported(registered: _Registered) -> State:
-    """State of a scan as it is reported: of a new map, lost; of a pose that its correspondences contradict, so."""
+    """State of a scan as it is reported.
+
+    Of a new map, lost; of a pose that its correspondences contradict, so; of one of several that fit, degenerate.
+    """
     if registered.elsewhere_m > 0.0:
         return State.LOST
-    is_contradicted = registered.state is State.OK and registered.match.fit < LEAST_FIT
-    return State.CONTRADICTED if is_contradicted else registered.state
+    if registered.state is not State.OK:
+        return registered.state
+    if registered.match.fit < LEAST_FIT:
+        return State.CONTRADICTED
+    return State.OK if registered.rival is None else State.DEGENERATE
 
 
 def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: int | None) -> tuple[Config, Pose]:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
-from scanchain.registration import BirdsEye, CorrelativeMap, Matcher, VoxelMap
+from scanchain.registration import AMBIGUOUS, BirdsEye, CorrelativeMap, Matcher, VoxelMap, Window
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
@@ -22,8 +25,17 @@ _UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradi
 _CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
 _SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
 _SEEDS = 3  # number of poses from the bird's-eye search that are aligned
+_LONG_S = 1.0  # shortest gap after which a robot may have turned around
+_SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of those of the search in the plane: distance, share of the best score
 _NEAR_PERCENT = 95.0  # share of the points within the radius of the bird's-eye image
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
+
+
+class Aligned(NamedTuple):
+    """The best alignment of a scan, and the twist (k,) from it to another pose that fits nearly as well."""
+
+    match: Match
+    rival: NDArray[np.float64] | None
 
 
 class Recovery:
@@ -38,26 +50,31 @@ class Recovery:
 
     def align(
         self, matcher: Matcher, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
-    ) -> Match:
+    ) -> Aligned:
         """The alignment from the predicted pose or, where that one is uncertain, the best of several.
 
         points : (N, d) those to be aligned; sweep : all of the scan
         """
         wide = self.wide_scans > 0 or prediction.is_guess
         best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
+        tried = [best]
         is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
         if is_contradicted:
-            best = self._searched(best, matcher, points, sweep, surfaces, prediction)
+            best = self._searched(tried, matcher, points, sweep, surfaces, prediction)
         is_found = is_contradicted and _is_sound(best)
         if not is_found and self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
+                tried.append(other)
                 if self._cost(other, prediction) < self._cost(best, prediction):
                     best = other
+        rival = None
+        if _is_free(prediction):
+            best, rival = self._decided(best, tried, surfaces, prediction)
         if surfaces.dimension == 2 or _is_sound(best):
             cost = best.cost / len(points)
             self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
-        return best
+        return Aligned(best, rival)
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
         """True if a scan without a reliable prediction does not fit the map at the pose that was found.
@@ -97,16 +114,19 @@ class Recovery:
 
     def _searched(
         self,
-        best: Match,
+        tried: list[Match],
         matcher: Matcher,
         points: Points,
         sweep: Sweep,
         surfaces: VoxelMap,
         prediction: Prediction,
     ) -> Match:
-        """The best alignment in space from where upright structure fits, or the one that there was."""
+        """The best alignment in space from where upright structure fits, or the one that there was.
+
+        tried : that one; those that are tried are appended
+        """
         structure = sweep.from_middle(prediction.velocity)
-        tried = [best]
+        best = tried[0]
         for half_width_m, half_width_rad in prediction.windows_in_space():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
             seeds = BirdsEye(surfaces, prediction.T_odom_lidar, radius_m).seeds(
@@ -122,11 +142,38 @@ class Recovery:
                 break
         return best
 
+    def _decided(self, best: Match, tried: Sequence[Match], surfaces: VoxelMap, prediction: Prediction) -> Aligned:
+        """The one nearest to the prediction, of the best alignment and distinct ones that fit nearly as well."""
+        distinct = [
+            match
+            for match in tried
+            if match.cost < AMBIGUOUS * best.cost
+            and match.inlier_share >= self.config.min_inlier_share
+            and _is_sound(match)
+            and not _is_near(match.T_target_source, best.T_target_source, surfaces.voxels.size_m)
+        ]
+        if not distinct:
+            return Aligned(best, None)
+        rival = min(distinct, key=lambda match: _away(match, prediction))
+        if _away(rival, prediction) < _away(best, prediction):
+            best, rival = rival, best
+        return Aligned(best, lie.log(lie.between(best.T_target_source, rival.T_target_source)))
+
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""
-        prior = prediction.prior
-        away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
-        return match.cost + 0.5 * self.config.sensor_noise_m**2 * float(away @ away)
+        return match.cost + 0.5 * self.config.sensor_noise_m**2 * _away(match, prediction)
+
+
+def _is_free(prediction: Prediction) -> bool:
+    """True after a gap so long that any motion within the search window is possible, not after uneven stamps."""
+    return prediction.is_guess and prediction.interval_s > _LONG_S
+
+
+def _away(match: Match, prediction: Prediction) -> float:
+    """Squared distance from the predicted pose, in the largest standard deviations of a prediction."""
+    prior = prediction.prior
+    away = lie.log(lie.between(prior.T_target_source, match.T_target_source)) / prior.widest
+    return float(away @ away)
 
 
 def _is_sound(match: Match) -> bool:
@@ -148,7 +195,7 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     half_width_m, half_width_rad = prediction.window()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
-    seed = CorrelativeMap(surfaces, T_predicted, reach_m).best(
-        points, T_predicted, half_width_m=half_width_m, half_width_rad=half_width_rad
-    )
-    return (*alternatives, seed.T_target_source)
+    window = Window(half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, answers=2)
+    seeds = CorrelativeMap(surfaces, T_predicted, reach_m).search(points, T_predicted, window)
+    seeds = seeds[: 2 if _is_free(prediction) else 1]
+    return (*alternatives, *(lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist()))

@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.config import MatchingConfig, PreprocessConfig
 from scanchain.data import Match, Points, Pose, Prior, Scan, State
 from scanchain.odometry.prediction import Prediction
-from scanchain.registration import with_source_frame
+from scanchain.registration import as_ambiguous, with_source_frame
 
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
 
@@ -22,7 +22,7 @@ class Tracked:
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
     from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
-    ``prior`` is that of its pose at the middle of the scan;
+    ``prior`` is that of this pose, its covariance that at the middle of the scan;
     ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
     """
 
@@ -92,12 +92,22 @@ def blurred(match: Match, error: NDArray[np.float64]) -> Match:
     )
 
 
+def spread(match: Match, rival: NDArray[np.float64]) -> Match:
+    """The same match with a covariance that covers another pose, a twist (k,) away, that fits as well."""
+    Omega_rival = match.information @ rival
+    information = match.information - np.outer(Omega_rival, Omega_rival) / (1.0 + rival @ Omega_rival)
+    T_rival = match.T_target_source @ lie.exp(rival)
+    return as_ambiguous(replace(match, information=information), *lie.apart(match.T_target_source, T_rival))
+
+
 def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
-    """The same scan as seen from another frame that moves with it: points, pose, information."""
+    """The same scan as seen from another frame that moves with it: points, poses, information."""
+    T_old_new = lie.inverse(T_new_old)
     return replace(
         tracked,
         points=lie.transform(T_new_old, tracked.points),
         matched=lie.transform(T_new_old, tracked.matched),
-        T_odom_lidar=tracked.T_odom_lidar @ lie.inverse(T_new_old),
+        T_odom_lidar=tracked.T_odom_lidar @ T_old_new,
         match=with_source_frame(tracked.match, T_new_old),
+        prior=tracked.prior._replace(T_target_source=tracked.prior.T_target_source @ T_old_new),
     )

@@ -1,8 +1,8 @@
 """SVD-ICP and LM-PLICP against a voxel map."""
 
-from scanchain.registration.align import align, with_source_frame
+from scanchain.registration.align import AMBIGUOUS, align, as_ambiguous, with_source_frame
 from scanchain.registration.birds_eye import BirdsEye
-from scanchain.registration.correlative import CorrelativeMap, Seed
+from scanchain.registration.correlative import CorrelativeMap, Seed, Window
 from scanchain.registration.matcher import Matcher, create_matcher
 from scanchain.registration.plicp import PointToShapeMatcher
 from scanchain.registration.svd import DegeneratePairsError, rigid_transform
@@ -10,6 +10,7 @@ from scanchain.registration.svd_icp import SvdMatcher
 from scanchain.registration.voxel_map import VoxelMap
 
 __all__ = [
+    "AMBIGUOUS",
     "BirdsEye",
     "CorrelativeMap",
     "DegeneratePairsError",
@@ -18,7 +19,9 @@ __all__ = [
     "Seed",
     "SvdMatcher",
     "VoxelMap",
+    "Window",
     "align",
+    "as_ambiguous",
     "create_matcher",
     "rigid_transform",
     "with_source_frame",

@@ -23,7 +23,7 @@ _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid
 _WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
 _SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number, distance, share of the best score
 _ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
-_AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival
+AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
 
 
@@ -99,10 +99,15 @@ def _unambiguous(matches: Sequence[Match]) -> Match:
     for other in matches:
         apart_m, apart_rad = lie.apart(best.T_target_source, other.T_target_source)
         is_elsewhere = apart_m > _ELSEWHERE_M or apart_rad > _ELSEWHERE_RAD
-        if best.converged and is_elsewhere and other.cost < _AMBIGUOUS * best.cost:
-            reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
-            best = replace(best, converged=False, reason=reason)
+        if best.converged and is_elsewhere and other.cost < AMBIGUOUS * best.cost:
+            best = as_ambiguous(best, apart_m, apart_rad)
     return best
+
+
+def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
+    """The same match, not converged because a pose so far away fits nearly as well."""
+    reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
+    return replace(match, converged=False, reason=reason)
 
 
 def _range_voxels(points: int, d: int) -> float:

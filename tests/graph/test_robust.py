@@ -1,5 +1,6 @@
 import math
 import re
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -225,25 +226,35 @@ def test_a_loss_of_the_users_that_is_none_is_refused(name, fault):
         graph.optimize(GraphConfig(robust=f"{__name__}:{name}"))
 
 
-def round_trips(drifted, turns=3):
-    """A graph of laps whose odometry is measured as ``drifted`` makes it, every lap closed at every tenth pose."""
+def round_trips(drifted, turns=3, written="forward"):
+    """A graph of laps whose odometry is measured as ``drifted`` makes it, every lap closed at every tenth pose.
+
+    written : how its odometry edges are: "forward", "backward" (from each pose to the one before), "last first"
+    """
     rng = np.random.default_rng(1)
     true = [lie.pose_2d(10 * np.cos(a), 10 * np.sin(a), a + np.pi / 2) for a in np.arange(60 * turns) * np.pi / 30]
     graph, sigma = PoseGraph(2), np.array([0.01, 0.01, 0.005])
     for index in range(len(true)):
         graph.add_pose(true[index], index)
+    odometry = []
     for i in range(len(true) - 1):
-        Z = lie.inverse(true[i]) @ true[i + 1] @ lie.exp(0.3 * sigma * rng.normal(size=3))
-        graph.add_edge(i, i + 1, drifted(i, Z), np.diag(sigma**-2))
+        Z = drifted(i, lie.inverse(true[i]) @ true[i + 1] @ lie.exp(0.3 * sigma * rng.normal(size=3)))
+        odometry.append((i + 1, i, lie.inverse(Z)) if written == "backward" else (i, i + 1, Z))
+    for i, j, Z in reversed(odometry) if written == "last first" else odometry:
+        graph.add_edge(i, j, Z, np.diag(sigma**-2))
     for i in range(0, len(true) - 60, 10):
         Z = lie.inverse(true[i]) @ true[i + 60] @ lie.exp(0.3 * sigma * rng.normal(size=3))
         graph.add_edge(i, i + 60, Z, np.diag(sigma**-2), is_loop=True)
     return graph, np.array(true)
 
 
-def test_loops_that_agree_show_a_systematic_drift_of_odometry_instead_of_being_rejected():
+WRITTEN = pytest.mark.parametrize("written", ["forward", "backward", "last first"])
+
+
+@WRITTEN
+def test_loops_that_agree_show_a_systematic_drift_of_odometry_instead_of_being_rejected(written):
     drift = np.array([0.0, -0.01])  # laps do not show the scale
-    graph, true = round_trips(lambda i, Z: corrected(Z, -drift))
+    graph, true = round_trips(lambda i, Z: corrected(Z, -drift), written=written)
     answer = graph.optimize(GraphConfig(), initialize="odometry")
     assert not answer.rejected.any()
     assert graph.drift[1] == pytest.approx(drift[1], abs=1e-3)
@@ -252,8 +263,11 @@ def test_loops_that_agree_show_a_systematic_drift_of_odometry_instead_of_being_r
     assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.2
 
 
-def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected():
-    graph, true = round_trips(lambda i, Z: Z @ lie.pose_2d(0.15 if 70 <= i < 80 else 0.0, 0.0, 0.0))
+@WRITTEN
+def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected(written):
+    graph, true = round_trips(
+        lambda i, Z: Z @ lie.pose_2d(0.15 if 70 <= i < 80 else 0.0, 0.0, 0.0), written=written
+    )
     answer = graph.optimize(GraphConfig(), initialize="odometry")
     assert not answer.rejected.any() and not graph.drift.any()
     (slip,) = graph.slips
@@ -268,4 +282,25 @@ def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected():
 def test_odometry_that_no_loop_contradicts_is_left_as_it_is():
     graph, _ = round_trips(lambda i, Z: Z)
     graph.optimize(GraphConfig())
+    assert not graph.drift.any() and graph.slips == ()
+
+
+def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
+    rng = np.random.default_rng(5)
+    true = np.array(list(accumulate(lie.exp(rng.normal(0.0, [0.1, 0.1, 0.5], (900, 3))), np.matmul)))
+    graph, sigma = PoseGraph(2), np.array([0.1, 0.1, 0.05])
+    for index, T in enumerate(true):
+        graph.add_pose(T, index)
+    chain = np.stack([np.arange(899), np.arange(1, 900)], axis=1)
+    pairs = rng.integers(0, 900, (1200, 2))
+    edges = np.concatenate([chain, pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1]])
+    measured = lie.between(true[edges[:, 0]], true[edges[:, 1]]) @ lie.exp(
+        sigma * rng.normal(size=(len(edges), 3))
+    )
+    measured[-10:] = measured[-10:] @ lie.pose_2d(
+        1.0, -1.0, 0.5
+    )  # wrong loops, so that there is something to explain
+    is_loop = np.arange(len(edges)) >= len(chain)
+    graph.add_edges(edges, measured, np.tile(np.diag(sigma**-2), (len(edges), 1, 1)), is_loop)
+    assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10
     assert not graph.drift.any() and graph.slips == ()

@@ -1,12 +1,14 @@
 """Place recognition in 3D: descriptors, their database, submaps that agree or do not."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from scanchain import lie
 from scanchain.data import Keyframe, Proposal, Verdict
+from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.kernels.search.descriptor import count_heights, mark_heights
 from scanchain.loops import LoopCloser
@@ -211,15 +213,27 @@ def there_and_back(lost_m=0.0):
     return [*there, *moved], [k.T_odom_lidar for k in (*there, *back)]
 
 
+def graph_of(keyframes, sigma_rad=0.002):
+    """The graph of odometry alone, a keyframe's heading known from the one before with so much."""
+    graph = PoseGraph(3)
+    for keyframe in keyframes:
+        graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+    information = np.diag(np.array([0.02, 0.02, 0.02, 0.002, 0.002, sigma_rad]) ** -2.0)
+    for a, b in pairwise(keyframes):
+        graph.add_edge(a.index, b.index, lie.between(a.T_odom_lidar, b.T_odom_lidar), information)
+    return graph
+
+
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])
 def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lost_m):
     keyframes, truth = there_and_back(lost_m)
     closer = LoopCloser(configured(3), 3).places
-    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     accepted = [
         closure
         for k in range(1, len(keyframes) + 1)
-        for closure in closer.close(keyframes[:k], poses[:k], np.ones(k, bool), finish=k == len(keyframes))
+        for closure in closer.close(
+            keyframes[:k], graph_of(keyframes[:k]), np.ones(k, bool), finish=k == len(keyframes)
+        )
         if closure.verdict is Verdict.ACCEPTED
     ]
     assert any(closure.proposed_by is Proposal.PLACE for closure in accepted) and len(accepted) >= 3
@@ -228,12 +242,11 @@ def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lo
         assert np.linalg.norm((lie.inverse(true) @ closure.match.T_target_source)[:3, 3]) < 0.2
 
 
-def test_a_place_that_odometry_cannot_have_missed_by_so_much_is_refused(monkeypatch):
+@pytest.mark.parametrize(("sigma_rad", "are_refused"), [(0.002, True), (0.2, False)])
+def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypatch, sigma_rad, are_refused):
     monkeypatch.setattr("scanchain.loops.place_closer._PLACE_DRIFT", 0.001)
     keyframes, _ = there_and_back(8.0)
-    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     closures = LoopCloser(configured(3), 3).places.close(
-        keyframes, poses, np.ones(len(keyframes), bool), finish=True
+        keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True
     )
-    assert closures and all(closure.verdict is Verdict.REJECTED for closure in closures)
-    assert any("of the path between" in closure.reason for closure in closures)
+    assert closures and all("of the path between" in closure.reason for closure in closures) == are_refused

@@ -1,6 +1,7 @@
 """Odometry and the whole chain on simulated drives with exact truth, and on the real logs' published bars."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -172,6 +173,36 @@ def test_a_gap_is_bridged_at_constant_velocity(town):
     assert ate_m(trajectory(steps), truth) < 0.05
 
 
+@pytest.mark.parametrize(("niche_m", "state"), [(0.0, State.DEGENERATE), (3.0, State.OK)])
+def test_after_a_gap_a_room_that_looks_the_same_turned_around_is_ambiguous(niche_m, state):
+    odometry = Odometry(configured(2, {"odometry.prior": "constant-velocity"}), np.eye(3))
+    for index in range(10):
+        odometry.process(scan_of_room(lie.pose_2d(0.3, 0.2, 0.0), niche_m, index, index * 10**8))
+    T_room_lidar = lie.pose_2d(0.5, -0.3, 1.2)
+    step = odometry.process(scan_of_room(T_room_lidar, niche_m, 10, 29 * 10**8))
+    T_turned_lidar = lie.pose_2d(0.0, 0.0, np.pi) @ T_room_lidar
+    poses = [lie.between(lie.pose_2d(0.3, 0.2, 0.0), T) for T in (T_room_lidar, T_turned_lidar)]
+    away_m, other_m = (lie.apart(step.T_odom_lidar, T)[0] for T in poses)
+    assert step.state is state
+    assert min(away_m, other_m) < 0.02
+    if state is State.DEGENERATE:
+        assert step.reason.startswith("ambiguous: a pose 1.2 m away, turned by 3.14 rad")
+        assert np.linalg.inv(step.match.information)[2, 2] > 3.1**2
+    else:
+        assert away_m < 0.02
+
+
+def scan_of_room(T_room_lidar, niche_m, index, stamp_ns):
+    """A scan of the walls of a room of 10 m by 6 m, which have a niche or none."""
+    corners = [[5, 3], [-5, 3], [-5, -3], [5, -3], [5, 0], [5 + niche_m, 0], [5 + niche_m, 2], [5, 2], [5, 3]]
+    wall = np.array(corners, np.float64)
+    along = np.linspace(0.0, 1.0, 100)[:, None]
+    points = np.concatenate([a + along * (b - a) for a, b in pairwise(wall)])
+    points += 0.005 * np.random.default_rng(index).normal(size=points.shape)
+    seen = lie.transform(lie.inverse(T_room_lidar), points).astype(np.float32)
+    return Scan(index, stamp_ns, stamp_ns, seen, np.empty(0, np.float32), 0, None)
+
+
 @pytest.mark.parametrize("odd_ns", [0, 1_000, -3_600_000_000_000])
 def test_a_stamp_that_makes_no_sense_moves_nothing(town, odd_ns):
     scans, T_base_lidar, truth = town
@@ -237,6 +268,22 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
     whole, holed, without = sigmas_m(read), sigmas_m(read & ~between(5, 14)), sigmas_m(read & between(9, 9))
     assert np.allclose(whole[1:], 0.01 * np.arange(1, 24), rtol=1e-3) and np.allclose(holed, whole)
     assert (without > 1e4).all()  # what came before the first reading is unknown up to the next keyframe
+
+
+@pytest.mark.parametrize("is_measured", [True, False])
+def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predicted(is_measured):
+    front_end = FrontEnd(configured(3, {"odometry.keyframe_distance_m": 100.0}), np.eye(4))
+    off, nothing, told = np.array([0.0, 0.4, 0.0, 0.0, 0.0, 0.1]), np.empty((0, 3)), []
+    for fit in (1.0, 1.0, 0.5, 1.0):
+        T = lie.lift(lie.pose_2d(0.1 * len(told), 0.0, 0.0))
+        prior = Prior(T @ lie.exp(off), 1e-4 * np.eye(6), np.ones(6), is_measured)
+        match = replace(first_match(T, nothing, configured(3).matching), information=1e6 * np.eye(6), fit=fit)
+        tracked = Tracked(None, nothing, nothing, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
+        front_end.odometry.process = lambda scan, tracked=tracked: tracked
+        told.append(np.linalg.inv(front_end.locate(None).information))
+    sigmas = np.sqrt(np.diagonal(told, axis1=1, axis2=2))
+    assert np.all(sigmas[:2] <= 1e-3 * (1.0 + 1e-9))
+    assert np.allclose(sigmas[2:], np.hypot(np.abs(off), 0.01), atol=0.02) and sigmas[3, 0] > 0.009
 
 
 SEES_ACROSS, NOTHING = np.diag([0.0, 1e6, 1e6]), np.empty((0, 2))

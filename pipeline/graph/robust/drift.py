@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import residual_covariances
-from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.left_out import LeftOut
 
 Vector = NDArray[np.float64]
 
 SCALE_SIGMA, TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
+FEWEST = 3  # least number of loop edges left out, none near another, that a drift must explain
 _CURVATURE = 0.3  # share of a predicted change that its linearization may be off by
-_MOST = 100  # largest number of contradicting loop edges that are looked at
 _ROUNDS = 5  # of the least squares over the edges that a drift explains
 
 
@@ -26,11 +22,25 @@ def size(freedom: int) -> int:
     return 2 if freedom == 3 else 4
 
 
-def corrected(measurements: Matrix, drift: Vector) -> Matrix:
-    """Motions (E, d+1, d+1) made longer by a share of themselves, drift[0], and turned by drift[1:] a meter."""
+def corrected(measurements: Matrix, drift: Vector, sign: Vector | float = 1.0) -> Matrix:
+    """Motions (E, d+1, d+1) made longer by a share of themselves, drift[0], and turned by drift[1:] a meter.
+
+    sign : (E,) −1 of a motion that is measured backward
+    """
     if not drift.any():
         return measurements
-    return lie.exp(_changed(lie.log(measurements), drift))
+    return lie.exp(_changed(lie.log(measurements), drift, sign))
+
+
+def rescaled(information: Matrix, drift: Vector) -> Matrix:
+    """Information (E, k, k) of corrected motions: their noise is longer by the same share.
+
+    With the noise left as it was, a motion made shorter would fit better for its shorter noise alone.
+    """
+    if not drift[0]:
+        return information
+    scale = lie.by_component(information.shape[-1], 1.0 / (1.0 + drift[0]), 1.0)
+    return information * np.outer(scale, scale)
 
 
 def penalty(drift: Vector) -> float:
@@ -42,75 +52,31 @@ def _prior(count: int) -> Vector:
     return np.array([SCALE_SIGMA] + (count - 1) * [TURN_SIGMA_RAD_M]) ** -2.0
 
 
-def _changed(twists: Matrix, drift: Vector) -> Matrix:
+def _changed(twists: Matrix, drift: Vector, sign: Vector | float) -> Matrix:
     turns = len(drift) - 1
     d = twists.shape[-1] - turns
-    length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True)
+    length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True) * np.asarray(sign)[..., None]
     return np.concatenate([(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1)
 
 
-@dataclass(frozen=True, slots=True)
-class DriftStep:
-    """A change of the drift, the loop edges that it would make inliers, and the fall of the cost it promises."""
+def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
+    """The fall of the cost by a change of the drift, to first order, and this change.
 
-    change: Vector
-    explained: NDArray[np.int64]
-    gain: float
-
-
-def drift_step(
-    problem: BetweenProblem,
-    poses: Matrix,
-    is_loop: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    drift: Vector,
-    price: float,
-) -> DriftStep:
-    """The change of the drift that explains most of the loop edges left out, to first order.
-
-    With B = ∂Z/∂drift of the odometry edges, poses follow a change δ by H⁻¹ Σ JᵀΩB δ, and a loop edge's residual
-    by V δ. Every edge alone gives a candidate; the one with the least cost Σ min(χ², price) is chosen and refined
-    by least squares over the edges that it explains.
+    Every loop edge left out gives a candidate, refined by least squares over the edges that it explains; the one
+    with the least cost Σ min(χ², price) is chosen.
     """
-    k, p = problem.freedom, len(drift)
-    errors = problem.errors(poses)
-    jacobians = problem.jacobians(poses, errors)
-    sparse = problem.factored(poses, errors, kept)
-    odometry = np.flatnonzero(~is_loop)
-    twists = lie.log(problem.measurements[odometry])
-    B = np.stack([_changed(twists, unit) - twists for unit in np.eye(p)], axis=-1)  # (O, k, p)
-    omega_B = problem.information[odometry] @ B
-    pull = np.swapaxes(jacobians[odometry], 1, 2) @ omega_B
-    whole = np.zeros((len(problem.variable), k, p))
-    i, j = problem.edges[odometry].T
-    np.add.at(whole, j, pull)
-    np.add.at(whole, i, -pull)
-    flat = sparse.packing.rows(whole[problem.free])
-    moved = np.stack([sparse.cholesky.solve(np.ascontiguousarray(column)) for column in flat.T], axis=1)
-    curvature = np.einsum("eap,eaq->pq", B, omega_B) - flat.T @ moved + np.diag(_prior(p))
-    slope = np.einsum("eap,ea->p", omega_B, errors[odometry]) - _prior(p) * drift
-    response = np.zeros((len(problem.variable), k, p))
-    response[problem.free] = sparse.packing.spread_rows(moved)
-    out = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
-    out = out[:: max(1, -(-len(out) // _MOST))]
-    i, j = problem.edges[out].T
-    V = jacobians[out] @ (response[j] - response[i])
-    noise = residual_covariances(problem, sparse, jacobians, out)
-    return _consensus(errors[out], V, noise, curvature, slope, out, price)
-
-
-def _consensus(
-    errors: Matrix,
-    V: Matrix,
-    noise: Matrix,
-    curvature: Matrix,
-    slope: Vector,
-    edges: NDArray[np.int64],
-    price: float,
-) -> DriftStep:
-    """Best change of the drift, of those that single edges ask for."""
-    own = np.asarray(np.linalg.solve(curvature, slope), np.float64)
-    best, most = DriftStep(own, edges[:0], 0.0), float(slope @ own)
+    odometry = left_out.odometry
+    twists = lie.log(left_out.problem.measurements[odometry])
+    B = np.stack([_changed(twists, unit, sign) - twists for unit in np.eye(len(drift))], axis=-1)  # ∂Z/∂drift
+    d = twists.shape[1] - len(drift) + 1
+    B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
+    slope, curvature, V = left_out.quadratic(B)
+    slope, curvature = slope - _prior(len(drift)) * drift, curvature + np.diag(_prior(len(drift)))
+    errors, noise = left_out.errors[left_out.edges], left_out.covariances
+    best, most = np.zeros(len(drift)), 0.0
+    if drift.any():
+        best = np.asarray(np.linalg.solve(curvature, slope), np.float64)
+        most = float(slope @ best)
 
     def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
         A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
@@ -125,7 +91,7 @@ def _consensus(
         left = errors + V @ change
         return np.einsum("ea,eab,eb->e", left, weight, left), weight
 
-    for start in range(len(edges)):
+    for start in range(len(errors)):
         members = np.array([start])
         change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
         for _ in range(_ROUNDS):
@@ -133,10 +99,11 @@ def _consensus(
             members = np.flatnonzero(chi2 < price)
             change = solved(members, weight[members])
         chi2, _ = fitting(change)
-        gain = float((price - chi2[chi2 < price]).sum() + 2.0 * slope @ change - change @ curvature @ change)
-        if gain > most:
-            best, most = DriftStep(change, edges[chi2 < price], gain), gain
-    return best
+        explained = price - chi2[chi2 < price]
+        gain = float(explained.sum() + 2.0 * slope @ change - change @ curvature @ change)
+        if gain > most and (drift.any() or len(explained) >= FEWEST):
+            best, most = change, gain
+    return most, best
 
 
 def _parts(k: int) -> list[int]:

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.covariance import responses
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
 _REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
@@ -50,11 +51,10 @@ def agreeing_groups(
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
     """Those of the edges that join other poses than the ones before: a mistake repeated does not count twice."""
-    chosen: list[int] = []
-    for edge in edges.tolist():
-        if not (np.abs(ends[chosen] - ends[edge]).max(axis=1, initial=0) <= _REACH).any():
-            chosen.append(edge)
-    return np.array(chosen, np.int64)
+    is_chosen = np.zeros(len(edges), np.bool_)
+    for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):
+        is_chosen[place] = not is_chosen[near].any()
+    return edges[is_chosen]
 
 
 class Contradiction:
@@ -74,8 +74,12 @@ class Contradiction:
     def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
         """The distance of the edges of a group, all of them kept or none."""
         k, count = self._problem.freedom, len(group)
-        columns = [self._predicted(edge, axis, group) for edge in group for axis in range(k)]
-        predicted = np.array(columns).reshape(k * count, k * count)
+        i, j = self._problem.edges[group].T
+        predicted = np.empty((k * count, k * count))
+        for place, edge in enumerate(group):
+            moved = responses(self._sparse, *self._problem.edges[edge])
+            joint = self._jacobians[group] @ (moved[j] - moved[i]) @ self._jacobians[edge].T
+            predicted[:, k * place : k * (place + 1)] = joint.reshape(-1, k)
         information = np.zeros((count, k, count, k))
         information[np.arange(count), :, np.arange(count)] = self._problem.information[group]
         information = information.reshape(k * count, k * count)
@@ -83,15 +87,3 @@ class Contradiction:
         sign = -1.0 if kept else 1.0
         matrix = (1.0 + _ROUNDING) * np.eye(len(errors)) + sign * (predicted @ information)
         return float(errors @ information @ np.linalg.solve(matrix, errors))
-
-    def _predicted(self, edge: int, axis: int, group: NDArray[np.int64]) -> Matrix:
-        """Covariance (G, k) of one component of an edge's residual with those of a group, as predicted."""
-        selection = np.zeros((len(self._problem.variable), self._problem.freedom))
-        i, j = self._problem.edges[edge]
-        selection[j], selection[i] = self._jacobians[edge, axis], -self._jacobians[edge, axis]
-        packing = self._sparse.packing
-        moved = self._sparse.cholesky.solve(packing.rows(selection[self._problem.free]))
-        selection[:] = 0.0
-        selection[self._problem.free] = packing.spread_rows(moved)
-        i, j = self._problem.edges[group].T
-        return np.einsum("eab,eb->ea", self._jacobians[group], selection[j] - selection[i])

@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import difference_covariance
+from scanchain.graph.covariance import difference_covariance, edge_covariances, inverse_blocks
 
 _MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals have long tails
 _FEWEST = 10  # least number of inlier edges from which a noise model is estimated
@@ -62,15 +62,13 @@ def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool
     The residual alone is too small: a kept edge bends the graph toward itself. Where a lower bound of the second,
     by Cov(a − b) ⪯ 2 Cov(a) + 2 Cov(b), is above the price already, the bound is given.
     """
-    errors, k = problem.errors(poses), problem.freedom
+    errors = problem.errors(poses)
     jacobians = problem.jacobians(poses, errors)
     sparse = problem.factored(poses, errors, kept)
-    blocks = sparse.packing.blocks(sparse.cholesky.inverse_blocks())
-    blocks = np.concatenate([blocks, np.zeros((1, k, k))])  # found by -1, a fixed pose
+    blocks = inverse_blocks(sparse)
     i, j = problem.variable[problem.edges].T
     joint = 2.0 * (blocks[i] + blocks[j])
-    i, j, pair = sparse.slots.T
-    joint[kept] = blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
+    joint[kept] = edge_covariances(sparse, blocks)
     result = _distances(errors, jacobians, problem.information, joint, kept)
     for edge in np.flatnonzero(~kept & (result < price)):
         one = np.array([edge])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,15 +9,17 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import residual_covariances
-from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.left_out import LeftOut
 
 SIGMA_M = 1.0  # standard deviation of a slip
-_MOST = 20  # largest number of loop edges left out that are looked at
+_MOST = 100  # largest number of stretches whose information is worked out
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
+_MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
 _PROBABILITY = 1e-3  # of a slip that begins at an edge
 _LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
+
+
+Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +37,20 @@ class Slip:
 
 
 def directions(information: Matrix, measurements: Matrix) -> Matrix:
-    """Twist (E, k) along which each edge may slip: its weakest translation, or its motion where none is weak."""
+    """Twist (E, k) along which each edge may slip: its weakest translation, or its motion where none is weak.
+
+    Zero where the motion is no longer than its noise: its direction is then that of the noise, which a slip would
+    seem to explain.
+    """
     d = measurements.shape[-1] - 1
     values, vectors = np.linalg.eigh(information[:, :d, :d])
     motion = measurements[:, :d, d]
     length = np.linalg.norm(motion, axis=1, keepdims=True)
     is_even = (values[:, :1] * _WEAKER > values[:, -1:]) & (length > 0.0)
     weakest = vectors[:, :, 0] * np.where((vectors[:, :, 0] * motion).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+    moves = np.einsum("ea,eab,eb->e", motion, information[:, :d, :d], motion) > _MOVES**2
     result = np.zeros(information.shape[:2])
-    result[:, :d] = np.where(is_even, motion / np.maximum(length, 1e-12), weakest)
+    result[:, :d] = moves[:, None] * np.where(is_even, motion / np.maximum(length, 1e-12), weakest)
     return result
 
 
@@ -66,73 +72,93 @@ def price_of(slip: Slip, odometry: Matrix, information: Matrix) -> float:
     """
     part = information[slip.edges]
     u = directions(part, odometry[slip.edges]) / slip.count
-    own = float(np.einsum("ea,eab,eb->", u, part, u))
-    return float(np.log1p(SIGMA_M**2 * own) - 2.0 * np.log(_PROBABILITY)) + (slip.size_m / SIGMA_M) ** 2
+    return float(_fixed_price(np.einsum("ea,eab,eb->", u, part, u))) + (slip.size_m / SIGMA_M) ** 2
+
+
+def _fixed_price(claimed: Vector) -> Vector:
+    return np.log1p(SIGMA_M**2 * claimed) - 2.0 * np.log(_PROBABILITY)
 
 
 def next_slip(
-    problem: BetweenProblem,
-    measured: Matrix,
-    poses: Matrix,
-    is_loop: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    slips: tuple[Slip, ...],
-    price: float,
+    left_out: LeftOut, measured: Matrix, slips: tuple[Slip, ...], price: float
 ) -> tuple[float, tuple[Slip, ...]]:
     """The fall of the cost by one more slip, or the change of one, to first order, and the slips with it.
 
-    measured : (E, d+1, d+1) as odometry has it
-    With g = Σ JᵀΩu/n, a slip s moves the poses by H⁻¹g s, and the residual e of a loop edge left out by V s. The
-    cost changes by A s² − 2 b s, A = Σ uᵀΩu/n² − gᵀH⁻¹g + 1/σ² and b = Σ uᵀΩe/n, and by what each loop edge,
-    predicted with covariance C, then costs less than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them
-    gives a candidate. Loop edges near each other count as one, for they may share a mistake.
+    measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
+    A slip s changes the cost by A s² − 2 b s, prior included, and by what each loop edge left out then costs less
+    than its price: min(price, (e + V s)ᵀC⁻¹(e + V s)). Each of them gives a candidate. A takes a solve, so that
+    stretches are tried in the order of an estimate: along a chain whose ends are well known, the information on a
+    slip of all edges is what they claim, that on a slip of one the share of its redundancy; these add up to one.
     """
-    odometry = np.flatnonzero(~is_loop)
-    errors = problem.errors(poses)
-    jacobians = problem.jacobians(poses, errors)
-    sparse = problem.factored(poses, errors, kept)
-    information = problem.information[odometry]
-    u = directions(information, measured[odometry])
-    pull = np.einsum("eab,eb->ea", information, u)
-    moved = np.einsum("eab,ea->eb", jacobians[odometry], pull)
-    claimed, bent = (u * pull).sum(axis=1), (pull * errors[odometry]).sum(axis=1)
-    out = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
-    out = out[:: max(1, -(-len(out) // _MOST))]
-    M = np.asarray(np.linalg.inv(residual_covariances(problem, sparse, jacobians, out)), np.float64)
-    i, j = problem.edges[out].T
-    left_out = errors[out]
+    u = directions(left_out.problem.information[left_out.odometry], measured)
+    tried = [*slips, *_stretches(len(u), slips)]
+    own, redundancy, bent, V = (_means(each, tried) for each in _edge_by_edge(left_out, u))
+    count = np.array([slip.count for slip in tried])
+    claimed = own / count
+    sizes = np.array([slip.size_m for slip in tried])
+    worth, prior = -_fixed_price(claimed), SIGMA_M**-2.0
+    worth[: len(slips)] = 0.0
+    information = prior + np.minimum(redundancy * count, 1.0) * claimed
+    hoped, _ = _largest_falls(left_out, V, information, bent - prior * sizes, worth, price)
+    hoped[: len(slips)] = np.inf
     best, most = slips, 0.0
-    for slip in _stretches(len(odometry), slips):
-        n = slip.count
-        whole = np.zeros((len(problem.variable), problem.freedom))
-        begin, end = problem.edges[odometry[slip.edges]].T
-        np.add.at(whole, end, moved[slip.edges] / n)
-        np.add.at(whole, begin, -moved[slip.edges] / n)
-        g = sparse.packing.rows(whole[problem.free])
-        x = sparse.cholesky.solve(g)
-        A = claimed[slip.edges].sum() / n**2 - g @ x + 1.0 / SIGMA_M**2
-        b = bent[slip.edges].sum() / n - slip.size_m / SIGMA_M**2
-        whole[:] = 0.0
-        whole[problem.free] = sparse.packing.spread_rows(x)
-        V = np.einsum("eab,eb->ea", jacobians[out], whole[j] - whole[i])
-        VM = np.einsum("ea,eab->eb", V, M)
-        s = np.append(b / A, (b - (VM * left_out).sum(axis=1)) / (A + (VM * V).sum(axis=1)))
-        left = left_out + s[:, None, None] * V  # (candidates, loop edges, k)
-        explained = np.maximum(price - np.einsum("cea,eab,ceb->ce", left, M, left), 0.0).sum(axis=1)
-        gain = 2.0 * b * s - A * s**2 + explained
-        if slip not in slips:
-            gain -= price_of(slip, measured[odometry], information)
-        which = int(np.argmax(gain))
-        if gain[which] > most:
+    for index in np.argsort(-hoped, kind="stable")[:_MOST]:
+        if not hoped[index] > most:
+            break
+        slip, one = tried[index], slice(index, index + 1)
+        twists = np.zeros((*u.shape, 1))
+        twists[slip.edges, :, 0] = u[slip.edges] / slip.count
+        b, A, _ = left_out.quadratic(twists)
+        falls = _largest_falls(left_out, V[one], prior + A[0], b - prior * sizes[one], worth[one], price)
+        gain, size_m = float(falls[0][0]), float(falls[1][0])
+        if gain > most:
             others = tuple(each for each in slips if each is not slip)
-            best, most = (*others, replace(slip, size_m=slip.size_m + float(s[which]))), float(gain[which])
+            best, most = (*others, replace(slip, size_m=slip.size_m + size_m)), gain
     return most, best
 
 
-def _stretches(count: int, slips: tuple[Slip, ...]) -> Iterator[Slip]:
-    """Slips known already, and stretches of every length that overlap none of them, each half beside the last."""
-    yield from slips
-    for length in _LENGTHS:
-        for first in range(0, count - length + 1, max(1, length // 2)):
-            if all(first >= slip.first + slip.count or slip.first >= first + length for slip in slips):
-                yield Slip(first, length)
+def _edge_by_edge(left_out: LeftOut, u: Matrix) -> tuple[Vector, Vector, Vector, Matrix]:
+    """Of each edge along its twist u (O, k): uᵀΩu (O,), redundancy (O,), uᵀΩe (O,), and ∂e of the loop edges."""
+    pull = (left_out.problem.information[left_out.odometry] @ u[..., None])[..., 0]
+    own = (u * pull).sum(axis=1)
+    known = (pull * (left_out.predicted @ pull[..., None])[..., 0]).sum(axis=1)
+    redundancy = 1.0 - known / np.maximum(own, np.finfo(np.float64).tiny)
+    bent = (pull * left_out.errors[left_out.odometry]).sum(axis=1)
+    return own, redundancy, bent, (left_out.shifts @ u[:, None, :, None])[..., 0]
+
+
+def _means(each: Matrix, stretches: list[Slip]) -> Matrix:
+    """Mean (S, ...) over the edges of each stretch, of values (O, ...)."""
+    sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    first, count = np.array([(slip.first, slip.count) for slip in stretches], np.int64).reshape(-1, 2).T
+    return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
+
+
+def _largest_falls(
+    left_out: LeftOut, V: Matrix, A: Vector, b: Vector, worth: Vector, price: float
+) -> tuple[Vector, Vector]:
+    """Largest fall of the cost by each stretch (S,), and the change of its slip that does it.
+
+    worth : (S,) minus the price of a new slip, which must explain a loop edge; 0 for one that is there
+    """
+    e, M = left_out.errors[left_out.edges], np.linalg.inv(left_out.covariances)
+    VM = np.einsum("sla,lab->slb", V, M)
+    VMV, VMe = (VM * V).sum(axis=2), (VM * e).sum(axis=2)
+    eMe = np.einsum("la,lab,lb->l", e, M, e)
+    fall, size_m = np.full(len(V), -np.inf), np.zeros(len(V))
+    for s in np.concatenate([b[None] / A, ((b[:, None] - VMe) / (A[:, None] + VMV)).T]):
+        explained = np.maximum(price - (eMe + 2.0 * s[:, None] * VMe + s[:, None] ** 2 * VMV), 0.0)
+        total = 2.0 * b * s - A * s**2 + explained.sum(axis=1) + worth
+        total[(worth < 0.0) & ~explained.any(axis=1)] = -np.inf
+        fall, size_m = np.maximum(fall, total), np.where(total > fall, s, size_m)
+    return fall, size_m
+
+
+def _stretches(count: int, slips: tuple[Slip, ...]) -> list[Slip]:
+    """Stretches of every length that overlap none of the slips, each half beside the last."""
+    return [
+        Slip(first, length)
+        for length in _LENGTHS
+        for first in range(0, count - length + 1, length // 2)
+        if all(first >= slip.first + slip.count or slip.first >= first + length for slip in slips)
+    ]
