@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-
 if TYPE_CHECKING:
     from typing import Any
 
-    from scanchain.api import compare, downsample, optimize, run
+    from scanchain.api import compare, downsample, localize, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scanchain.logs import open_log
     from scanchain.odometry import Odometry
     from scanchain.registration import VoxelMap, align, create_matcher, rigid_transform
+    from scanchain.sessions.localizer import Localizer
     from scanchain.settings import load_settings
     from scanchain.simulation import simulate
     from scanchain.slam import Slam, SlamResult
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Config": "config",
     "InputError": "errors",
+    "Localizer": "sessions.localizer",
     "Match": "data",
     "Odometry": "odometry",
     "PoseGraph": "graph.pose_graph",
@@ -45,6 +47,7 @@ _HOMES = {
     "downsample": "api",
     "evaluate": "evaluation.metrics",
     "load_settings": "settings",
+    "localize": "api",
     "open_log": "logs",
     "optimize": "api",
     "read_g2o": "graph.files.g2o",
@@ -57,6 +60,7 @@ _HOMES = {
 }
 
 _COMPILED = {
+    "Localizer",
     "Odometry",
     "PoseGraph",
     "Slam",
@@ -66,6 +70,7 @@ _COMPILED = {
     "create_matcher",
     "downsample",
     "evaluate",
+    "localize",
     "run",
     "simulate",
 }
@@ -73,6 +78,7 @@ _COMPILED = {
 __all__ = [
     "Config",
     "InputError",
+    "Localizer",
     "Match",
     "Odometry",
     "PoseGraph",
@@ -90,6 +96,7 @@ __all__ = [
     "downsample",
     "evaluate",
     "load_settings",
+    "localize",
     "open_log",
     "optimize",
     "read_g2o",

@@ -21,6 +21,7 @@ from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
+from scanchain.commands.localize import localize
 from scanchain.commands.optimize import optimize
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
@@ -46,8 +47,8 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks, config,
-    sequence,
+    run, localize, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks,
+    config, sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
     from scanchain.runs.job import Recorder, SinkName
+    from scanchain.sessions.localize import LocalizedLog
 
 Logs = str | Path | Sequence[str | Path]
 
@@ -56,6 +57,36 @@ def run(
         force=force,
     )
     return run_job(job, open_recorder, Unwatched(), write_report)
+
+
+def localize(
+    log: Logs,
+    prior: str | Path,
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    recording: bool = True,
+    force: bool = False,
+    **overrides: object,
+) -> LocalizedLog:
+    """Place a log in the map of an earlier run, as ``scanchain localize`` does; nothing is printed.
+
+    prior : the run directory that holds the map
+    Other arguments as in ``run``; without ``recording`` there is no report either.
+    Returns path, metrics and poses. Raises InputError for bad input.
+    """
+    from scanchain.sessions.localize import Localizing
+    from scanchain.sessions.localize import localize as localize_log
+
+    job = Localizing(
+        logs=sources_of(log),
+        prior=checks.path(prior, "prior"),
+        out=checks.path(out, "out"),
+        config_file=None if config is None else checks.path(config, "config"),
+        overrides=overrides_of(overrides),
+        force=force,
+    )
+    return localize_log(job, Unwatched(), draw_localization if recording else lambda folder, localized: None)[0]
 
 
 def compare(
@@ -121,6 +152,16 @@ def write_report(directory: Path) -> None:
     from scanchain.viz.report.run import write_run_report
 
     write_run_report(directory)
+
+
+def draw_localization(folder: Path, localized: LocalizedLog) -> None:
+    """Add report.html and a recording to the directory of a localized log."""
+    from scanchain.runs.directory import RECORDING_FILE
+    from scanchain.viz.recording.localization import record_localization
+    from scanchain.viz.report.localization import write_localization_report
+
+    write_localization_report(folder, localized)
+    record_localization(folder / RECORDING_FILE, localized)
 
 
 def present_comparison(directory: Path) -> None:

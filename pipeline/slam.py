@@ -265,7 +265,31 @@ class Slam:
         return keyframe.index
 
     def _close_loops(self) -> tuple[Closure, ...]:
-        return self._take(self.closer.close(self.keyframes, self.graph))
+        closures = self._take(self.closer.close(self.keyframes, self.graph))
+        for closure in closures if self.first else ():
+            if closure.verdict is Verdict.ACCEPTED and closure.target < self.first:
+                self.T_world_odom = self.by_map(closure)
+        return closures
+
+    def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
+        """Join the first scan of this log to the nearest keyframe of the map: it is at this pose, to m and rad."""
+        positions = self.graph.poses[: self.first, :-1, -1]
+        nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
+        T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
+        information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
+        self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
+        self._optimize("gnc")
+
+    def by_map(self, closure: Closure) -> Pose:
+        """T_world_odom by a closure with a keyframe of the map."""
+        T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+        return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))
+
+    @property
+    def is_in_map(self) -> bool:
+        """True if a closure in force joins the newest keyframe to the map."""
+        components = self.closer.segments.components(self.graph)
+        return self.first > 0 and bool(components[-1] == components[0])
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
@@ -294,7 +318,7 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = _OPTIMIZE_EVERY
+        enough = 1 if self.first and self.moves_map else _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:

@@ -1,0 +1,196 @@
+"""Localization in a map from nowhere: odometry, joined to the map by loop closures once its place is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import checks, lie
+from scanchain.config import Config
+from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory, Verdict
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.odometry import LiveStamps
+from scanchain.slam import Slam, SlamResult, edge_information
+
+_RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
+_TURN = 0.1  # drift in radians a meter, as a share of loops.drift
+INITIAL_SIGMAS = (2.0, 0.35)  # m and rad, standard deviations of a pose that the user gives
+
+
+class MapState(StrEnum):
+    """Knowledge of where a scan is in the map."""
+
+    SEARCHING = "searching"
+    LOCALIZED = "localized"
+    WITHOUT_MAP = "tracking without map"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A scan in the map, as known at its time.
+
+    Attributes
+    ----------
+    state : how it is known; of one that is ``LOST`` the pose is predicted
+    T_map_lidar : pose in the map's frame, None while ``SEARCHING``
+    covariance : (k, k) of a twist in the lidar's own frame, None while ``SEARCHING``
+    step : its odometry and what was compared with the map
+    """
+
+    state: MapState
+    T_map_lidar: Pose | None
+    covariance: Matrix | None
+    step: Step
+
+
+@dataclass(frozen=True, slots=True)
+class Localization:
+    """A log in a map, after its last scan.
+
+    Attributes
+    ----------
+    states : (N,) of every scan, as known at its time
+    is_placed : (N,) bool, scans that are joined to the map in the end, those before they were found too
+    trajectory : every scan, T_map_lidar; without meaning where not ``is_placed``
+    live : (N, d+1, d+1) poses as known at the time, NaN while searching
+    sigma_m : (N,) standard deviation of the position at the time, NaN while searching
+    traveled_m : (N,) length of the path up to each scan, by odometry
+    closures : with keyframes of the map, or tried
+    result : of the whole chain, keyframes of the map first
+    """
+
+    states: NDArray[np.str_]
+    is_placed: NDArray[np.bool_]
+    trajectory: Trajectory
+    live: Matrix
+    sigma_m: NDArray[np.float64]
+    traveled_m: NDArray[np.float64]
+    closures: tuple[Closure, ...]
+    result: SlamResult
+
+    @property
+    def found_at(self) -> int:
+        """The first scan whose place was known at its time, −1 if there is none."""
+        known = np.flatnonzero(self.states != MapState.SEARCHING)
+        return int(known[0]) if len(known) and self.is_placed.any() else -1
+
+
+class Localizer:
+    """Places the scans of a log in a map, which stays as it is.
+
+    Until its place is found the log is followed by odometry alone. Then every keyframe is matched to the map
+    around it, and every scan to those before; matches with the map that contradict the others are left out.
+    """
+
+    def __init__(
+        self,
+        prior: SavedMap | Path | str,
+        config: Config | None = None,
+        T_base_lidar: Pose | None = None,
+        *,
+        initial: Pose | None = None,
+        points_file: Path | None = None,
+    ) -> None:
+        """Begin in a map.
+
+        prior : the map, or the run directory that holds it
+        config, T_base_lidar, points_file : as in ``Slam``
+        initial : T_map_lidar of the first scan where it is known, to a few meters and 20°
+        Raises InputError for a map that cannot be read.
+        """
+        self.map = prior if isinstance(prior, SavedMap) else open_saved_map(checks.path(prior, "prior"))
+        dimension = self.map.dimension
+        self.slam = Slam(config, T_base_lidar, points_file, dimension=dimension, prior=self.map)
+        self.initial = None if initial is None else checks.pose(initial, "initial", dimension)
+        self.live_stamps = LiveStamps()
+        self.states: list[MapState] = []
+        self.live: list[Pose] = []
+        self.sigma_m: list[float] = []
+        self.traveled_m: list[float] = []
+        self.start_m = self.slam.traveled_m
+        self.last: Closure | None = None  # the last one with the map
+        self.last_m = 0.0
+        self.is_in_map = False
+
+    def track(
+        self,
+        points: RawPoints,
+        stamp_s: float,
+        times_s: NDArray[np.float32] | None = None,
+        *,
+        T_odom_base: Pose | None = None,
+    ) -> Placed:
+        """Place a scan as a driver gives it; arguments as in ``Odometry.track``."""
+        scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
+        self.live_stamps.check(scan)
+        placed = self.process(scan)
+        self.live_stamps.take(scan)
+        return placed
+
+    def process(self, scan: Scan) -> Placed:
+        """Place one scan of a log."""
+        step = self.slam.process(scan)
+        if self.initial is not None and len(self.states) == 0:
+            self.slam.begin_at(self.initial, INITIAL_SIGMAS)
+        for closure in step.closures:
+            if closure.verdict is Verdict.ACCEPTED and closure.target < self.slam.first:
+                self.last, self.last_m = closure, self.slam.traveled_m
+        placed = self._placed(step)
+        unknown = np.full(step.T_odom_lidar.shape, np.nan)
+        self.states.append(placed.state)
+        self.live.append(unknown if placed.T_map_lidar is None else placed.T_map_lidar)
+        covariance, d = placed.covariance, self.slam.dimension
+        self.sigma_m.append(np.nan if covariance is None else float(np.sqrt(np.trace(covariance[:d, :d]))))
+        self.traveled_m.append(self.slam.traveled_m - self.start_m)
+        return placed
+
+    def finish(self) -> Localization:
+        """Match what is left and smooth the whole path; scans before the place was found are placed as well."""
+        result = self.slam.finish()
+        keyframe_of = np.searchsorted(
+            [keyframe.scan_index for keyframe in result.keyframes[self.slam.first :]],
+            np.arange(len(result.trajectory)),
+            side="right",
+        )
+        is_joined = result.components[self.slam.first :] == result.components[0]
+        return Localization(
+            states=np.array(self.states, np.str_),
+            is_placed=is_joined[keyframe_of - 1],
+            trajectory=result.trajectory,
+            live=np.array(self.live),
+            sigma_m=np.array(self.sigma_m),
+            traveled_m=np.array(self.traveled_m),
+            closures=tuple(each for each in result.closures if each.target < self.slam.first),
+            result=result,
+        )
+
+    def _placed(self, step: Step) -> Placed:
+        slam = self.slam
+        if step.keyframe >= 0:
+            self.is_in_map = slam.is_in_map
+        if not self.is_in_map:
+            return Placed(MapState.SEARCHING, None, None, step)
+        state = MapState.LOCALIZED
+        if self.last is None or len(slam.keyframes) - 1 - self.last.source > _RECENT_KEYFRAMES:
+            state = MapState.WITHOUT_MAP
+        if step.state is State.LOST:
+            state = MapState.LOST
+        T_map_lidar = slam.T_world_odom @ step.T_odom_lidar
+        return Placed(state, T_map_lidar, self._covariance(step.T_odom_lidar), step)
+
+    def _covariance(self, T_odom_lidar: Pose) -> Matrix:
+        """Covariance of a pose by the last match with the map and the drift since."""
+        config, k = self.slam.config.loops, self.slam.graph.freedom
+        since_m = self.slam.traveled_m - self.last_m
+        drift = lie.by_component(k, config.drift * since_m, _TURN * config.drift * since_m)
+        if self.last is None:
+            return np.diag(lie.by_component(k, *INITIAL_SIGMAS) ** 2 + drift**2)
+        information = edge_information(self.last.match.information, config.edge_sigma_m, config.edge_sigma_rad)
+        T_source_lidar = lie.between(self.slam.keyframes[self.last.source].T_odom_lidar, T_odom_lidar)
+        Ad = lie.adjoint(lie.inverse(T_source_lidar))
+        return Ad @ np.linalg.inv(information) @ Ad.T + np.diag(drift**2)

@@ -1,0 +1,128 @@
+"""A localized log as a recording: map, live pose, hypotheses while searching, state over time, final path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from scanchain.data import Verdict
+from scanchain.sessions.localize import LocalizedLog
+from scanchain.sessions.localizer import MapState
+from scanchain.viz.recording import entities, shapes
+from scanchain.viz.recording.blueprint import eye, time_panel, whole_log
+from scanchain.viz.recording.messages import Message, Times
+from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain.viz.report.localization import map_points
+
+_LIVE, _FINAL, _SCAN = "world/lidar", "world/final", "world/lidar/scan"
+_ACCEPTED, _REJECTED, _SIGMA = "world/matches/accepted", "world/matches/rejected", "plots/sigma"
+_COLORS = {
+    MapState.SEARCHING: entities.GRAY,
+    MapState.LOCALIZED: entities.GREEN,
+    MapState.WITHOUT_MAP: entities.ORANGE,
+    MapState.LOST: entities.RED,
+}
+_MAX_SCAN_POINTS = 5_000
+
+
+def record_localization(path: Path, localized: LocalizedLog) -> None:
+    """Write a .rrd file. Raises OSError."""
+    found, prior = localized.localization, localized.prior
+    stream = open_stream(localized.path.name.split(".partial")[0], prior.dimension, uuid4())
+    points = shapes.in_space(map_points(prior))
+    messages = [
+        Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        Message(
+            entities.MAP, rr.Points3D(points, colors=entities.height_colors(points), radii=entities.pixels(1.0))
+        ),
+        Message(_LIVE, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
+        Message(_SCAN, rr.Points3D.from_fields(colors=[entities.YELLOW], radii=[entities.pixels(2.0)])),
+        Message(entities.VERDICT, rr.TextDocument(localized.metrics.sentence)),
+        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
+        Message(
+            entities.STATE,
+            rr.StateConfiguration(values=list(MapState), labels=list(MapState), colors=list(_COLORS.values())),
+        ),
+        *_states(localized),
+        *_live(localized),
+        *_scans(localized),
+        *_matches(localized),
+    ]
+    if found.is_placed.any():
+        placed = shapes.positions(found.trajectory.poses[found.is_placed])
+        line = rr.LineStrips3D([placed], colors=[entities.CYAN], radii=entities.pixels(1.0))
+        messages.append(Message(_FINAL, line))
+    box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else None
+    side = rrb.Vertical(
+        rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
+        rrb.TimeSeriesView(origin=_SIGMA, name="standard deviation of the position", axis_x=whole_log()),
+        rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole_log()),
+    )
+    scene = rrb.Spatial3DView(
+        origin=entities.WORLD,
+        name="map",
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=eye(prior.dimension, box),
+    )
+    layout = rrb.Blueprint(
+        rrb.Horizontal(scene, side, column_shares=[5, 2]), time_panel(len(found.states)), collapse_panels=True
+    )
+    write_recording(path, stream, layout, messages)
+
+
+def _times(localized: LocalizedLog) -> Times:
+    stamps_ns = localized.localization.trajectory.stamps_ns
+    return Times(np.arange(len(stamps_ns), dtype=np.int64), stamps_ns)
+
+
+def _states(localized: LocalizedLog) -> list[Message]:
+    found, times = localized.localization, _times(localized)
+    changed = np.concatenate([[True], found.states[1:] != found.states[:-1]])
+    known = np.isfinite(found.sigma_m)
+    return [
+        Message(entities.STATE, rr.StateChange.columns(state=found.states[changed].tolist()), times[changed]),
+        Message(_SIGMA, rr.Scalars.columns(scalars=found.sigma_m[known]), times[known]),
+    ]
+
+
+def _live(localized: LocalizedLog) -> list[Message]:
+    """The pose known at the time of each scan."""
+    found, times = localized.localization, _times(localized)
+    known = np.isfinite(found.live[:, 0, 0])
+    if not known.any():
+        return []
+    return [Message(_LIVE, shapes.transforms(found.live[known]), times[known])]
+
+
+def _scans(localized: LocalizedLog) -> list[Message]:
+    """Points of the keyframes of the log, from when its place is known."""
+    found, times = localized.localization, _times(localized)
+    first = len(localized.prior.keyframes)
+    messages = []
+    for keyframe in found.result.keyframes[first:]:
+        if np.isfinite(found.live[keyframe.scan_index, 0, 0]):
+            points = shapes.in_space(shapes.at_most(keyframe.points, _MAX_SCAN_POINTS))
+            content = rr.Points3D.columns(positions=points).partition([len(points)])
+            messages.append(Message(_SCAN, content, times[np.array([keyframe.scan_index])]))
+    return messages
+
+
+def _matches(localized: LocalizedLog) -> list[Message]:
+    """Places in the map that keyframes were matched at: hypotheses while it searches, matches then."""
+    found, times, keyframes = localized.localization, _times(localized), localized.localization.result.keyframes
+    messages = []
+    for closure in found.closures:
+        T_map_target = keyframes[closure.target].T_odom_lidar
+        ends = np.stack([T_map_target, T_map_target @ closure.match.T_target_source])
+        is_accepted = closure.verdict is Verdict.ACCEPTED
+        color = entities.GREEN if is_accepted else entities.RED
+        strips = rr.LineStrips3D.columns(
+            strips=[shapes.positions(ends)], colors=[color], radii=[entities.pixels(2.0)]
+        ).partition([1])
+        when = times[np.array([keyframes[closure.source].scan_index])]
+        messages.append(Message(_ACCEPTED if is_accepted else _REJECTED, strips, when))
+    return messages

@@ -1,0 +1,137 @@
+"""report.html of a localized log: where it was found, how sure, and its path in the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.data import Points
+from scanchain.maps import SavedMap
+from scanchain.sessions.localize import LocalizedLog, Part
+from scanchain.sessions.localizer import MapState
+from scanchain.viz.pictures.figure import INK, SvgFigure
+from scanchain.viz.pictures.map_figures import extent, path_over_map
+from scanchain.viz.pictures.trajectory_figures import PathLine
+from scanchain.viz.report.page import REPORT_FILE, Cell, Chip, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.words import counted
+
+COLORS = {
+    MapState.SEARCHING: "#8c9096",
+    MapState.LOCALIZED: "#2f7de1",
+    MapState.WITHOUT_MAP: "#c77800",
+    MapState.LOST: "#e0532f",
+}
+_MAX_POINTS = 200_000
+_PLACED_LATER = "#0f9bb5"
+
+
+def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
+    """Write the page into a folder."""
+    m = localized.metrics
+    facts = (
+        ("scans", f"{m.scans:,} over {m.path_m:.1f} m"),
+        ("placed", f"{m.placed:,}, {100.0 * m.placed / max(m.scans, 1):.1f} %"),
+        ("found", f"after {m.found_after_m:.1f} m, {m.found_after_s:.1f} s" if m.found_scan >= 0 else "not"),
+        ("matches with the map", f"{m.matches:,}, {m.rejected:,} left out"),
+        ("overlap", f"{m.median_overlap:.2f} (median)" if m.matches else "none"),
+        ("standard deviation", f"{m.median_sigma_m:.3f} m (median)" if m.matches else "unknown"),
+    )
+    subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
+    sections = tuple(_sections(localized))
+    write_page(folder / REPORT_FILE, Page("Localization", subtitle, facts, (m.sentence,), m.warnings, sections))
+
+
+def map_points(prior: SavedMap, limit: int = _MAX_POINTS) -> Points:
+    """(N, 3) some points of all keyframes of a map, in its frame."""
+    each = max(limit // max(len(prior.keyframes), 1), 1)
+    clouds = [np.empty((0, 3))]
+    for keyframe in prior.keyframes:
+        points = keyframe.points
+        some = lie.transform(keyframe.T_odom_lidar, points[:: max(1, -(-len(points) // each))])
+        clouds.append(np.pad(some, ((0, 0), (0, 3 - some.shape[1]))))
+    return np.vstack(clouds)
+
+
+def _sections(localized: LocalizedLog) -> Iterator[Section]:
+    found, m = localized.localization, localized.metrics
+    yield Section(
+        "Path in the map",
+        "As known at the time; the place of the dashed part was found afterwards, by smoothing.",
+        chips=(
+            *(Chip(state, color) for state, color in COLORS.items() if state in found.states),
+            Chip("placed afterwards", _PLACED_LATER, is_dashed=True),
+        ),
+        drawings=(_path(localized),),
+    )
+    yield Section("State over the path", "", drawings=(_states(localized),))
+    if m.parts:
+        heads = (Head("kind"), Head("scans"), Head("time", "s"), Head("path", "m"))
+        yield Section("Stretches to check", grid=Grid(heads, tuple(map(_row, m.parts))))
+    sessions = tuple(
+        Row(each.name, (Cell(f"{each.keyframes:,}"), Cell(_date(each.first_stamp_ns))))
+        for each in localized.prior.sessions
+    )
+    yield Section("The map", grid=Grid((Head("session"), Head("keyframes"), Head("begins", "UTC")), sessions))
+
+
+def _row(part: Part) -> Row:
+    scans, seconds = f"{part.first:,} to {part.last:,}", f"{part.start_s:.1f} to {part.end_s:.1f}"
+    return Row(part.kind, (Cell(scans), Cell(seconds), Cell(f"{part.length_m:.1f}")))
+
+
+def _date(stamp_ns: int) -> str:
+    return str(np.datetime64(stamp_ns, "ns").astype("datetime64[s]")).replace("T", " ")
+
+
+def _path(localized: LocalizedLog) -> Drawing:
+    found = localized.localization
+    points = map_points(localized.prior)
+    low, high = extent(points)
+    lines = []
+    if found.is_placed.any():
+        final = _in_space(found.trajectory.poses[:, :-1, -1])
+        later = np.where((found.is_placed & (found.states == MapState.SEARCHING))[:, None], final, np.nan)
+        lines.append(PathLine(later, _PLACED_LATER, is_dashed=True, width=1.2))
+        low, high = (
+            np.minimum(low, final[found.is_placed].min(axis=0)),
+            np.maximum(high, final[found.is_placed].max(axis=0)),
+        )
+    live = _in_space(found.live[:, :-1, -1])
+    for state, color in COLORS.items():
+        lines.append(
+            PathLine(np.where((found.states == state)[:, None], live, np.nan), color, is_dashed=False, width=1.4)
+        )
+    known = np.flatnonzero(found.is_placed)
+    ends = _in_space(found.trajectory.poses[known][[0, -1], :-1, -1]) if len(known) else np.full((2, 3), np.nan)
+    margin = 0.02 * (high - low)
+    svg = path_over_map("path", points, ends, lines, low - margin, high + margin)
+    return Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
+
+
+def _states(localized: LocalizedLog) -> Drawing:
+    """Standard deviation of the position and state, over the path."""
+    found = localized.localization
+    with SvgFigure("states", 2.0) as figure:
+        axes = figure.axes
+        axes.plot(found.traveled_m, found.sigma_m, color=INK, linewidth=0.9)
+        top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
+        for state, color in COLORS.items():
+            axes.fill_between(
+                found.traveled_m, 0.0, 1.1 * top, where=found.states == state, color=color, alpha=0.25, linewidth=0
+            )
+        axes.set_ylim(0.0, 1.1 * top)
+        axes.set_xlabel("path [m]")
+        axes.set_ylabel("sigma [m]")
+        count = counted(len(found.closures), "match with the map", "matches with the map")
+        return Drawing(
+            "Standard deviation of the position",
+            f"Behind it the state, in the colors above; {count} tried.",
+            figure.svg(),
+        )
+
+
+def _in_space(positions: Points) -> Points:
+    return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
