@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, Keyframe, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
+from scanchain.loops.map_search import MapSearch
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
@@ -25,18 +27,25 @@ class LoopCloser:
 
     def __init__(self, config: Config, dimension: int) -> None:
         """Raises InputError for a recognizer that cannot be loaded."""
+        self.config = config
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = ScanVerifier(config, submaps)
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)
+        self.map_search: MapSearch | None = None
         self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
-    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
-        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path) -> float:
+        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
+
+        folder : of the map
+        """
         self.near.of_map = len(keyframes)
-        return self.places.begin_in(keyframes)
+        if self.relocalizer is None and self.config.loops.enabled:
+            self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
+        return self.places.begin_in(keyframes, are_added=self.map_search is None)
 
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
@@ -52,6 +61,12 @@ class LoopCloser:
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
+        if self.map_search is not None:
+            if not self.map_search.is_tracked(keyframes, closures):
+                closures += self.map_search.close(keyframes, graph, components)
+            else:
+                self.places.skip(keyframes)
+                return closures
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
