@@ -27,8 +27,10 @@ _COLUMNS = 150  # number of columns that are scored, evenly spread
 _MIN_COLUMNS = 30  # number of columns, below which there is too little to see
 _MAX_CELLS = 1 << 23  # of the grid of a map; a larger one has coarser cells
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
-_RIVAL = 0.85  # share of the best score, from which on another pose makes it ambiguous
+_RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
+_SEEDS = 4  # largest number of poses that are verified
 _APART = 4.0  # least distance of two distinct poses, cells
+_MIN_AGREEMENT = 0.8  # least agreement about free space with a map of another day: cars and people are others
 _REACH = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
 _LEVEL_M = 2.0  # least difference in height of two stories
 _MAX_LEVELS = 3  # number of stories that are tried
@@ -46,7 +48,7 @@ class MapSearch:
         """Take the keyframes of a map; the outline is kept in its folder."""
         self.config = config
         self.segments = segments
-        self.verifier = SubmapVerifier(config)
+        self.verifier = SubmapVerifier(config, min_agreement=_MIN_AGREEMENT)
         self.of_map = len(keyframes)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
@@ -95,24 +97,26 @@ class MapSearch:
         newest = members[-1]
         T_newest_level = level_frame(newest, self.config.local_map)
         seeds = self._seeds(_together(members, lie.inverse(T_newest_level)))
-        if not len(seeds):
-            return None
-        x_m, y_m, yaw_rad, _ = seeds[0].tolist()
         source = Submap(newest, members, self.radius_m)
         tried: list[Closure] = []
-        for target in self._stories(np.array([x_m, y_m])):
-            T_level_source = self._on_ground(keyframes[target], x_m, y_m, yaw_rad) @ lie.inverse(T_newest_level)
-            T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
-            verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
-            problem = "" if len(seeds) == 1 else "another place of the map is as similar"
-            tried.append(verified.closure(target, newest.index, Proposal.PLACE, problem=problem))
+        for x_m, y_m, yaw_rad, _ in seeds.tolist():
+            for target in self._stories(np.array([x_m, y_m])):
+                T_level_source = self._on_ground(keyframes[target], x_m, y_m, yaw_rad) @ lie.inverse(
+                    T_newest_level
+                )
+                T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
+                verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
+                tried.append(verified.closure(target, newest.index, Proposal.PLACE))
         accepted = [each for each in tried if each.verdict is Verdict.ACCEPTED]
-        if len(accepted) > 1:
-            return replace(accepted[0], verdict=Verdict.REJECTED, reason="another story of the map is as similar")
-        return accepted[0] if accepted else tried[0] if tried else None
+        if not accepted:
+            return tried[0] if tried else None
+        best = max(accepted, key=lambda each: each.overlap)
+        if all(_agree(best, each, keyframes) for each in accepted):
+            return best
+        return replace(best, verdict=Verdict.REJECTED, reason="another place of the map is as similar")
 
     def _seeds(self, points: Points) -> Matrix:
-        """The best pose in the map's level frame and its rival (A ≤ 2, 4): x, y, yaw and share."""
+        """The best poses in the map's level frame (A, 4): x, y, yaw and share."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
@@ -122,7 +126,7 @@ class MapSearch:
         low, high = self.columns.min(axis=0), self.columns.max(axis=0)
         middle = lie.pose_2d(*(0.5 * (low + high)).tolist(), yaw_rad=0.0)
         half_m = 0.5 * float((high - low).max())
-        window = Window(half_m, math.pi, _APART * self.size_m, _RIVAL, answers=2, least=_MIN_SHARE)
+        window = Window(half_m, math.pi, _APART * self.size_m, _RIVAL, _SEEDS, least=_MIN_SHARE)
         return self.grid.search(columns, middle, window)
 
     def _stories(self, place: NDArray[np.float64]) -> list[int]:

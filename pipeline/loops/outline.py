@@ -46,11 +46,11 @@ def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConf
 
     keyframes : of the map; their ``T_odom_lidar`` is T_map_lidar
     """
-    size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
     path = folder / PLACES_FILE
-    stored = _stored(path, len(keyframes), size_m)
+    stored = _stored(path, len(keyframes))
     if stored is not None:
         return stored
+    size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
     T_map_level = _level(keyframes, config)
     outline = Outline(T_map_level, _columns(keyframes, lie.inverse(T_map_level), size_m), size_m)
     data = io.BytesIO()
@@ -67,13 +67,13 @@ def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConf
     return outline
 
 
-def _stored(path: Path, count: int, size_m: float) -> Outline | None:
-    """The outline on disk; None where there is none of this version, size and number of keyframes."""
+def _stored(path: Path, count: int) -> Outline | None:
+    """The outline on disk; None where there is none of this version and number of keyframes."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            if (int(file["version"]), int(file["keyframes"]), float(file["size_m"])) != (VERSION, count, size_m):
+            if (int(file["version"]), int(file["keyframes"])) != (VERSION, count):
                 return None
-            return Outline(file["T_map_level"], file["columns"].astype(np.float64), size_m)
+            return Outline(file["T_map_level"], file["columns"].astype(np.float64), float(file["size_m"]))
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile):
         return None
 
