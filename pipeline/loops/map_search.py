@@ -24,6 +24,8 @@ from scanchain.registration import ScoreGrid, Window, evenly, upright_columns
 _MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
 _COLUMNS = 150  # number of columns that are scored, evenly spread
+_COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, and numbers of the first search
+_REFINED_RAD = 0.15  # half width of the window in heading around what it found
 _MIN_COLUMNS = 30  # number of columns, below which there is too little to see
 _MAX_CELLS = 1 << 23  # of the grid of a map; a larger one has coarser cells
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
@@ -57,7 +59,7 @@ class MapSearch:
         extent_m = np.ptp(outline.columns, axis=0) if len(outline.columns) else np.zeros(2)
         self.size_m = max(outline.size_m, math.sqrt(float(extent_m.prod()) / _MAX_CELLS))
         self.columns = outline.columns
-        self.grid: ScoreGrid | None = None  # drawn when first searched
+        self.grids: tuple[ScoreGrid, ...] = ()  # coarse and fine, drawn when first searched
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with the map
         self.finds: list[Closure] = []
@@ -116,18 +118,25 @@ class MapSearch:
         return replace(best, verdict=Verdict.REJECTED, reason="another place of the map is as similar")
 
     def _seeds(self, points: Points) -> Matrix:
-        """The best poses in the map's level frame (A, 4): x, y, yaw and share."""
+        """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
             return np.empty((0, 4))
-        if self.grid is None:
-            self.grid = ScoreGrid(self.columns, self.size_m)
+        if not self.grids:
+            self.grids = tuple(ScoreGrid(self.columns, cells * self.size_m) for cells in (_COARSE, 1.0))
+        coarse, fine = self.grids
         low, high = self.columns.min(axis=0), self.columns.max(axis=0)
         middle = lie.pose_2d(*(0.5 * (low + high)).tolist(), yaw_rad=0.0)
-        half_m = 0.5 * float((high - low).max())
-        window = Window(half_m, math.pi, _APART * self.size_m, _RIVAL, _SEEDS, least=_MIN_SHARE)
-        return self.grid.search(columns, middle, window)
+        apart_m = _COARSE * _APART * self.size_m
+        anywhere = Window(0.5 * float((high - low).max()), math.pi, apart_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
+        around = Window(_COARSE * self.size_m, _REFINED_RAD, apart_m, 1.0, 1, _MIN_SHARE)
+        found = coarse.search(evenly(columns, _COARSE_COLUMNS), middle, anywhere)
+        seeds = np.vstack(
+            [np.empty((0, 4)), *(fine.search(columns, lie.pose_2d(x, y, yaw), around) for x, y, yaw, _ in found)]
+        )
+        best_first = seeds[np.argsort(-seeds[:, 3], kind="stable")][:_SEEDS]
+        return best_first[best_first[:, 3] >= _RIVAL * best_first[:1, 3]]
 
     def _stories(self, place: NDArray[np.float64]) -> list[int]:
         """Keyframes of the map nearest to a place (2,), one on each story."""
