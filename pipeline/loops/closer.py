@@ -19,6 +19,7 @@ from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
+_KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
 
@@ -58,6 +59,9 @@ class LoopCloser:
         """
         components = self.segments.components(graph)
         connected = components == components[-1]
+        if self.map_search is not None and self.map_search.has_just_matched(keyframes):
+            self.places.skip(keyframes)
+            return ()
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
@@ -87,6 +91,7 @@ class ProximityCloser:
         self.search = search
         self.drift = Drift(config.drift)
         self.of_map = 0  # number of the first keyframes that belong to a map
+        self.target_in_map = -1  # anchor of the last submap of the map that was matched
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, connected: NDArray[np.bool_]
@@ -109,6 +114,11 @@ class ProximityCloser:
         if not len(near):
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
+        if self.search is None and target < self.of_map:
+            kept = self.target_in_map
+            if kept in near and distance_m[kept] <= _KEPT_M * keyframes[kept].scale:
+                target = kept
+            self.target_in_map = target
         T_first = lie.between(T_world[target], T_world[-1])
         verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
         closure = verified.closure(target, newest)

@@ -39,6 +39,7 @@ _MAX_LEVELS = 3  # number of stories that are tried
 _STEP_M = 1.0  # least path between two searches
 _BACKOFF = 0.1  # path between two searches, as a share of what was searched so far
 _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
+_MATCH_M = 3.5  # path between two matches with the map, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
 
@@ -63,6 +64,12 @@ class MapSearch:
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with the map
         self.finds: list[Closure] = []
+
+    def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies so little behind the newest keyframe that none is due."""
+        newest = keyframes[-1]
+        since_m = newest.traveled_m - self.matched_m
+        return since_m < _MATCH_M * newest.scale and self.segments.starts[-1] != newest.index
 
     def is_tracked(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> bool:
         """True while the newest keyframes match the map; closures : of the newest."""
