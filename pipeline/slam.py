@@ -103,9 +103,12 @@ class Slam:
         self.traveled_m = 0.0
         self.waiting_closures = 0
         self.moves_map = False
+        self.joins_segment = False
+        self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
         self.lost_scans = 0
         self.optimized_at = 0
         self.first = 0  # number of the first keyframe of this log
+        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
         if prior is not None:
@@ -267,8 +270,10 @@ class Slam:
     def _close_loops(self) -> tuple[Closure, ...]:
         closures = self._take(self.closer.close(self.keyframes, self.graph))
         for closure in closures if self.first else ():
-            if closure.verdict is Verdict.ACCEPTED and closure.target < self.first:
-                self.T_world_odom = self.by_map(closure)
+            is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
+            if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
+                self.by_map = closure
+                self.T_world_odom = self._by_map(closure)
         return closures
 
     def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
@@ -280,7 +285,7 @@ class Slam:
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
         self._optimize("gnc")
 
-    def by_map(self, closure: Closure) -> Pose:
+    def _by_map(self, closure: Closure) -> Pose:
         """T_world_odom by a closure with a keyframe of the map."""
         T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
         return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))
@@ -308,17 +313,27 @@ class Slam:
         error = lie.log(lie.between(Z_ij, expected))
         self.waiting_closures += 1
         self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
+        self.joins_segment |= self._joins_segment(closure)
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         return replace(closure, chi2_before=float(error @ information @ error))
 
+    def _joins_segment(self, closure: Closure) -> bool:
+        """True for the first closure of the newest segment to an older one."""
+        start = self.closer.segments.starts[-1]
+        joins = self.joined_start < start and closure.target < start <= closure.source
+        if joins:
+            self.joined_start = start
+        return joins
+
     def _optimize_when_due(self) -> GraphState | None:
-        """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
+        """Optimize when closures wait: at once where one joins a segment, soon where it moves the map.
 
         The required growth is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = 1 if self.first and self.moves_map else _OPTIMIZE_EVERY
+        is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
+        enough = 0 if is_urgent else _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:
@@ -328,6 +343,7 @@ class Slam:
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
         self.waiting_closures, self.moves_map, self.optimized_at = 0, False, len(self.keyframes)
+        self.joins_segment = False
         self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
 

@@ -35,16 +35,17 @@ class LoopCloser:
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)
         self.map_search: MapSearch | None = None
-        self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
+        self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
-    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path) -> float:
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> float:
         """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
 
-        folder : of the map
+        folder : of a map on disk, which keeps its outline; without one, places are recognized by descriptors
         """
         self.near.of_map = len(keyframes)
-        if self.relocalizer is None and self.config.loops.enabled:
+        self.near.submaps.begin_in(keyframes)
+        if folder is not None and self.relocalizer is None and self.config.loops.enabled:
             self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
         return self.places.begin_in(keyframes, are_added=self.map_search is None)
 
@@ -120,7 +121,9 @@ class ProximityCloser:
                 target = kept
             self.target_in_map = target
         T_first = lie.between(T_world[target], T_world[-1])
-        verified = self.verifier.verify(keyframes, newest, target, T_first, newest=old - 1)
+        verified = self.verifier.verify(
+            keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
+        )
         closure = verified.closure(target, newest)
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)

@@ -41,7 +41,7 @@ class PlaceCloser:
         self.next_m = 0.0
         self.last: Closure | None = None
 
-    def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool) -> float:
+    def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
         """Begin behind the keyframes of a map; the path, in meters, from which on all of them are candidates.
 
         are_added : whether places of the map are recognized here

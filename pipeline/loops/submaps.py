@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
@@ -18,6 +19,7 @@ from scanchain.registration import VoxelMap
 RADII_AHEAD = 1.0  # radii of the trajectory after the anchor that a submap takes in
 RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahead sees a location from far off
 _MAX_POINTS = 80_000  # largest number of points of a submap, of keyframes evenly spread over it
+_OF_MAP = 2  # times as many keyframes in a submap of a map, which was seen from several sides
 _MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
 
 
@@ -63,7 +65,7 @@ class VoxelSubmaps:
     """Voxel maps of 2n + 1 keyframes around every n-th one, built when first used.
 
     They lie in that keyframe's frame, with voxels of the size that odometry used there; keyframes of another
-    segment are left out.
+    segment are left out. Of a map, whose poses are known, those nearest to the keyframe are taken, of any pass.
     """
 
     def __init__(self, dimension: int, half_width: int, config: LocalMapConfig, segments: Segments) -> None:
@@ -71,7 +73,12 @@ class VoxelSubmaps:
         self.dimension = dimension
         self.half_width = half_width
         self.config = config
+        self.of_map = KDTree(np.empty((0, dimension)))
         self.cached: OrderedDict[tuple[int, int], VoxelMap] = OrderedDict()
+
+    def begin_in(self, keyframes: Sequence[Keyframe]) -> None:
+        """Take the keyframes of a map."""
+        self.of_map = KDTree(np.array([keyframe.T_odom_lidar[:-1, -1] for keyframe in keyframes]))
 
     def anchor_of(self, keyframe: int) -> int:
         """The last keyframe up to this one that has a submap around it."""
@@ -81,13 +88,21 @@ class VoxelSubmaps:
         """The submap of an anchor out of the keyframes up to ``newest``."""
         begin, end = self.segments.span(anchor, len(keyframes))
         first, last = max(anchor - self.half_width, begin), min(anchor + self.half_width, newest, end - 1)
+        is_of_map = anchor < self.of_map.n
+        if is_of_map:
+            last = -1
         submap = self.cached.pop((anchor, last), None)
         if submap is None:
-            submap = self._build(keyframes[anchor], keyframes[first : last + 1])
+            chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
+            submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen])
         self.cached[anchor, last] = submap
         if len(self.cached) > _MAX_CACHED:
             self.cached.popitem(last=False)
         return submap
+
+    def _nearest(self, anchor: Keyframe) -> list[int]:
+        count = min(_OF_MAP * (2 * self.half_width + 1), self.of_map.n)
+        return sorted(np.atleast_1d(self.of_map.query(anchor.T_odom_lidar[:-1, -1], count)[1]).tolist())
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
         submap = VoxelMap(self.dimension, self.config, anchor.scale)

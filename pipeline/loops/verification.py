@@ -75,11 +75,13 @@ class ScanVerifier:
         *,
         newest: int,
         alone: bool = False,
+        in_map: bool = False,
     ) -> Verification:
         """The source's scan in the submap of an anchor, from an initial pose.
 
         newest : keyframe that may be in the submap
         alone : whether nothing but the match supports the closure, which must overlap more then
+        in_map : whether the source is followed in a map, where it needs no more information than a scan does
         """
         submap = self.submaps.around(target, keyframes, newest)
         points = downsample(keyframes[source].points, submap.scale * self.match_voxel_m)
@@ -87,16 +89,19 @@ class ScanVerifier:
         overlap = overlap_of(points, match.T_target_source, submap)
         moved_m = lie.apart(T_first, match.T_target_source)[0]
         min_overlap = _MIN_OVERLAP_ALONE if alone else self.config.min_overlap
-        return Verification(match, overlap, self._problem(match, overlap, moved_m, min_overlap))
+        min_information = 0.0 if in_map and match.observability >= 1.0 else self.config.min_information
+        return Verification(match, overlap, self._problem(match, overlap, moved_m, min_overlap, min_information))
 
-    def _problem(self, match: Match, overlap: float, moved_m: float, min_overlap: float) -> str:
+    def _problem(
+        self, match: Match, overlap: float, moved_m: float, min_overlap: float, min_information: float
+    ) -> str:
         limits, information = self.config, match.degeneracy_eigenvalue
         if not match.is_fit:
             return match.reason
         if overlap < min_overlap:
             return f"overlap {below(overlap)} < loops.min_overlap ({min_overlap:g})"
-        if information < limits.min_information:
-            return f"information {information:.1e} < loops.min_information ({limits.min_information:g})"
+        if information < min_information:
+            return f"information {information:.1e} < loops.min_information ({min_information:g})"
         if moved_m > limits.max_radius_m:
             return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
         return ""

@@ -231,14 +231,14 @@ class Odometry:
         """A scan that was aligned as seen from its middle, as seen from its stamp.
 
         The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
-        changes at the rate of the last two motions, known to about a half; in translation that would be noise.
+        changes at the rate of the last two motions, with an error as large; in translation that would be noise.
         """
         if sweep.middle_s == 0.0 or prediction.interval_s <= 0.0:
             return tracked
         mean = lie.log(self.predictor.T_previous_current) / prediction.interval_s
         change = (1.0 - sweep.middle_s / prediction.interval_s) * (self.predictor.velocity - mean)
         change[: self.dimension] = 0.0
-        tracked = replace(tracked, match=blurred(tracked.match, 0.5 * sweep.middle_s * change))
+        tracked = replace(tracked, match=blurred(tracked.match, sweep.middle_s * change))
         return seen_from(tracked, lie.exp(sweep.middle_s * (mean + change)))
 
     def _check_dimension(self, scan: Scan) -> None:

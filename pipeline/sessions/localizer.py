@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory, Verdict
+from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import LiveStamps
 from scanchain.slam import Slam, SlamResult, edge_information
@@ -113,8 +113,6 @@ class Localizer:
         self.sigma_m: list[float] = []
         self.traveled_m: list[float] = []
         self.start_m = self.slam.traveled_m
-        self.last: Closure | None = None  # the last one with the map
-        self.last_m = 0.0
         self.is_in_map = False
 
     def track(
@@ -137,9 +135,6 @@ class Localizer:
         step = self.slam.process(scan)
         if self.initial is not None and len(self.states) == 0:
             self.slam.begin_at(self.initial, INITIAL_SIGMAS)
-        for closure in step.closures:
-            if closure.verdict is Verdict.ACCEPTED and closure.target < self.slam.first:
-                self.last, self.last_m = closure, self.slam.traveled_m
         placed = self._placed(step)
         unknown = np.full(step.T_odom_lidar.shape, np.nan)
         self.states.append(placed.state)
@@ -176,7 +171,7 @@ class Localizer:
         if not self.is_in_map:
             return Placed(MapState.SEARCHING, None, None, step)
         state = MapState.LOCALIZED
-        if self.last is None or len(slam.keyframes) - 1 - self.last.source > _RECENT_KEYFRAMES:
+        if slam.by_map is None or len(slam.keyframes) - 1 - slam.by_map.source > _RECENT_KEYFRAMES:
             state = MapState.WITHOUT_MAP
         if step.state is State.LOST:
             state = MapState.LOST
@@ -185,12 +180,13 @@ class Localizer:
 
     def _covariance(self, T_odom_lidar: Pose) -> Matrix:
         """Covariance of a pose by the last match with the map and the drift since."""
-        config, k = self.slam.config.loops, self.slam.graph.freedom
-        since_m = self.slam.traveled_m - self.last_m
+        slam, config, k = self.slam, self.slam.config.loops, self.slam.graph.freedom
+        by_map = slam.by_map
+        since_m = slam.traveled_m - (self.start_m if by_map is None else slam.keyframes[by_map.source].traveled_m)
         drift = lie.by_component(k, config.drift * since_m, _TURN * config.drift * since_m)
-        if self.last is None:
+        if by_map is None:
             return np.diag(lie.by_component(k, *INITIAL_SIGMAS) ** 2 + drift**2)
-        information = edge_information(self.last.match.information, config.edge_sigma_m, config.edge_sigma_rad)
-        T_source_lidar = lie.between(self.slam.keyframes[self.last.source].T_odom_lidar, T_odom_lidar)
+        information = edge_information(by_map.match.information, config.edge_sigma_m, config.edge_sigma_rad)
+        T_source_lidar = lie.between(slam.keyframes[by_map.source].T_odom_lidar, T_odom_lidar)
         Ad = lie.adjoint(lie.inverse(T_source_lidar))
         return Ad @ np.linalg.inv(information) @ Ad.T + np.diag(drift**2)

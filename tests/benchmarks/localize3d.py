@@ -49,7 +49,7 @@ class Case:
     map_world: str
     log_world: str
     sensor: str = "hdl-64"
-    day: int = 1
+    changed: int | None = 1
     reverse: bool = True
     start_m: float = 130.0
     duration_s: float = 66.0
@@ -57,13 +57,13 @@ class Case:
 
 
 CASES = {
-    "same": Case("town", "town", reverse=False, start_m=0.0, day=0),
+    "same": Case("town", "town", reverse=False, start_m=0.0, changed=None),
     "changed": Case("town", "town"),
-    "vlp-16": Case("town", "town", "vlp-16", day=2),
-    "os1-32": Case("town", "town", "os1-32", day=3, start_m=50.0),
-    "rounds": Case("rounds", "rounds", day=4, start_m=300.0, duration_s=160.0),
+    "vlp-16": Case("town", "town", "vlp-16", changed=2),
+    "os1-32": Case("town", "town", "os1-32", changed=3, start_m=50.0),
+    "rounds": Case("rounds", "rounds", changed=4, start_m=300.0, duration_s=160.0),
     "forest": Case("town", "forest", belongs=False),
-    "forest in forest": Case("forest", "forest", day=1),
+    "forest in forest": Case("forest", "forest", changed=1),
 }
 
 
@@ -204,7 +204,12 @@ def main() -> None:
         case, seed = CASES[name], arguments.seed
         map_log = log_of(case.map_world, seed, arguments.cache, duration_s=case.duration_s)
         run = map_of(map_log)
-        options = {"day": case.day, "reverse": case.reverse, "start_m": case.start_m, "sensor": case.sensor}
+        options = {
+            "changed": case.changed,
+            "reverse": case.reverse,
+            "start_m": case.start_m,
+            "sensor": case.sensor,
+        }
         log = log_of(case.log_world, seed, arguments.cache, duration_s=case.duration_s, **options)
         truth = open_log([map_log], LogConfig()).ground_truth()
         count = len(open_log([log], LogConfig()).ground_truth())

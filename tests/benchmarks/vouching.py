@@ -109,6 +109,7 @@ def _process(case: Case, cache: Path, out: Path) -> None:
     if case.wheels != "wheels":
         options["odometry__prior"] = "constant-velocity"
     is_tum = reference is not None and reference.suffix == ".tum"
+    shutil.rmtree(out, ignore_errors=True)  # without run.json it would not be replaced
     job = Job(
         (file,), out, overrides=overrides_of(options), sinks=frozenset(), force=True,
         ground_truth=reference if is_tum else None,

@@ -253,24 +253,9 @@ def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane(
     assert min(same, opposite, aside) > 30  # of some 320 places
 
 
-def test_on_another_day_the_houses_stand_and_the_cars_and_people_are_others():
-    first, other = plan("town", seed=3).solids, plan("town", seed=3, day=1).solids
-
-    def shared(group):
-        rows = {tuple(row) for row in getattr(first, group).tolist()}
-        return np.array([tuple(row) in rows for row in getattr(other, group).tolist()])
-
-    high = other.boxes[:, 5] - other.ground_height(other.boxes[:, :2]) > 3.0
-    assert shared("boxes")[high].all() and shared("ellipsoids").all()  # houses, trees
-    bodies = np.abs(other.boxes[:, 4] - other.ground_height(other.boxes[:, :2]) - 0.23) < 0.03
-    assert bodies.sum() > 100 and not shared("boxes")[bodies].any()
-    assert len(other.cylinders) > len(first.cylinders) + 50  # people
-    assert not np.array_equal(plan("town", seed=3, day=2).solids.boxes, other.boxes)
-
-
 def test_a_route_is_driven_the_other_way_round_from_any_point_of_it():
     there = plan("town", seed=3, duration_s=80.0).truth().poses
-    back = plan("town", seed=3, duration_s=20.0, day=1, reverse=True, start_m=100.0).truth().poses
+    back = plan("town", seed=3, duration_s=20.0, changed=1, reverse=True, start_m=100.0).truth().poses
     away_m = np.linalg.norm(back[:, None, :2, 3] - there[:, :2, 3], axis=2)
     assert away_m.min(axis=1).max() < 4.0
     along = there[away_m.argmin(axis=1), :3, 0] * back[:, :3, 0]
@@ -620,7 +605,6 @@ def test_the_tum_file_holds_the_truth_to_the_nanosecond(tmp_path):
         ({"dropout": 1.5}, "choose one from 0 to 1"),
         ({"noise_m": float("nan")}, "noise_m nan"),
         ({"seed": -1}, "seed -1"),
-        ({"day": -1}, "day -1"),
         ({"start_m": -1.0}, "start_m -1 is out of range"),
         ({"world": "turns", "reverse": True}, "turns is no route"),
     ],

@@ -25,7 +25,6 @@ class World:
     route : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
     sight_m : how far any lidar sees there
     dropouts : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
-    another_day : draws the same place, with further random numbers for what changes from day to day
     """
 
     build: Callable[[np.random.Generator], Solids]
@@ -35,7 +34,6 @@ class World:
     duration_s: float
     sight_m: float = np.inf
     dropouts: tuple[tuple[float, float], ...] = ()
-    another_day: Callable[[np.random.Generator, np.random.Generator], Solids] | None = None
 
     def motion(
         self,
@@ -60,8 +58,8 @@ _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle o
 
 WORLDS: dict[str, World] = {
     "office": World(office.office, office.ROUTE, office.ROBOT, "lms-270", 240.0),
-    "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0, another_day=town.town),
-    "rounds": World(town.rounds, town.ROUNDS_ROUTE, town.ROUNDS_CAR, "hdl-64", 160.0, another_day=town.rounds),
+    "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0),
+    "rounds": World(town.rounds, town.ROUNDS_ROUTE, town.ROUNDS_CAR, "hdl-64", 160.0),
     "identical": World(identical.identical, identical.ROUTE, office.ROBOT, "lms-270", 300.0),
     "highway": World(highway.highway, highway.ROUTE, highway.CAR, "hdl-64", 30.0),
     "corridor": World(corridor.corridor, corridor.ROUTE, corridor.ROBOT, "os1-32", 40.0, corridor.SIGHT_M),
@@ -70,7 +68,7 @@ WORLDS: dict[str, World] = {
     "staircase": World(staircase.staircase, staircase.ROUTE, staircase.WALKER, "os1-32", 40.0),
     "hall": World(sparse.hall, sparse.HALL_ROUTE, sparse.TRUCK, "vlp-16", 25.0),
     "turns": World(sparse.yard, sparse.YARD_STEPS, sparse.YARD_ROBOT, "os1-32", 40.0),
-    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, dropouts=_GAPS, another_day=town.town),
+    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, dropouts=_GAPS),
 }
 
 

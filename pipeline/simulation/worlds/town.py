@@ -20,7 +20,6 @@ from scanchain.simulation.worlds.outdoors import BELOW_M, parked_car, tree
 _STREETS_X_M = (-50.0, 0.0, 50.0, 100.0, 150.0)  # middles of the streets that run north
 _STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
 _KERB_M, _PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 4.0, 3.1, 4.7, 5.2, 7.0  # from the middle of the street
-_PERSON_M = 13.0  # of pavement for each person or couple
 
 CAR = Vehicle(
     speed_m_s=9.0,
@@ -52,37 +51,22 @@ _LEGS = (
 )  # fmt: skip
 
 
-def town(rng: np.random.Generator, later: np.random.Generator | None = None, *, parked: float = 0.55) -> Solids:
+def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
     """The town; streets and blocks stand where they stand, everything else is drawn from ``rng``.
 
-    later : draws the parked cars, and people on the pavements, of another day
     parked : share of the places at the kerb that have a car on them
     """
-    relief = _relief(rng)
-    scenery = Scenery(relief)
-    cars = scenery if later is None else Scenery(relief)
+    scenery = Scenery(_relief(rng))
     for west, east in pairwise(_STREETS_X_M):
         for south, north in pairwise(_STREETS_Y_M):
             _block(scenery, west, east, south, north, rng)
     for y in _STREETS_Y_M:
         for west, east in pairwise(_STREETS_X_M):
-            _street(scenery, cars, np.array([west, y]), np.array([east, y]), parked, rng)
+            _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
     for x in _STREETS_X_M:
         for south, north in pairwise(_STREETS_Y_M):
-            _street(scenery, cars, np.array([x, south]), np.array([x, north]), parked, rng)
-    if later is not None:
-        for start, end in _stretches():
-            for side in (-1.0, 1.0):
-                _park_side(scenery, start, end, side, parked, later)
-            _people(scenery, start, end, later)
+            _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
-
-
-def _stretches() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Both ends of every street between two crossings."""
-    along_x = [((w, y), (e, y)) for y in _STREETS_Y_M for w, e in pairwise(_STREETS_X_M)]
-    along_y = [((x, s), (x, n)) for x in _STREETS_X_M for s, n in pairwise(_STREETS_Y_M)]
-    return [(np.array(start), np.array(end)) for start, end in along_x + along_y]
 
 
 def _relief(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -146,16 +130,23 @@ def _house(
 
 def _street(
     scenery: Scenery,
-    cars: Scenery,
     start: NDArray[np.float64],
     end: NDArray[np.float64],
     parked: float,
     rng: np.random.Generator,
 ) -> None:
     """Both sides of one street between two crossings: parked cars, trees, lamps, signs, bins."""
-    length, along, aside, yaw = _axes(start, end)
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / length
+    aside = np.array([-along[1], along[0]])
+    yaw = float(np.arctan2(along[1], along[0]))
     for side in (-1.0, 1.0):
-        _park_side(cars, start, end, side, parked, rng)
+        place = 12.0 + rng.uniform(0.0, 3.0)
+        while place < length - 12.0:
+            if rng.random() < parked:
+                x, y = start + place * along + side * (_PARKED_M + rng.normal(0.0, 0.08)) * aside
+                parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
+            place += rng.uniform(5.2, 7.5)
         for place in np.arange(9.0 + rng.uniform(0.0, 4.0), length - 9.0, rng.uniform(9.0, 14.0)):
             x, y = start + place * along + side * _TREE_M * aside
             if rng.random() < 0.6:
@@ -164,56 +155,19 @@ def _street(
             x, y = start + place * along + side * _LAMP_M * aside
             scenery.cylinder((float(x), float(y)), radius, (BELOW_M, height + rng.uniform(-0.3, 0.3)))
         x, y = start + rng.uniform(10.0, length - 10.0) * along + side * 6.2 * aside
-        scenery.box((float(x), float(y)), (0.6, 0.7), (BELOW_M, 1.1), yaw)
+        with scenery.movable():
+            scenery.box((float(x), float(y)), (0.6, 0.7), (BELOW_M, 1.1), yaw)
 
 
-def _axes(
-    start: NDArray[np.float64], end: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
-    """Length, direction, the direction to its left, and heading of a street."""
-    length = float(np.linalg.norm(end - start))
-    along = (end - start) / length
-    return length, along, np.array([-along[1], along[0]]), float(np.arctan2(along[1], along[0]))
-
-
-def _park_side(
-    scenery: Scenery,
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    side: float,
-    parked: float,
-    rng: np.random.Generator,
-) -> None:
-    """Parked cars on one side of a street, 1 to its left and −1 to its right."""
-    length, along, aside, yaw = _axes(start, end)
-    place = 12.0 + rng.uniform(0.0, 3.0)
-    while place < length - 12.0:
-        if rng.random() < parked:
-            x, y = start + place * along + side * (_PARKED_M + rng.normal(0.0, 0.08)) * aside
-            parked_car(scenery, float(x), float(y), yaw + rng.normal(0.0, 0.02), rng)
-        place += rng.uniform(5.2, 7.5)
-
-
-def _people(
-    scenery: Scenery, start: NDArray[np.float64], end: NDArray[np.float64], rng: np.random.Generator
-) -> None:
-    """People on both pavements, one every 13 m or so, alone or two together."""
-    length, along, aside, _ = _axes(start, end)
-    for side in (-1.0, 1.0):
-        for place in rng.uniform(9.0, length - 9.0, rng.poisson(length / _PERSON_M)):
-            at = start + place * along + side * rng.uniform(5.4, 6.8) * aside
-            for beside_m in (0.0, 0.7)[: 1 + (rng.random() < 0.3)]:
-                x, y = at + beside_m * along
-                scenery.cylinder((float(x), float(y)), rng.uniform(0.18, 0.28), (-0.1, rng.uniform(1.1, 1.9)))
-
-
-def rounds(rng: np.random.Generator, later: np.random.Generator | None = None) -> Solids:
+def rounds(rng: np.random.Generator) -> Solids:
     """The town, its kerbs empty and its hedges cut where they reach into the lanes."""
-    solids = town(rng, later, parked=0.0)
+    solids = town(rng, parked=0.0)
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
     gap = np.abs(lanes[:, None] - solids.boxes[:, :2]) - solids.boxes[:, 2:4]
     distance_m = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0)
-    return replace(solids, boxes=solids.boxes[distance_m > _FREE_M])
+    kept = distance_m > _FREE_M
+    owner = np.concatenate([solids.owner[: len(kept)][kept], solids.owner[len(kept) :]])
+    return replace(solids, boxes=solids.boxes[kept], owner=owner)
 
 
 def _lanes() -> Matrix:

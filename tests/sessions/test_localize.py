@@ -1,0 +1,140 @@
+"""A simulated office: a map of its first half, in which the rest is localized."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from scanchain import InputError, Localizer, Trajectory, lie, read_tum, run, simulate, write_tum
+from scanchain.maps import Edges, open_saved_map, write_saved_map
+from scanchain.sessions.initial import pose_near
+from scanchain.sessions.localizer import MapState
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """Folder with office.mcap, the truth and the map of the first 100 s."""
+    folder = tmp_path_factory.mktemp("office")
+    simulate("office", folder / "office.mcap", seed=3)
+    run(folder / "office.mcap", folder / "map", recording=False, log__end_s=100.0)
+    return folder
+
+
+def in_the_map(folder):
+    """True poses of the lidar in the frame of the map, whose first scan stands at the identity."""
+    truth = lie.flatten(read_tum(folder / "office.tum").poses)
+    return lie.between(np.broadcast_to(truth[0], truth.shape), truth)
+
+
+def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
+    stamps_ns = read_tum(office / "office.tum").stamps_ns
+    true = in_the_map(office)
+    rough = true @ lie.exp(np.array([0.4, -0.3, 0.1]))
+    write_tum(tmp_path / "rough.tum", Trajectory(stamps_ns, rough))
+    code, out, _ = call(
+        "localize", office / "office.mcap", "--start", 110, "--map", office / "map", "--out", tmp_path / "loc",
+        "--initial", tmp_path / "rough.tum",
+    )  # fmt: skip
+    assert code == 0 and out.startswith("verdict        trustworthy: found in map after 0.0 m"), out
+    found = read_tum(tmp_path / "loc/trajectory.tum")
+    where = np.searchsorted(stamps_ns, found.stamps_ns)
+    off = [lie.apart(a, b) for a, b in zip(lie.flatten(found.poses), true[where], strict=True)]
+    assert np.median(off, axis=0)[0] < 0.03 and np.max(off, axis=0)[0] < 0.15, np.max(off, axis=0)
+    table = pq.read_table(tmp_path / "loc/localization.parquet").to_pydict()
+    states = np.array(table["state"])
+    known = states == MapState.LOCALIZED
+    assert known.mean() > 0.5 and not (states == MapState.SEARCHING).any()
+    live = np.column_stack([table["live_x_m"], table["live_y_m"]])[known]
+    error_m = np.linalg.norm(live - true[where][known][:, :2, 2], axis=1)
+    assert (error_m < 5.0 * np.array(table["sigma_m"])[known]).mean() > 0.95
+    for name in ("report.html", "recording.rrd", "summary.txt", "config.toml", "run.json"):
+        assert (tmp_path / "loc" / name).stat().st_size > 100, name
+    metrics = json.loads((tmp_path / "loc/metrics.json").read_text())
+    assert metrics["placed"] == metrics["scans"] == len(states)
+
+
+def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
+    simulate("identical", tmp_path / "other.mcap", seed=5, duration_s=40.0)
+    code, out, error = call(
+        "localize", tmp_path / "other.mcap", "--map", office / "map", "--out", tmp_path / "loc"
+    )
+    assert code == 1 and "not trustworthy: not from this place: nothing in " in out and "is in map" in error
+    assert not (tmp_path / "loc/trajectory.tum").exists()
+    assert json.loads((tmp_path / "loc/metrics.json").read_text())["placed"] == 0
+
+
+def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office, tmp_path, call):
+    with pytest.raises(InputError, match=r"holds no map \(map/map.json\); give the directory of a finished run"):
+        open_saved_map(tmp_path)
+    whole = open_saved_map(office / "map")
+
+    def copy(name):
+        write_saved_map(tmp_path / name, whole.keyframes, whole.poses, whole.session, whole.sessions, whole.edges)
+        return tmp_path / name
+
+    points = copy("cut") / "points.i16"
+    points.write_bytes(points.read_bytes()[:-7])
+    with pytest.raises(InputError, match=r"points.i16: has [\d,]+ bytes of [\d,]+; run the log again"):
+        open_saved_map(tmp_path / "cut")
+    index = copy("newer") / "map.json"
+    index.write_text(index.read_text().replace('"version": 1', '"version": 99'))
+    with pytest.raises(InputError, match="is of version 99, this scanchain reads 1"):
+        open_saved_map(tmp_path / "newer")
+    for name in ("keyframes.npz", "edges.npz"):
+        broken = copy(name.split(".")[0]) / name
+        broken.write_bytes(broken.read_bytes()[:100])
+        with pytest.raises(InputError, match=f"{name} cannot be read"):
+            open_saved_map(broken.parent)
+        broken.unlink()
+        with pytest.raises(InputError, match=f"{name} cannot be read"):
+            open_saved_map(broken.parent)
+    simulate("town", tmp_path / "town.mcap", duration_s=1.0)
+    code, _, error = call("localize", tmp_path / "town.mcap", "--map", office / "map", "--out", tmp_path / "loc")
+    assert code == 2 and "has 3D scans, the map map is 2D; give a map of the same kind" in error
+    code, _, error = call("localize", office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc",
+                          "--initial", "1,2")  # fmt: skip
+    assert code == 2 and "--initial is '1,2'; give x,y,yaw in meters and degrees, or a file .tum" in error
+
+
+def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
+    words = ("localize", office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--no-loops")
+    code, _, error = call(*words)
+    assert code == 2 and "a place in a map is found by loop closures; leave it true" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_saved_map_holds_its_keyframes_to_the_millimeter_and_the_poses_to_the_bit(office, tmp_path):
+    saved = open_saved_map(office / "map")
+    twice = saved.edges.among(np.arange(len(saved.keyframes)))
+    write_saved_map(tmp_path / "again", saved.keyframes, saved.poses, saved.session, saved.sessions, twice)
+    again = open_saved_map(tmp_path / "again")
+    assert again.sessions == saved.sessions and (again.poses == saved.poses).all()
+    assert all(np.array_equal(a, b) for a, b in zip(vars_of(again.edges), vars_of(saved.edges), strict=True))
+    for one, other in zip(again.keyframes, saved.keyframes, strict=True):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-3)
+        assert replace(one, stored=None, T_odom_lidar=None) == replace(other, stored=None, T_odom_lidar=None)
+    half = saved.edges.among(np.arange(5, 20))
+    assert half.pairs.max() < 15 and len(half.pairs) < len(saved.edges.pairs)
+
+
+def vars_of(edges: Edges):
+    return edges.pairs, edges.measurements, edges.information, edges.is_loop, edges.weight
+
+
+def test_the_localizer_takes_scans_as_a_driver_has_them(office):
+    saved = open_saved_map(office / "map")
+    localizer = Localizer(office / "map", initial=saved.keyframes[0].T_odom_lidar)
+    first = saved.keyframes[0].points
+    placed = [localizer.track(first, 0.1 * k) for k in range(5)]
+    assert all(each.state is not MapState.SEARCHING for each in placed)
+    off_m, off_rad = lie.apart(placed[-1].T_map_lidar, saved.keyframes[0].T_odom_lidar)
+    assert off_m < 0.01 and off_rad < 0.01 and placed[-1].covariance.shape == (3, 3)
+    with pytest.raises(InputError, match="stamp"):
+        localizer.track(first, 0.1)
+
+
+def test_a_heading_in_degrees_turns_the_pose_of_the_nearest_keyframe(office):
+    saved = open_saved_map(office / "map")
+    np.testing.assert_allclose(pose_near(1.0, 2.0, 90.0)(0, saved), lie.pose_2d(1.0, 2.0, np.pi / 2), atol=1e-12)
