@@ -125,7 +125,7 @@ class Slam:
         self.first = self.optimized_at = len(self.keyframes)
         for keyframe in self.keyframes:
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
-        self.traveled_m = self.closer.begin_in(self.keyframes)
+        self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)
 
     def track(
         self,

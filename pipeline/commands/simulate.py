@@ -34,6 +34,8 @@ from scanchain.words import counted
     metavar="N",
     help="Drive again on another day, number N: furniture or parked cars came, went and moved.",
 )
+@click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
+@click.option("--start", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
     world: str,
@@ -45,6 +47,8 @@ def simulate(
     noise: float | None,
     dropout: float | None,
     changed: int | None,
+    reverse: bool,
+    start: float,
     force: bool,
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
@@ -73,6 +77,7 @@ def simulate(
       scanchain simulate highway fast.mcap --sensor os1-32
       scanchain simulate office later.mcap --changed 1
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
+      scanchain simulate town again.mcap --changed 1 --reverse --start 100
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
@@ -90,6 +95,8 @@ def simulate(
             noise_m=noise,
             dropout=dropout,
             changed=changed,
+            reverse=reverse,
+            start_m=start,
             force=force,
             progress=terminal.count,
         )

@@ -15,6 +15,7 @@ from scanchain.config import Config, MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.logs import Log
+from scanchain.loops import outline_of
 from scanchain.maps import (
     MAP_FOLDER,
     Edges,
@@ -25,6 +26,7 @@ from scanchain.maps import (
     draw_grid,
     fitting_resolution,
     moved,
+    open_saved_map,
     write_laz,
     write_map,
     write_pcd,
@@ -88,6 +90,8 @@ def _write_saved_map(path: Path, results: Results) -> None:
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
     write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
+    if results.config.loops.enabled and graph.dimension == 3:
+        outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
 
 
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here

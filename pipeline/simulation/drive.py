@@ -22,6 +22,7 @@ PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own rando
 _DROPOUT_S = 1.0
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
 _LONGEST_S = 36_000.0
+_FARTHEST_M = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,8 @@ def plan(
     noise_m: float | None = None,
     dropout: float | None = None,
     changed: int | None = None,
+    reverse: bool = False,
+    start_m: float = 0.0,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
     place = find_world(world)
@@ -72,9 +75,16 @@ def plan(
     length_s = place.duration_s if duration_s is None else duration_s
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
+    check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    if isinstance(place.route, tuple) and (reverse or start_m):
+        raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = place.build(random_numbers(seed, PLACE))
     motion = place.motion(
-        solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, DEVIATION, changed)
+        solids,
+        duration_s=length_s + lidar.period_ns * 1e-9,
+        rng=random_numbers(seed, DEVIATION, changed),
+        reverse=reverse,
+        start_m=start_m,
     )
     changes: tuple[Change, ...] = ()
     if changed is not None:

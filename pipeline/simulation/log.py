@@ -32,6 +32,8 @@ def simulate(
     noise_m: float | None = None,
     dropout: float | None = None,
     changed: int | None = None,
+    reverse: bool = False,
+    start_m: float = 0.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
@@ -43,6 +45,7 @@ def simulate(
     multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own; with
     ``changed``, a seed, it is another day: furniture or parked cars came, went and moved, as .changes.csv beside
     the log lists, and the drive is repeated with other deviations and noise;
+    ``reverse`` drives the other way round, from ``start_m`` along that route;
     ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
@@ -56,7 +59,15 @@ def simulate(
     if changed is not None and changes_file.exists() and not force:
         raise InputError(f"{changes_file}: exists; choose another name or pass --force to replace it")
     drive = plan(
-        world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout, changed=changed
+        world,
+        seed=seed,
+        duration_s=duration_s,
+        sensor=sensor,
+        noise_m=noise_m,
+        dropout=dropout,
+        changed=changed,
+        reverse=reverse,
+        start_m=start_m,
     )
     truth = record(drive, destination, seed=seed, changed=changed, drift=drift, force=force, progress=progress)
     if changed is not None:
