@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-
 if TYPE_CHECKING:
     from typing import Any
 
-    from scanchain.api import compare, downsample, localize, optimize, run
+    from scanchain.api import changes, compare, downsample, localize, merge, optimize, run
     from scanchain.config import Config
     from scanchain.data import Match, Scan, State, Step, Trajectory
     from scanchain.errors import InputError, ScanchainError
@@ -42,12 +42,14 @@ _HOMES = {
     "Trajectory": "data",
     "VoxelMap": "registration",
     "align": "registration",
+    "changes": "api",
     "compare": "api",
     "create_matcher": "registration",
     "downsample": "api",
     "evaluate": "evaluation.metrics",
     "load_settings": "settings",
     "localize": "api",
+    "merge": "api",
     "open_log": "logs",
     "optimize": "api",
     "read_g2o": "graph.files.g2o",
@@ -66,11 +68,13 @@ _COMPILED = {
     "Slam",
     "VoxelMap",
     "align",
+    "changes",
     "compare",
     "create_matcher",
     "downsample",
     "evaluate",
     "localize",
+    "merge",
     "run",
     "simulate",
 }
@@ -91,12 +95,14 @@ __all__ = [
     "Trajectory",
     "VoxelMap",
     "align",
+    "changes",
     "compare",
     "create_matcher",
     "downsample",
     "evaluate",
     "load_settings",
     "localize",
+    "merge",
     "open_log",
     "optimize",
     "read_g2o",

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import click
 
 from scanchain.commands.batch import batch
+from scanchain.commands.changes import changes
 from scanchain.commands.check import check
 from scanchain.commands.compare import compare
 from scanchain.commands.config import config
@@ -22,6 +23,8 @@ from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.localize import localize
+from scanchain.commands.map import map_group
+from scanchain.commands.merge import merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
@@ -47,8 +50,8 @@ def scanchain() -> None:
 
 
 _COMMANDS = (
-    run, localize, check, batch, view, compare, info, doctor, convert, simulate, evaluate, optimize, landmarks,
-    config, sequence,
+    run, localize, merge, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate,
+    evaluate, optimize, landmarks, config, sequence,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)

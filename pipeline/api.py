@@ -1,4 +1,4 @@
-"""The commands as functions: process a log, compare methods on it, optimize a graph, downsample points."""
+"""The commands as functions: process a log, merge maps, compare methods, optimize a graph, downsample points."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanchain import checks
-from scanchain.data import Points
+from scanchain.data import Points, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
     from scanchain.runs.job import Recorder, SinkName
+    from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
+    from scanchain.sessions.merging import Merged
 
 Logs = str | Path | Sequence[str | Path]
 
@@ -87,6 +89,76 @@ def localize(
         force=force,
     )
     return localize_log(job, Unwatched(), draw_localization if recording else lambda folder, localized: None)[0]
+
+
+def merge(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    fixed: bool = False,
+    force: bool = False,
+    **overrides: object,
+) -> Merged:
+    """Merge the maps of run directories into one, as ``scanchain merge`` does; nothing is printed.
+
+    runs : two or more; the map is in the frame of the first, whose poses stay as they are if ``fixed``
+    Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
+    are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
+    """
+    from scanchain.sessions.merging import MergeJob
+    from scanchain.sessions.merging import merge as merge_maps
+
+    job = MergeJob(
+        runs=tuple(checks.path(run, "runs") for run in runs),
+        out=checks.path(out, "out"),
+        config_file=None if config is None else checks.path(config, "config"),
+        overrides=overrides_of(overrides),
+        fixed=checks.truth(fixed, "fixed"),
+        force=force,
+    )
+    return merge_maps(job, Unwatched(), present_merge)
+
+
+def changes(
+    earlier: str | Path,
+    later: str | Path | None,
+    out: str | Path,
+    *,
+    T_earlier_later: Pose | None = None,
+    voxel_size_m: float | None = None,
+    min_size_m: float = 0.2,
+    recording: bool = True,
+    force: bool = False,
+) -> Changes:
+    """Compare two maps of one place, as ``scanchain changes`` does; nothing is printed.
+
+    earlier, later : run directories; None compares the newest session of a merged map with all before it
+    T_earlier_later : (d+1, d+1) where it is known; found by loop closures where left out
+    voxel_size_m : resolution; that of maps where left out. min_size_m : least length of a change
+    recording : whether report and recording are written
+    Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
+    """
+    from scanchain.sessions.change_run import Comparison, compare_maps
+
+    first = checks.path(earlier, "earlier")
+    size_m = None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m")
+    comparison = Comparison(
+        earlier=first,
+        later=None if later is None else checks.path(later, "later"),
+        out=checks.path(out, "out"),
+        transform=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
+        voxel_size_m=size_m,
+        min_size_m=checks.positive(min_size_m, "min_size_m"),
+        force=force,
+    )
+    return compare_maps(comparison, present_changes if recording else lambda directory, found: None)
+
+
+def _pose_in(path: Path, T: Pose) -> Pose:
+    from scanchain.maps import open_saved_map
+
+    return checks.pose(T, "T_earlier_later", open_saved_map(path).dimension)
 
 
 def compare(
@@ -164,6 +236,15 @@ def draw_localization(folder: Path, localized: LocalizedLog) -> None:
     record_localization(folder / RECORDING_FILE, localized)
 
 
+def present_merge(directory: Path) -> None:
+    """Add report.html and a recording to the directory of a merge."""
+    from scanchain.viz.recording.merge import record_merge
+    from scanchain.viz.report.merge import write_merge_report
+
+    write_merge_report(directory)
+    record_merge(directory)
+
+
 def present_comparison(directory: Path) -> None:
     """Add report.html and a recording to the directory of a comparison."""
     from scanchain.viz.recording.comparison import record_comparison
@@ -171,3 +252,12 @@ def present_comparison(directory: Path) -> None:
 
     write_compare_report(directory)
     record_comparison(directory)
+
+
+def present_changes(directory: Path, found: Changes) -> None:
+    """Add report.html and a recording to the directory of changes."""
+    from scanchain.viz.recording.changes import record_changes
+    from scanchain.viz.report.changes import write_changes_report
+
+    write_changes_report(directory, found)
+    record_changes(directory, found)

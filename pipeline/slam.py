@@ -103,6 +103,8 @@ class Slam:
         self.traveled_m = 0.0
         self.waiting_closures = 0
         self.moves_map = False
+        self.joins_segment = False
+        self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
         self.lost_scans = 0
         self.optimized_at = 0
         self.first = 0  # number of the first keyframe of this log
@@ -123,7 +125,7 @@ class Slam:
         self.first = self.optimized_at = len(self.keyframes)
         for keyframe in self.keyframes:
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
-        self.traveled_m = self.closer.begin_in(self.keyframes)
+        self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)
 
     def track(
         self,
@@ -312,16 +314,31 @@ class Slam:
         self.waiting_closures += 1
         self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
+        if self._joins_segment(closure):
+            self._move_segment(closure)
         return replace(closure, chi2_before=float(error @ information @ error))
 
+    def _joins_segment(self, closure: Closure) -> bool:
+        """True for the first closure of the newest segment to an older one."""
+        start = self.closer.segments.starts[-1]
+        return self.joined_start < start and closure.target < start <= closure.source
+
+    def _move_segment(self, closure: Closure) -> None:
+        """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
+        self.joined_start, self.joins_segment = self.closer.segments.starts[-1], True
+        T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
+        T_new_old = T_world_source @ lie.inverse(self.graph.poses[closure.source])
+        self.graph.move(self.joined_start, lie.normalize(T_new_old))
+
     def _optimize_when_due(self) -> GraphState | None:
-        """Optimize when closures wait: soon if one of them moves the map, else once the graph has grown enough.
+        """Optimize when closures wait: at once where one joins a segment, soon where it moves the map.
 
         The required growth is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
-        enough = 1 if self.first and self.moves_map else _OPTIMIZE_EVERY
+        is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
+        enough = 0 if is_urgent else _OPTIMIZE_EVERY
         if not self.moves_map:
             enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
         if not self.waiting_closures or grown < enough:
@@ -331,6 +348,7 @@ class Slam:
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
         self.waiting_closures, self.moves_map, self.optimized_at = 0, False, len(self.keyframes)
+        self.joins_segment = False
         self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
 

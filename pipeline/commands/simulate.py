@@ -28,6 +28,14 @@ from scanchain.words import counted
 @click.option(
     "--dropout", type=float, metavar="SHARE", help="Share of returns that are lost. [default: the sensor's]"
 )
+@click.option(
+    "--changed",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Drive again on another day, number N: furniture or parked cars came, went and moved.",
+)
+@click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
+@click.option("--start", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
     world: str,
@@ -38,6 +46,9 @@ def simulate(
     drift: float,
     noise: float | None,
     dropout: float | None,
+    changed: int | None,
+    reverse: bool,
+    start: float,
     force: bool,
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
@@ -56,14 +67,17 @@ def simulate(
       hall       flat floor, few pillars, from standstill to 5 m/s
       turns      turns on the spot at 120 deg/s and short moves in a yard
       gap        the town, but one second of scans is missing in a bend, and one on a straight
-    All but office and identical are driven with a 3D lidar by default.
+    All but office and identical are driven with a 3D lidar by default. With --changed the world is the one of the
+    same seed, and what is different in it (in office, identical, town, rounds, gap) is listed in DST.changes.csv.
 
     \b
     Examples:
       scanchain simulate office office.mcap
       scanchain simulate town town.mcap --duration 20 --seed 3
       scanchain simulate highway fast.mcap --sensor os1-32
+      scanchain simulate office later.mcap --changed 1
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
+      scanchain simulate town again.mcap --changed 1 --reverse --start 100
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
@@ -80,6 +94,9 @@ def simulate(
             drift=drift,
             noise_m=noise,
             dropout=dropout,
+            changed=changed,
+            reverse=reverse,
+            start_m=start,
             force=force,
             progress=terminal.count,
         )

@@ -220,6 +220,13 @@ class PoseGraph:
         self._changed()
         self._fixed.add(index)
 
+    def move(self, first: int, T_new_old: Pose) -> None:
+        """Move this pose and all later ones rigidly, as a first guess."""
+        poses = self.poses.copy()
+        poses[first:] = checks.pose(T_new_old, "T_new_old", self.dimension) @ poses[first:]
+        self._changed()
+        self._poses.replace(poses)
+
     def optimize(
         self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: OutlierRejection = "refined"
     ) -> Optimization:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,13 @@ from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, Keyframe, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
+from scanchain.loops.map_search import MapSearch
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
+_KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
 
@@ -25,19 +28,30 @@ class LoopCloser:
 
     def __init__(self, config: Config, dimension: int) -> None:
         """Raises InputError for a recognizer that cannot be loaded."""
+        self.config = config
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = ScanVerifier(config, submaps)
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)
-        self.relocalizer = None if search is None else Relocalizer(search, verifier, self.segments)
+        self.map_search: MapSearch | None = None
+        self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
-    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
-        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters."""
-        self.near.of_map = len(keyframes)
-        self.near.submaps.begin_in(keyframes)
-        return self.places.begin_in(keyframes)
+    def begin_in(
+        self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_fixed: bool = True
+    ) -> float:
+        """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
+
+        folder : of a map on disk, which keeps its outline; without one, places are recognized by descriptors
+        is_fixed : whether they stay where they are; else only those of one pass make a submap
+        """
+        if is_fixed:
+            self.near.of_map = len(keyframes)
+            self.near.submaps.begin_in(keyframes)
+        if folder is not None and self.relocalizer is None and self.config.loops.enabled:
+            self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
+        return self.places.begin_in(keyframes, are_added=self.map_search is None)
 
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
@@ -50,9 +64,18 @@ class LoopCloser:
         """
         components = self.segments.components(graph)
         connected = components == components[-1]
+        if self.map_search is not None and self.map_search.has_just_matched(keyframes):
+            self.places.skip(keyframes)
+            return ()
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
+        if self.map_search is not None:
+            if not self.map_search.is_tracked(keyframes, closures):
+                closures += self.map_search.close(keyframes, graph, components)
+            else:
+                self.places.skip(keyframes)
+                return closures
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
@@ -73,6 +96,7 @@ class ProximityCloser:
         self.search = search
         self.drift = Drift(config.drift)
         self.of_map = 0  # number of the first keyframes that belong to a map
+        self.target_in_map = -1  # anchor of the last submap of the map that was matched
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, connected: NDArray[np.bool_]
@@ -95,6 +119,11 @@ class ProximityCloser:
         if not len(near):
             return ()
         target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
+        if self.search is None and target < self.of_map:
+            kept = self.target_in_map
+            if kept in near and distance_m[kept] <= _KEPT_M * keyframes[kept].scale:
+                target = kept
+            self.target_in_map = target
         T_first = lie.between(T_world[target], T_world[-1])
         verified = self.verifier.verify(
             keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map

@@ -114,8 +114,14 @@ def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
         if chosen.sum() < _MIN_GROUND_VOXELS:
             break
         up = _unit((normals[chosen] * np.sign(along[chosen])[:, None]).sum(axis=0))
+    return upright_frame(up)
+
+
+def upright_frame(up: NDArray[np.float64], ahead: NDArray[np.float64] | None = None) -> Pose:
+    """The frame (4, 4) at the origin with its z axis along the unit vector ``up``, x near ``ahead``, or x."""
     T = lie.identity(3)
-    forward = _unit(np.array([1.0, 0.0, 0.0]) - up[0] * up)
+    ahead = np.array([1.0, 0.0, 0.0]) if ahead is None else ahead
+    forward = _unit(ahead - (ahead @ up) * up)
     T[:3, 0], T[:3, 1], T[:3, 2] = forward, np.cross(up, forward), up
     return T
 

@@ -41,9 +41,12 @@ class PlaceCloser:
         self.next_m = 0.0
         self.last: Closure | None = None
 
-    def begin_in(self, keyframes: Sequence[Keyframe]) -> float:
-        """Add the submaps of a map; the path, in meters, from which on all of them are candidates."""
-        if self.recognizer is not None:
+    def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
+        """Begin behind the keyframes of a map; the path, in meters, from which on all of them are candidates.
+
+        are_added : whether places of the map are recognized here
+        """
+        if self.recognizer is not None and are_added:
             for anchor in self._anchors(keyframes, finish=True):
                 self.recognizer.add(self._submap(anchor, keyframes))
                 self.added.append(anchor.index)
@@ -52,6 +55,10 @@ class PlaceCloser:
         apart_m = max((RADII_BEHIND + RADII_AHEAD) * self._radius_m(last), limits.min_travel_m)
         self.next_m = last.traveled_m + 2.0 * apart_m
         return self.next_m
+
+    def skip(self, keyframes: Sequence[Keyframe]) -> None:
+        """Make no submaps around the keyframes so far."""
+        self.examined = len(keyframes)
 
     def close(
         self,

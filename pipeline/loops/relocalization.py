@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from scanchain import lie
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
+from scanchain.loops.planar_map_search import MapSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
@@ -23,15 +24,23 @@ _RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of 
 _MIN_RAD = 0.1  # least half width of the window in heading
 _SPACING_M = 4.0  # least distance between the anchors of submaps that are searched
 _MAX_SUBMAPS = 6  # largest number of submaps searched near the expected pose
-_MAX_SUBMAPS_ANYWHERE = 400  # largest number of submaps searched without an expected pose
-_KEYFRAMES_ANYWHERE = 12  # number of keyframes whose points are searched for together, without an expected pose
-_MIN_SHARE = 0.55  # least share of the highest possible score at which something was found
+_MIN_SHARE = 0.55  # least share of the highest possible score at which something was found near it
 _SAME_POSE_M = 2.0  # distance within which the results of two submaps are the same pose
-_RIVAL = 0.9  # share of the best score, from which on a result elsewhere makes it ambiguous
-_FIRST_M = 3.0  # distance traveled in a new segment before the first search anywhere
+_AMBIGUOUS = 0.9  # share of the best score, from which on a result elsewhere makes it ambiguous
+
+_FIRST_M = 1.0  # distance traveled in a new segment before the first search of the whole map
 _BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
-_APART_M = 1.0  # least distance traveled between two results that may confirm each other
+_APART_M = 0.5  # least distance traveled between two searches
+_PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
+_LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
+_CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
+_RIVAL = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
+_SOURCES, _SUBMAPS = (
+    4,
+    6,
+)  # numbers of keyframes of the path that are aligned, and of submaps that are tried for each
+_NEAR_M = 8.0  # largest distance of such a submap's anchor
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,26 +88,7 @@ class PlanarSearch:
         ]
         return _best(anchors, seeds, T_world)
 
-    def find_anywhere(
-        self, keyframes: Sequence[Keyframe], T_world: Matrix, old: NDArray[np.int64], known: int
-    ) -> Found | None:
-        """The best fit of the newest keyframe among older ones, without an expected pose.
-
-        old : these keyframes, of one component; known : how many of the last ones odometry joins to the newest
-        """
-        old = old[old % self.submaps.half_width == 0]
-        if not len(old):
-            return None
-        anchors = self._anchors(old, T_world, most=_MAX_SUBMAPS_ANYWHERE)
-        points = self._points(keyframes, min(known, _KEYFRAMES_ANYWHERE))
-        newest = len(keyframes) - 1
-        seeds = [
-            _seed(points, self.submaps.around(anchor, keyframes, newest), lie.identity(2), _SPACING_M, math.pi)
-            for anchor in anchors
-        ]
-        return _best(anchors, seeds, T_world)
-
-    def _anchors(self, near: NDArray[np.int64], T_world: Matrix, most: int = _MAX_SUBMAPS) -> list[int]:
+    def _anchors(self, near: NDArray[np.int64], T_world: Matrix) -> list[int]:
         """Anchors among the keyframes within reach, the nearest to the newest first, none close to another."""
         positions = T_world[:, :2, 2]
         anchors = np.unique([self.submaps.anchor_of(index) for index in near.tolist()])
@@ -106,7 +96,7 @@ class PlanarSearch:
         chosen: list[int] = []
         for anchor in nearest_first.tolist():
             away_m = np.linalg.norm(positions[chosen] - positions[anchor], axis=1)
-            if len(chosen) < most and (away_m >= _SPACING_M).all():
+            if len(chosen) < _MAX_SUBMAPS and (away_m >= _SPACING_M).all():
                 chosen.append(anchor)
         return chosen
 
@@ -118,42 +108,53 @@ class PlanarSearch:
 
 
 class Relocalizer:
-    """Search for a new segment in the older ones, as long as no loop joins it to them."""
+    """Search for a new segment in the older ones, as long as no loop joins it to them.
 
-    def __init__(self, search: PlanarSearch, verifier: ScanVerifier, segments: Segments) -> None:
-        self.search = search
+    All points of its path so far are searched for in the whole map, again and again as it travels. A pose is
+    taken once it fits better than chance, no pose elsewhere fits nearly as well, an earlier search found the same
+    one, and scans align there.
+    """
+
+    def __init__(self, submaps: VoxelSubmaps, verifier: ScanVerifier, segments: Segments) -> None:
+        self.submaps = submaps
         self.verifier = verifier
         self.segments = segments
         self.next_m = 0.0
         self.turn = 0
-        self.found: list[Closure] = []
+        self.found: list[Find] = []
+        self.searched: MapSearch | None = None
+        self.searched_poses = np.empty((0, 3, 3))
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
     ) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe to older segments; the first that agree with each other are accepted.
+        """Closures of keyframes of the newest segment to older segments; accepted where two finds agree.
 
         components : (K,) of ``Segments.components``
         """
-        start = self.segments.starts[-1]
+        start, newest = self.segments.starts[-1], len(keyframes) - 1
         traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
         unknown = np.flatnonzero(components != components[-1])
         is_due = traveled_m >= _FIRST_M and keyframes[-1].traveled_m >= self.next_m
         if not len(unknown) or not is_due:
             return ()
         self.next_m = keyframes[-1].traveled_m + max(_BACKOFF * traveled_m, _APART_M)
+        self.found = [find for find in self.found if find.source >= start]
         old = self._next_component(unknown, components)
-        found = self.search.find_anywhere(keyframes, graph.poses, old, len(keyframes) - start)
-        if found is None:
+        first = newest
+        while first > start and keyframes[newest].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
+            first -= 1
+        find = self._search(keyframes[first:], old, keyframes, graph.poses)
+        if find is None:
             return ()
-        newest = len(keyframes) - 1
-        verified = self.verifier.verify(
-            keyframes, newest, found.anchor, found.T_anchor_source, newest=newest, alone=True
-        )
-        closure = verified.closure(found.anchor, newest, Proposal.PLACE)
-        if closure.verdict is Verdict.REJECTED:
-            return (closure,)
-        return self._confirmed(closure, keyframes, graph.poses)
+        agreeing = any(_agree(other, find, keyframes) for other in self.found)
+        self.found.append(find)
+        if not agreeing:
+            return ()
+        closures = self._verified(find, np.arange(first, newest + 1), old, keyframes, graph.poses)
+        if any(closure.verdict is Verdict.ACCEPTED for closure in closures):
+            self.found = []
+        return closures
 
     def _next_component(self, unknown: NDArray[np.int64], components: NDArray[np.int64]) -> NDArray[np.int64]:
         """Keyframes of the next component, in rotation: two may show the same location."""
@@ -161,15 +162,77 @@ class Relocalizer:
         self.turn += 1
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
 
-    def _confirmed(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
-        """The closure and the older ones that agree with it; rejected while there are none."""
-        old = [other for other in self.found if other.source >= self.segments.starts[-1]]
-        agreeing = [other for other in old if _agree(closure, other, keyframes, T_world)]
-        if agreeing:
-            self.found = []
-            return (*agreeing, closure)
-        self.found = [*old, closure]
-        return (replace(closure, verdict=Verdict.REJECTED, reason="found anywhere, and no other find agrees yet"),)
+    def _search(
+        self, path: Sequence[Keyframe], old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix
+    ) -> Find | None:
+        """The pose of the last keyframe of a path among older ones; None where there is none, or no clear one."""
+        if self.searched is None or not np.array_equal(self.searched_poses, T_world[old]):
+            voxel_size_m = self.submaps.config.voxel_size_m
+            self.searched_poses = T_world[old]
+            self.searched = MapSearch([keyframes[k] for k in old.tolist()], self.searched_poses, voxel_size_m)
+        T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
+        points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
+        best = self.searched.best(points, _LEAST_SHARE)
+        if best is None or best.rival > _RIVAL * best.share:
+            return None
+        if best.share < _LEAST_SHARE + _CHANCE / math.sqrt(best.points):
+            return None
+        return Find(path[-1].index, int(old[0]), best.T_map_lidar)
+
+    def _verified(
+        self,
+        find: Find,
+        path: NDArray[np.int64],
+        old: NDArray[np.int64],
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+    ) -> tuple[Closure, ...]:
+        """Closures of some keyframes of the path, from where the find puts them."""
+        sources = path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
+        anchors = old[old % self.submaps.half_width == 0]
+        closures = [
+            self._aligned(source, find.moved_to(source, keyframes), anchors, keyframes, T_world)
+            for source in sources.tolist()
+        ]
+        return tuple(sorted((each for each in closures if each is not None), key=_rank, reverse=True))
+
+    def _aligned(
+        self,
+        source: int,
+        T_world_source: Pose,
+        anchors: NDArray[np.int64],
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+    ) -> Closure | None:
+        """The closure of a keyframe to the submap near by that it overlaps most; None where there is none."""
+        away_m = np.linalg.norm(T_world[anchors, :2, 2] - T_world_source[:2, 2], axis=1)
+        near = anchors[np.argsort(away_m)[:_SUBMAPS]]
+        near = near[np.linalg.norm(T_world[near, :2, 2] - T_world_source[:2, 2], axis=1) <= _NEAR_M]
+        best: Closure | None = None
+        for anchor in near.tolist():
+            T_first = lie.between(T_world[anchor], T_world_source)
+            verified = self.verifier.verify(keyframes, source, anchor, T_first, newest=len(keyframes) - 1)
+            off_m, off_rad = lie.apart(T_first, verified.match.T_target_source)
+            is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
+            problem = f"{off_m:.1f} m from where the path was found" if is_off else ""
+            closure = verified.closure(anchor, source, Proposal.PLACE, problem=problem)
+            if best is None or (_rank(closure) > _rank(best)):
+                best = closure
+        return best
+
+
+@dataclass(frozen=True, slots=True)
+class Find:
+    """The pose of keyframe ``source`` among older keyframes, by a search; ``target`` is the first of them."""
+
+    source: int
+    target: int
+    T_world_source: Pose
+
+    def moved_to(self, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
+        """T_world_keyframe of another keyframe of the segment, by odometry."""
+        odom = keyframes[self.source].T_odom_lidar
+        return self.T_world_source @ lie.between(odom, keyframes[keyframe].T_odom_lidar)
 
 
 def _seed(points: Points, submap: VoxelMap, T_first: Pose, half_width_m: float, half_width_rad: float) -> Seed:
@@ -185,20 +248,16 @@ def _best(anchors: Sequence[int], seeds: Sequence[Seed], T_world: Matrix) -> Fou
     T_found = np.array([T_world[a] @ seed.T_target_source for a, seed in zip(anchors, seeds, strict=True)])
     elsewhere = np.linalg.norm((T_found - T_found[best])[:, :2, 2], axis=1) > _SAME_POSE_M
     rival = max(seeds[best].rival, float(shares[elsewhere].max(initial=0.0)))
-    if rival >= _RIVAL * shares[best]:
+    if rival >= _AMBIGUOUS * shares[best]:
         return None
     return Found(anchors[best], seeds[best].T_target_source)
 
 
-def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-    """True if two closures imply the same pose of the newest keyframe."""
-    off_m, off_rad = lie.apart(
-        _implied_pose(a, a.source, keyframes, T_world), _implied_pose(b, a.source, keyframes, T_world)
-    )
-    return off_m < _AGREE_M and off_rad < _AGREE_RAD
+def _agree(a: Find, b: Find, keyframes: Sequence[Keyframe]) -> bool:
+    """True if two finds imply the same pose of the later keyframe."""
+    off_m, off_rad = lie.apart(a.moved_to(b.source, keyframes), b.T_world_source)
+    return a.target == b.target and off_m < _AGREE_M and off_rad < _AGREE_RAD
 
 
-def _implied_pose(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
-    """T_world_keyframe by a closure and odometry, in the world of the closure's target."""
-    T_source_keyframe = lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)
-    return T_world[closure.target] @ closure.match.T_target_source @ T_source_keyframe
+def _rank(closure: Closure) -> tuple[bool, float]:
+    return closure.verdict is Verdict.ACCEPTED, closure.overlap

@@ -110,8 +110,10 @@ class ScanVerifier:
 class SubmapVerifier:
     """Aligns 3D submaps from coarse to fine and compares their free space."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, *, min_agreement: float = _MIN_AGREEMENT) -> None:
+        """min_agreement : least agreement about free space; less where the place may have changed."""
         self.config = config
+        self.min_agreement = min_agreement
         self.matcher = PointToShapeMatcher(config.matching)
 
     def verify(self, source: Submap, target: Submap, T_first: Pose) -> Verification:
@@ -149,9 +151,10 @@ class SubmapVerifier:
             return f"overlap {below(overlap)} < the least of a recognized place ({_MIN_PLACE_OVERLAP:g})"
         if information < _MIN_PLACE_INFORMATION:
             return f"information {information:.1e} < the least of a recognized place ({_MIN_PLACE_INFORMATION:g})"
-        if agreement < _MIN_AGREEMENT:
+        if agreement < self.min_agreement:
             return (
-                f"free-space agreement {below(agreement)} < the least of a recognized place ({_MIN_AGREEMENT:g})"
+                f"free-space agreement {below(agreement)} < the least of a recognized place "
+                f"({self.min_agreement:g})"
             )
         return ""
 

@@ -2,7 +2,7 @@
 
 from scanchain.maps.laz import write_laz
 from scanchain.maps.map_files import read_map, write_map
-from scanchain.maps.moving import View, moved
+from scanchain.maps.moving import View, clearly_through, moved, reach_of, sightings
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution
 from scanchain.maps.pcd import write_pcd
 from scanchain.maps.ply import read_ply, write_ply
@@ -18,12 +18,15 @@ __all__ = [
     "Session",
     "View",
     "build_point_map",
+    "clearly_through",
     "draw_grid",
     "fitting_resolution",
     "moved",
     "open_saved_map",
+    "reach_of",
     "read_map",
     "read_ply",
+    "sightings",
     "write_laz",
     "write_map",
     "write_pcd",

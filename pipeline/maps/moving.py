@@ -23,6 +23,7 @@ _LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # flatness assumed of the ground in vo
 _LEAST_THROUGH = 2  # least number of scans that saw through what moved
 _MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
 _ENOUGH = 12  # number of scans that saw a surface, for which it stays
+_EVERY = np.iinfo(np.int32).max  # a limit that no number of scans reaches
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,28 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
 
     A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
     """
-    index = _Cells(_in_space(voxels), _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi))
+    seen, seen_through = sightings(voxels, voxel_size_m, views, enough=_ENOUGH)
+    return clearly_through(seen, seen_through) & (seen < _ENOUGH)
+
+
+def clearly_through(seen: NDArray[np.int32], seen_through: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """True for points that clearly more scans saw through than saw a surface there."""
+    return (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
+
+
+def reach_of(voxel_size_m: float) -> float:
+    """Range up to which scans are compared with the points of a map of such voxels, meters."""
+    return _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi)
+
+
+def sightings(
+    voxels: Points, voxel_size_m: float, views: Iterable[View], *, enough: int = _EVERY
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Numbers of scans that saw a surface at each point (N, d) of a map, one a voxel, and that saw through it.
+
+    enough : a point that so many scans saw is not tested again
+    """
+    index = _Cells(_in_space(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
@@ -61,16 +83,14 @@ def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray
             parts = [
                 pool.submit(
                     weigh_points, index.points, np.ascontiguousarray(spans[k::_THREADS]), T_lidar_world, ranges_m,
-                    limits, _ENOUGH, seen, seen_through,
+                    limits, enough, seen, seen_through,
                 )
                 for k in range(_THREADS)
             ]  # fmt: skip
             for part in parts:
                 part.result()
-    result = np.zeros(len(voxels), bool)
-    clearly = (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
-    result[index.order] = clearly & (seen < _ENOUGH)
-    return result
+    order = np.argsort(index.order)
+    return seen[order], seen_through[order]
 
 
 def _in_space(points: Points) -> Points:

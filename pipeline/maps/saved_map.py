@@ -77,6 +77,12 @@ class Edges:
         pairs = number[self.pairs]
         return replace(self, pairs=pairs).where((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
 
+    @classmethod
+    def chained(cls, *parts: Edges) -> Edges:
+        """Those of several, one after the other."""
+        names = ("pairs", "measurements", "information", "is_loop", "weight")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
     def where(self, kept: NDArray[np.bool_]) -> Edges:
         """Those for which ``kept`` (E,) holds."""
         return Edges(

@@ -1,8 +1,8 @@
 """SVD-ICP and LM-PLICP against a voxel map."""
 
 from scanchain.registration.align import AMBIGUOUS, align, as_ambiguous, with_source_frame
-from scanchain.registration.birds_eye import BirdsEye
-from scanchain.registration.correlative import CorrelativeMap, Seed, Window
+from scanchain.registration.birds_eye import BirdsEye, upright_columns
+from scanchain.registration.correlative import CorrelativeMap, ScoreGrid, Seed, Window, evenly
 from scanchain.registration.matcher import Matcher, create_matcher
 from scanchain.registration.plicp import PointToShapeMatcher
 from scanchain.registration.svd import DegeneratePairsError, rigid_transform
@@ -16,6 +16,7 @@ __all__ = [
     "DegeneratePairsError",
     "Matcher",
     "PointToShapeMatcher",
+    "ScoreGrid",
     "Seed",
     "SvdMatcher",
     "VoxelMap",
@@ -23,6 +24,8 @@ __all__ = [
     "align",
     "as_ambiguous",
     "create_matcher",
+    "evenly",
     "rigid_transform",
+    "upright_columns",
     "with_source_frame",
 ]

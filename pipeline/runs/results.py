@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Points, Pose
+from scanchain.data import Keyframe, Matrix, Points, Pose
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.logs import Log
+from scanchain.loops import outline_of
 from scanchain.maps import (
     MAP_FOLDER,
     Edges,
@@ -25,6 +26,7 @@ from scanchain.maps import (
     draw_grid,
     fitting_resolution,
     moved,
+    open_saved_map,
     write_laz,
     write_map,
     write_pcd,
@@ -88,6 +90,8 @@ def _write_saved_map(path: Path, results: Results) -> None:
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
     write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
+    if results.config.loops.enabled and graph.dimension == 3:
+        outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
 
 
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
@@ -144,9 +148,23 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
 
-def cloud_of(result: SlamResult, config: Config) -> Cloud:
+class Posed(Protocol):
+    """Keyframes and their final poses, (K, d+1, d+1)."""
+
+    @property
+    def keyframes(self) -> Sequence[Keyframe]:
+        """In order."""
+        ...
+
+    @property
+    def T_world_keyframes(self) -> Matrix:
+        """Their poses."""
+        ...
+
+
+def cloud_of(result: Posed, config: Config) -> Cloud:
     """The cloud of all keyframes, without moving objects if so configured."""
-    dimension = result.trajectory.dimension
+    dimension = result.T_world_keyframes.shape[-1] - 1
     built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
     if not config.maps.remove_moving:
@@ -159,7 +177,7 @@ def cloud_of(result: SlamResult, config: Config) -> Cloud:
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
+def grid_of(result: Posed, config: MapsConfig) -> OccupancyGrid:
     """The grid of all keyframes, coarser than configured where the world is too large."""
     resolution_m = fitting_resolution(
         result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
@@ -168,7 +186,7 @@ def grid_of(result: SlamResult, config: MapsConfig) -> OccupancyGrid:
     return draw_grid(_scans(result), fitting, max_range_m=config.grid_max_range_m)
 
 
-def _scans(result: SlamResult) -> Iterator[tuple[Pose, Points]]:
+def _scans(result: Posed) -> Iterator[tuple[Pose, Points]]:
     """Keyframes with their optimized poses."""
     for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True):
         yield pose, keyframe.points

@@ -12,10 +12,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Struct, json
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import working_s
+from scanchain.config import Config
 from scanchain.data import Pose, Trajectory, Verdict
 from scanchain.errors import InputError
 from scanchain.logs import Log, open_log
@@ -137,7 +139,7 @@ def localize(
     early = load_settings(file=job.config_file, overrides=job.overrides)
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides, idle=log.idle_keys())
-    _check_dimension(log, prior)
+    _check(log, prior, settings.config)
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     provenance = describe_start(job.command, job.logs, settings.source)
     with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
@@ -158,7 +160,9 @@ def localize(
             raise InputError(f"{log.name}: has no scan to localize; scanchain doctor says why")
         progress.say("smoothing the path")
         found = localizer.finish()
-        warnings = (*log.damage, *settings.without_effect)
+        count = counted(len(found.states), "scan")
+        stopped = (f"stopped by the user after {count}",) if progress.stopped else ()
+        warnings = (*stopped, *log.damage, *settings.without_effect)
         metrics = measure(found, prior, working_s() - started, warnings)
         localized = LocalizedLog(directory.path, prior, found, metrics)
         text = summary(localized, log)
@@ -168,12 +172,17 @@ def localize(
             draw(folder, localized)
         localizer.slam.points.close()
         (directory.path / POINTS_FILE).unlink(missing_ok=True)
-        provenance.hashed(hashing).write(directory.path / RUN_FILE)
+        made = replace(
+            provenance.hashed(hashing), complete=True, stopped="".join(stopped), duration_s=working_s() - started
+        )
+        made.write(directory.path / RUN_FILE)
         directory.complete()
     return localized, text
 
 
-def _check_dimension(log: Log, prior: SavedMap) -> None:
+def _check(log: Log, prior: SavedMap, config: Config) -> None:
+    if not config.loops.enabled:
+        raise InputError("loops.enabled is false, but a place in a map is found by loop closures; leave it true")
     if log.dimension != prior.dimension:
         raise InputError(
             f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "

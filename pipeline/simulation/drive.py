@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
+from scanchain.simulation.another_day import Change, another_day
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import SENSORS, Sensor
 from scanchain.simulation.solids import Solids
@@ -19,7 +20,9 @@ from scanchain.simulation.worlds.registry import World, find_world
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
 _DROPOUT_S = 1.0
+_PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
 _LONGEST_S = 36_000.0
+_FARTHEST_M = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,7 @@ class Drive:
     T_base_lidar : (4, 4)
     scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
     solids_of_instant : the solids at the begin of a scan, where some of them move
+    changes : of the world since the drive of the same seed on the first day
     """
 
     solids: Solids
@@ -40,6 +44,7 @@ class Drive:
     T_base_lidar: Matrix
     scans: NDArray[np.int64]
     solids_of_instant: Callable[[float], Solids] | None = None
+    changes: tuple[Change, ...] = ()
 
     def solids_at(self, time_s: float) -> Solids:
         """The solids during the scan that begins then."""
@@ -60,6 +65,9 @@ def plan(
     sensor: str | None = None,
     noise_m: float | None = None,
     dropout: float | None = None,
+    changed: int | None = None,
+    reverse: bool = False,
+    start_m: float = 0.0,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
     place = find_world(world)
@@ -67,18 +75,33 @@ def plan(
     length_s = place.duration_s if duration_s is None else duration_s
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
+    check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    if isinstance(place.route, tuple) and (reverse or start_m):
+        raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = place.build(random_numbers(seed, PLACE))
     motion = place.motion(
-        solids, duration_s=length_s + lidar.period_ns * 1e-9, rng=random_numbers(seed, DEVIATION)
+        solids,
+        duration_s=length_s + lidar.period_ns * 1e-9,
+        rng=random_numbers(seed, DEVIATION, changed),
+        reverse=reverse,
+        start_m=start_m,
     )
-    return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, _recorded(place, motion, lidar, count))
+    changes: tuple[Change, ...] = ()
+    if changed is not None:
+        path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
+        free_m = place.vehicle.radius_m + place.vehicle.deviation_m
+        solids, changes = another_day(solids, path, free_m, random_numbers(seed, PLACE, changed))
+    scans = _recorded(place, motion, lidar, count)
+    return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, scans, changes=changes)
 
 
-def random_numbers(seed: int, purpose: int) -> np.random.Generator:
-    """Random numbers for one purpose of a drive."""
-    if seed < 0:
-        raise InputError(f"seed {seed} is negative; choose one from 0 up")
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose,)))
+def random_numbers(seed: int, purpose: int, changed: int | None = None) -> np.random.Generator:
+    """Random numbers for one purpose of a drive, on the first day or another one."""
+    for name, number in (("seed", seed), ("changed", changed or 0)):
+        if number < 0:
+            raise InputError(f"{name} {number} is negative; choose one from 0 up")
+    day = () if changed is None else (changed,)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, *day)))
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:

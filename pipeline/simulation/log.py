@@ -12,6 +12,7 @@ from scanchain import checks
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writing.writer import LogWriter
+from scanchain.simulation.another_day import write_changes
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
 from scanchain.simulation.motion import Motion, wheel_odometry
 from scanchain.simulation.sensors import Sensor, Sweep, take_sweep
@@ -30,6 +31,9 @@ def simulate(
     drift: float = 1.0,
     noise_m: float | None = None,
     dropout: float | None = None,
+    changed: int | None = None,
+    reverse: bool = False,
+    start_m: float = 0.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
@@ -38,7 +42,10 @@ def simulate(
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
-    multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own;
+    multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own; with
+    ``changed``, a seed, it is another day: furniture or parked cars came, went and moved, as .changes.csv beside
+    the log lists, and the drive is repeated with other deviations and noise;
+    ``reverse`` drives the other way round, from ``start_m`` along that route;
     ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
@@ -48,8 +55,24 @@ def simulate(
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
         raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
-    drive = plan(world, seed=seed, duration_s=duration_s, sensor=sensor, noise_m=noise_m, dropout=dropout)
-    return record(drive, destination, seed=seed, drift=drift, force=force, progress=progress)
+    changes_file = destination.with_suffix(".changes.csv")
+    if changed is not None and changes_file.exists() and not force:
+        raise InputError(f"{changes_file}: exists; choose another name or pass --force to replace it")
+    drive = plan(
+        world,
+        seed=seed,
+        duration_s=duration_s,
+        sensor=sensor,
+        noise_m=noise_m,
+        dropout=dropout,
+        changed=changed,
+        reverse=reverse,
+        start_m=start_m,
+    )
+    truth = record(drive, destination, seed=seed, changed=changed, drift=drift, force=force, progress=progress)
+    if changed is not None:
+        write_changes(changes_file, drive.changes)
+    return truth
 
 
 def record(
@@ -57,6 +80,7 @@ def record(
     destination: Path,
     *,
     seed: int = 0,
+    changed: int | None = None,
     drift: float = 1.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -67,8 +91,8 @@ def record(
     with LogWriter(destination, force=force) as log:
         log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
         end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
-        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS))
-        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES))):
+        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS, changed))
+        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, changed))):
             stamp_ns = int(truth.stamps_ns[done])
             wheels.write_until(stamp_ns - 1)  # in a dropout
             log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])

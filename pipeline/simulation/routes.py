@@ -75,6 +75,18 @@ class Laps:
         return self.base(times_s) @ self._vehicle.T_base_lidar
 
 
+def begun_at(route: Matrix, start_m: float) -> Matrix:
+    """The closed route (W, d) from a point on, so many meters along it."""
+    if start_m == 0.0:
+        return route
+    lap = np.vstack([route, route[:1]])
+    corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lap, axis=0), axis=1))])
+    along_m = start_m % corners_m[-1]
+    first = np.stack([np.interp(along_m, corners_m, column) for column in lap.T])
+    ahead = int(np.searchsorted(corners_m[:-1], along_m, side="right"))
+    return np.vstack([first, route[ahead:], route[:ahead]])
+
+
 def _densify(route: Matrix, reach_m: float, step_m: float) -> Matrix:
     """Points every ``step_m`` along as many laps of the closed route as ``reach_m`` takes."""
     lap = np.vstack([route, route[:1]])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from scanchain.data import Matrix
 from scanchain.kernels.raycast.cast import cast_rays
 
 FLAT = np.zeros(7)
+FIXED = -1  # owner of solids that belong to no movable object
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +26,15 @@ class Solids:
     cylinders : (C, 5) upright: center x, y, radius, bottom, top
     ellipsoids : (E, 6) center x, y, z, radii x, y, z
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
+    owner : (B + C + E,) number of the movable object that each solid is a part of, FIXED for none; (0,) where
+        nothing is movable
     """
 
     boxes: Matrix
     cylinders: Matrix
     ellipsoids: Matrix
     ground: NDArray[np.float64]
+    owner: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
         """Height of the ground at (..., 2) positions."""
@@ -94,6 +100,17 @@ class Scenery:
         self._boxes: list[tuple[float, ...]] = []
         self._cylinders: list[tuple[float, ...]] = []
         self._ellipsoids: list[tuple[float, ...]] = []
+        self._owners: tuple[list[int], list[int], list[int]] = ([], [], [])  # of boxes, cylinders, ellipsoids
+        self._objects = 0
+        self._owner = FIXED
+
+    @contextmanager
+    def movable(self) -> Iterator[None]:
+        """A context: what is put down in it is one object, which may stand elsewhere another day."""
+        self._owner = self._objects
+        yield
+        self._objects += 1
+        self._owner = FIXED
 
     def box(
         self, center: tuple[float, float], size: tuple[float, float], z: tuple[float, float], yaw_rad: float = 0.0
@@ -101,16 +118,19 @@ class Scenery:
         """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
         base = self._base(center)
         half = (0.5 * size[0], 0.5 * size[1])
+        self._owners[0].append(self._owner)
         self._boxes.append((*center, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
 
     def cylinder(self, center: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
         """Put down an upright cylinder, heights ``z`` above the ground at its center."""
         base = self._base(center)
+        self._owners[1].append(self._owner)
         self._cylinders.append((*center, radius, base + z[0], base + z[1]))
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
         """Put down an ellipsoid; its center's height counts from the ground there."""
         x, y, z = center
+        self._owners[2].append(self._owner)
         self._ellipsoids.append((x, y, z + self._base((x, y)), *radii))
 
     def finish(self) -> Solids:
@@ -120,6 +140,7 @@ class Scenery:
             cylinders=np.array(self._cylinders, dtype=np.float64).reshape(-1, 5),
             ellipsoids=np.array(self._ellipsoids, dtype=np.float64).reshape(-1, 6),
             ground=self._ground,
+            owner=np.array([owner for owners in self._owners for owner in owners], np.int64),
         )
 
     def _base(self, center: tuple[float, float]) -> float:

@@ -58,7 +58,7 @@ def log_of(world: str, sensor: str, scans: int, cache: Path) -> Path:
     """The simulated log, made if it is not there yet."""
     place, period_s = WORLDS[world], SENSORS[sensor].period_ns * 1e-9
     duration_s = min(place.duration_s, scans * period_s)
-    folder = cache / _version()
+    folder = cache / simulator_version()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{world}_{sensor}_{duration_s:g}s.mcap"
     if not path.exists():
@@ -140,7 +140,7 @@ def _is_lost_alone(row: Sequence[Score], first_rival: int, place: int) -> bool:
     return row[place].is_lost and not all(rival.is_lost for rival in row[first_rival:])
 
 
-def _version() -> str:
+def simulator_version() -> str:
     """A name for the simulator as it is now."""
     root = Path(scanchain.__file__).parent
     sources = sorted([*root.glob("simulation/**/*.py"), *root.glob("kernels/raycast/*.py")])

@@ -1,5 +1,6 @@
 """Place recognition in 3D: descriptors, their database, submaps that agree or do not."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -11,10 +12,11 @@ from scanchain.data import Keyframe, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.kernels.search.descriptor import count_heights, mark_heights
-from scanchain.loops import LoopCloser
+from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import compare, describe, level_frame
 from scanchain.loops.descriptor_recognizer import DescriptorDatabase
+from scanchain.loops.outline import PLACES_FILE
 from scanchain.loops.submaps import VoxelSubmaps, submap_around
 from scanchain.loops.verification import SubmapVerifier, free_space_agreement
 from scanchain.simulation import plan
@@ -250,3 +252,71 @@ def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypa
         keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True
     )
     assert closures and all("of the path between" in closure.reason for closure in closures) == are_refused
+
+
+# --- in a map, from nowhere --------------------------------------------------------------------------------------
+
+T_ODOM_WORLD = pose(500.0, -300.0, 20.0, yaw=2.0)
+
+
+def sought(mapped, log, folder):
+    """Closures of each keyframe of a log in a map, and its true poses; odometry begins elsewhere."""
+    first, gone_m = len(mapped), mapped[-1].traveled_m + 500.0
+    closer = LoopCloser(configured(3), 3)
+    closer.begin_in(mapped, folder)
+    closer.start_segment(first)
+    moved = [
+        replace(k, index=first + n, T_odom_lidar=T_ODOM_WORLD @ k.T_odom_lidar, traveled_m=gone_m + k.traveled_m)
+        for n, k in enumerate(log)
+    ]
+    keyframes = [*mapped, *moved]
+    closures = [
+        closer.close(keyframes[:end], graph_of(keyframes[:end])) for end in range(first + 1, len(keyframes) + 1)
+    ]
+    return closures, [k.T_odom_lidar for k in (*mapped, *log)]
+
+
+def accepted_of(closures):
+    return [closure for closure in closures if closure.verdict is Verdict.ACCEPTED]
+
+
+def test_a_log_is_found_in_a_map_by_the_second_keyframe_that_says_the_same(tmp_path):
+    closures, truth = sought(passage(street()), passage(street(4.0, True)[4:6]), tmp_path)
+    assert [closure.reason for closure in closures[0]] == ["found anywhere, and no other find agrees yet"]
+    assert len(accepted_of(closures[1])) == 2
+    for closure in closures[1]:
+        true = lie.inverse(truth[closure.target]) @ truth[closure.source]
+        assert np.linalg.norm((lie.inverse(true) @ closure.match.T_target_source)[:3, 3]) < 0.2
+
+
+def test_a_log_of_elsewhere_is_found_nowhere_in_a_map(tmp_path):
+    elsewhere = tuple((0.0, y, 0.5 * np.pi) for y in np.arange(-30.0, -9.0, 4.0))
+    closures, _ = sought(passage(street()[4:]), passage(elsewhere), tmp_path)
+    assert not accepted_of(sum(closures, ()))
+
+
+def test_of_two_places_that_are_the_same_none_is_said_to_be_it(tmp_path):
+    there = passage(street())
+    T, count, gone_m = pose(200.0, yaw=1.0), len(there), there[-1].traveled_m + 500.0
+    again = [
+        replace(k, index=count + k.index, T_odom_lidar=T @ k.T_odom_lidar, traveled_m=gone_m + k.traveled_m)
+        for k in there
+    ]
+    closures, _ = sought([*there, *again], passage(street(4.0, True)[4:7]), tmp_path)
+    reasons = {closure.reason for closure in sum(closures, ())}
+    assert reasons == {"another place of the map is as similar"}
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_the_outline_of_a_map_is_kept_beside_it_and_made_anew_where_it_is_damaged(tmp_path, tilt):
+    there = [replace(k, T_odom_lidar=pose(pitch=tilt) @ k.T_odom_lidar) for k in passage(street()[::4])]
+    made = outline_of(tmp_path, there, configured(3).local_map)
+    kept = outline_of(tmp_path, [replace(k, stored=None) for k in there], configured(3).local_map)
+    assert np.allclose(kept.columns, made.columns, atol=1e-4) and np.array_equal(
+        kept.T_map_level, made.T_map_level
+    )
+    assert np.degrees(np.arccos((pose(pitch=tilt).T @ made.T_map_level)[2, 2])) < 2.0
+    assert len(made.columns) > 300
+    (tmp_path / PLACES_FILE).write_bytes((tmp_path / PLACES_FILE).read_bytes()[:-100])
+    assert np.array_equal(outline_of(tmp_path, there, configured(3).local_map).columns, made.columns)
+    assert len(outline_of(tmp_path, there[1:], configured(3).local_map).columns) < len(made.columns)

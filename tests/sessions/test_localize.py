@@ -98,6 +98,13 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
     assert code == 2 and "--initial is '1,2'; give x,y,yaw in meters and degrees, or a file .tum" in error
 
 
+def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
+    words = ("localize", office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--no-loops")
+    code, _, error = call(*words)
+    assert code == 2 and "a place in a map is found by loop closures; leave it true" in error
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_saved_map_holds_its_keyframes_to_the_millimeter_and_the_poses_to_the_bit(office, tmp_path):
     saved = open_saved_map(office / "map")
     twice = saved.edges.among(np.arange(len(saved.keyframes)))

@@ -253,6 +253,16 @@ def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane(
     assert min(same, opposite, aside) > 30  # of some 320 places
 
 
+def test_a_route_is_driven_the_other_way_round_from_any_point_of_it():
+    there = plan("town", seed=3, duration_s=80.0).truth().poses
+    back = plan("town", seed=3, duration_s=20.0, changed=1, reverse=True, start_m=100.0).truth().poses
+    away_m = np.linalg.norm(back[:, None, :2, 3] - there[:, :2, 3], axis=2)
+    assert away_m.min(axis=1).max() < 4.0
+    along = there[away_m.argmin(axis=1), :3, 0] * back[:, :3, 0]
+    assert np.median(along.sum(axis=1)) < -0.9
+    assert np.linalg.norm(back[0, :2, 3] - there[0, :2, 3]) > 30.0
+
+
 def test_all_rooms_of_the_identical_floor_look_the_same():
     drive = plan("identical", noise_m=0.0, dropout=0.0)
     poses = np.tile(np.eye(4), (3, 1, 1))
@@ -595,6 +605,8 @@ def test_the_tum_file_holds_the_truth_to_the_nanosecond(tmp_path):
         ({"dropout": 1.5}, "choose one from 0 to 1"),
         ({"noise_m": float("nan")}, "noise_m nan"),
         ({"seed": -1}, "seed -1"),
+        ({"start_m": -1.0}, "start_m -1 is out of range"),
+        ({"world": "turns", "reverse": True}, "turns is no route"),
     ],
 )
 def test_a_wrong_argument_is_one_line_and_leaves_no_file(tmp_path, arguments, message):
@@ -645,3 +657,24 @@ def test_a_misspelt_key_is_refused(tmp_path):
     (tmp_path / "sequence.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
     with pytest.raises(InputError, match="sede"):
         catalog.read(tmp_path / "sequence.toml")
+
+
+def test_another_day_changes_movable_objects_alone_and_keeps_the_path_free():
+    first, later = plan("office", seed=3, duration_s=20.0), plan("office", seed=3, duration_s=20.0, changed=1)
+    kinds = {change.kind for change in later.changes}
+    assert kinds == {"removed", "moved", "added"}
+    for name in ("boxes", "cylinders", "ellipsoids"):
+        rows = [{tuple(row) for row in getattr(drive.solids, name)} for drive in (first, later)]
+        assert rows[0] & rows[1]
+    fixed = [drive.solids.boxes[drive.solids.owner[: len(drive.solids.boxes)] < 0] for drive in (first, later)]
+    assert np.array_equal(*fixed)
+    path = later.motion.base(np.arange(0.0, 20.0, 0.1))[:, :2, 3]
+    assert later.solids.clearance_m(path, 2.0).min() > 0.1
+    assert later.changes[0].owner == plan("office", seed=3, duration_s=20.0, changed=1).changes[0].owner
+
+
+def test_changes_of_another_day_are_listed_beside_the_log(tmp_path):
+    simulate("office", tmp_path / "later.mcap", seed=3, duration_s=1.0, changed=1)
+    lines = (tmp_path / "later.changes.csv").read_text().splitlines()
+    assert lines[0].startswith("kind,x_before,")
+    assert len(lines) > 10

@@ -39,7 +39,7 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
 def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
     with SvgFigure.of_plan(name, low, high) as figure:
-        _draw_points(figure, points, low, high, by_height=True)
+        draw_points(figure, points, low, high, by_height=True)
         return figure.svg()
 
 
@@ -48,13 +48,29 @@ def path_over_map(
 ) -> Markup:
     """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
     with SvgFigure.of_plan(name, low, high) as figure:
-        _draw_points(figure, points, low, high)
+        draw_points(figure, points, low, high)
         for line in lines:
             style = (0, (3, 3)) if line.is_dashed else "-"
             x, y = line.positions[:, :2].T
             figure.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
         for place, marker in ((0, "o"), (-1, "s")):
             figure.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
+        return figure.svg()
+
+
+def layers_picture(
+    name: str,
+    layers: Sequence[tuple[Points, str]],
+    outlines: Sequence[tuple[Floats, str]],
+    low: Floats,
+    high: Floats,
+) -> Markup:
+    """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
+    with SvgFigure.of_plan(name, low, high) as figure:
+        for points, color in layers:
+            draw_points(figure, points, low, high, color)
+        for outline, color in outlines:
+            figure.axes.plot(*np.vstack([outline, outline[:1]])[:, :2].T, color=color, linewidth=0.8)
         return figure.svg()
 
 
@@ -73,7 +89,7 @@ def overlay_picture(name: str, overlay: Overlay) -> Markup:
     high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
     with SvgFigure.of_plan(name, low, high) as figure:
         for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
-            _draw_points(figure, points, low, high, color)
+            draw_points(figure, points, low, high, color)
             figure.axes.plot(path[:, 0], path[:, 1], color=color, linewidth=1.4)
         figure.axes.set_xlim(low[0], high[0])
         figure.axes.set_ylim(low[1], high[1])
@@ -86,9 +102,10 @@ def _above_ground(points: Points) -> Points:
     return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
 
 
-def _draw_points(
+def draw_points(
     figure: SvgFigure, points: Points, low: Floats, high: Floats, color: str = _POINTS, *, by_height: bool = False
 ) -> None:
+    """Draw points (M, 3) as seen from above, within corners, in one color or by their height."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():

@@ -40,8 +40,9 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         ("standard deviation", f"{m.median_sigma_m:.3f} m (median)" if m.matches else "unknown"),
     )
     subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
-    sections = tuple(_sections(localized))
-    write_page(folder / REPORT_FILE, Page("Localization", subtitle, facts, (m.sentence,), m.warnings, sections))
+    verdict = Section("Verdict", m.sentence)
+    sections = (verdict, *_sections(localized))
+    write_page(folder / REPORT_FILE, Page("Localization", subtitle, facts, m.warnings, (), sections))
 
 
 def map_points(prior: SavedMap, limit: int = _MAX_POINTS) -> Points:

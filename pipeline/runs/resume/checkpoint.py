@@ -18,7 +18,7 @@ from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.place_closer import PlaceCloser
-from scanchain.loops.relocalization import PlanarSearch, Relocalizer
+from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
@@ -67,9 +67,9 @@ _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
         Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap, Voxels,
-        PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, PlanarSearch, VoxelSubmaps,
-        ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray, PointStore,
-        StoredPoints,
+        PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
+        VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
+        PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
@@ -77,6 +77,7 @@ _CLASSES = Classes(
         (PoseGraph, "_problem"): lambda graph: None,
         (PoseGraph, "_factor_is_now"): lambda graph: False,
         (VoxelSubmaps, "cached"): lambda submaps: OrderedDict(),
+        (Relocalizer, "searched"): lambda relocalizer: None,
         (PlaceCloser, "recognizer"): lambda closer: None,
         (PointStore, "file"): lambda store: None,
         (Odometry, "matcher"): lambda odometry: create_matcher(odometry.config.matching),

@@ -67,4 +67,5 @@ def _furnish(scenery: Scenery, x: float, y: float, side: float, furniture: Matri
     """The same furniture in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
     yaw_rad = 0.0 if side > 0.0 else np.pi
     for u, v, length, width, height in furniture:
-        scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)
+        with scenery.movable():
+            scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)

@@ -111,7 +111,8 @@ class Furnisher:
         if not self._is_free(center, half):
             return False
         self._taken.append((center, half))
-        self._put(kind, float(center[0]), float(center[1]), 0.5 * np.pi * upright)
+        with self._scenery.movable():
+            self._put(kind, float(center[0]), float(center[1]), 0.5 * np.pi * upright)
         return True
 
     def _is_free(self, center: Matrix, half: Matrix) -> bool:

@@ -13,15 +13,17 @@ def parked_car(scenery: Scenery, x: float, y: float, yaw: float, rng: np.random.
     """A body, a cabin and four wheels; now and then a van."""
     length, width = rng.uniform(3.8, 4.8), rng.uniform(1.7, 1.85)
     c, s = np.cos(yaw), np.sin(yaw)
-    if rng.random() < 0.15:
-        scenery.box((x, y), (length + 0.4, width + 0.15), (0.25, rng.uniform(2.0, 2.5)), yaw)
-    else:
-        back = rng.choice([-1.0, 1.0]) * 0.08 * length
-        scenery.box((x, y), (length, width), (0.22, rng.uniform(0.8, 1.0)), yaw)
-        scenery.box((x + c * back, y + s * back), (0.5 * length, width - 0.2), (0.8, rng.uniform(1.4, 1.6)), yaw)
-    for u in (-0.32 * length, 0.32 * length):
-        for v in (-0.5 * width + 0.1, 0.5 * width - 0.1):
-            scenery.box((x + c * u - s * v, y + s * u + c * v), (0.6, 0.2), (-0.1, 0.3), yaw)
+    with scenery.movable():
+        if rng.random() < 0.15:
+            scenery.box((x, y), (length + 0.4, width + 0.15), (0.25, rng.uniform(2.0, 2.5)), yaw)
+        else:
+            back = rng.choice([-1.0, 1.0]) * 0.08 * length
+            scenery.box((x, y), (length, width), (0.22, rng.uniform(0.8, 1.0)), yaw)
+            cabin = (x + c * back, y + s * back)
+            scenery.box(cabin, (0.5 * length, width - 0.2), (0.8, rng.uniform(1.4, 1.6)), yaw)
+        for u in (-0.32 * length, 0.32 * length):
+            for v in (-0.5 * width + 0.1, 0.5 * width - 0.1):
+                scenery.box((x + c * u - s * v, y + s * u + c * v), (0.6, 0.2), (-0.1, 0.3), yaw)
 
 
 def tree(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.simulation.motion import Motion, Vehicle
-from scanchain.simulation.routes import Laps, Pivot, Pivots
+from scanchain.simulation.routes import Laps, Pivot, Pivots, begun_at
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds import corridor, forest, highway, identical, office, sparse, staircase, town
 
@@ -35,11 +35,23 @@ class World:
     sight_m: float = np.inf
     dropouts: tuple[tuple[float, float], ...] = ()
 
-    def motion(self, solids: Solids, *, duration_s: float, rng: np.random.Generator) -> Motion:
-        """The drive; ``rng`` draws its deviations and its sway."""
+    def motion(
+        self,
+        solids: Solids,
+        *,
+        duration_s: float,
+        rng: np.random.Generator,
+        reverse: bool = False,
+        start_m: float = 0.0,
+    ) -> Motion:
+        """The drive; ``rng`` draws its deviations and its sway.
+
+        reverse : drive the route the other way round; start_m : begin so far along it
+        """
         if isinstance(self.route, tuple):
             return Pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
-        return Laps(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        route = begun_at(self.route[::-1] if reverse else self.route, start_m)
+        return Laps(route, self.vehicle, solids, duration_s=duration_s, rng=rng)
 
 
 _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street

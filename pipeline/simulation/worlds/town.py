@@ -155,7 +155,8 @@ def _street(
             x, y = start + place * along + side * _LAMP_M * aside
             scenery.cylinder((float(x), float(y)), radius, (BELOW_M, height + rng.uniform(-0.3, 0.3)))
         x, y = start + rng.uniform(10.0, length - 10.0) * along + side * 6.2 * aside
-        scenery.box((float(x), float(y)), (0.6, 0.7), (BELOW_M, 1.1), yaw)
+        with scenery.movable():
+            scenery.box((float(x), float(y)), (0.6, 0.7), (BELOW_M, 1.1), yaw)
 
 
 def rounds(rng: np.random.Generator) -> Solids:
@@ -164,7 +165,9 @@ def rounds(rng: np.random.Generator) -> Solids:
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
     gap = np.abs(lanes[:, None] - solids.boxes[:, :2]) - solids.boxes[:, 2:4]
     distance_m = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0)
-    return replace(solids, boxes=solids.boxes[distance_m > _FREE_M])
+    kept = distance_m > _FREE_M
+    owner = np.concatenate([solids.owner[: len(kept)][kept], solids.owner[len(kept) :]])
+    return replace(solids, boxes=solids.boxes[kept], owner=owner)
 
 
 def _lanes() -> Matrix:

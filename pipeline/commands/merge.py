@@ -1,0 +1,61 @@
+"""``scanchain merge``: sessions of one place into one map."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from scanchain.commands.options import OverrideCommand, overrides
+
+
+@click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to create.")
+@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
+@click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
+@click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run or merge.")
+@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+@click.pass_context
+def merge(
+    ctx: click.Context,
+    runs: tuple[Path, ...],
+    out: Path,
+    config: Path | None,
+    fixed: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Merge the maps of several runs into one map in one frame.
+
+    RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
+    between the runs, and the graph of all of them is optimized and certified. The map is in the frame of the first
+    RUN; the order of the others does not matter. Runs that too few closures join to the others are named and stay
+    apart; where no two belong together, the exit code is 1. DIR is a map like any other: it can be merged further.
+
+    \b
+    Examples:
+      scanchain merge runs/monday runs/tuesday --out runs/both
+      scanchain merge runs/survey runs/today --fixed --out runs/extended
+      scanchain merge runs/both runs/wednesday --out runs/week --json
+    """
+    from scanchain.api import present_merge
+    from scanchain.commands.terminal import Terminal
+    from scanchain.sessions.merging import MergeJob
+    from scanchain.sessions.merging import merge as merge_maps
+
+    job = MergeJob(
+        runs=runs,
+        out=out,
+        config_file=config,
+        overrides=overrides(ctx),
+        fixed=fixed,
+        force=force,
+        command=tuple(sys.argv),
+    )
+    with Terminal("maps") as terminal:
+        merged = merge_maps(job, terminal, present_merge)
+    click.echo((merged.path / "metrics.json").read_text() if as_json else merged.summary, nl=False)
+    if not as_json:
+        click.echo(f"written        {out}")

@@ -1,0 +1,211 @@
+"""Search for a 3D log in a map: upright structure of both, correlated as seen from above, verified in space."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.descriptor import level_frame, upright_frame
+from scanchain.loops.outline import outline_of
+from scanchain.loops.submaps import Submap
+from scanchain.loops.verification import SubmapVerifier
+from scanchain.registration import ScoreGrid, Window, evenly, upright_columns
+
+_MEMBERS = 10  # number of the newest keyframes that are sought together
+_RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
+_COLUMNS = 150  # number of columns that are scored, evenly spread
+_COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, and numbers of the first search
+_REFINED_RAD = 0.15  # half width of the window in heading around what it found
+_MIN_COLUMNS = 30  # number of columns, below which there is too little to see
+_MAX_CELLS = 1 << 23  # of the grid of a map; a larger one has coarser cells
+_MIN_SHARE = 0.55  # least share of the columns that lie on the map's
+_RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
+_SEEDS = 4  # largest number of poses that are verified
+_APART = 4.0  # least distance of two distinct poses, cells
+_MIN_AGREEMENT = 0.8  # least agreement about free space with a map of another day: cars and people are others
+_REACH = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
+_LEVEL_M = 2.0  # least difference in height of two stories
+_MAX_LEVELS = 3  # number of stories that are tried
+_STEP_M = 1.0  # least path between two searches
+_BACKOFF = 0.1  # path between two searches, as a share of what was searched so far
+_AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
+_MATCH_M = 3.5  # path between two matches with the map, at full scale
+_TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
+_DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
+
+
+class MapSearch:
+    """Search for the newest keyframes in a map, as long as no closure joins them or none has for a while."""
+
+    def __init__(self, config: Config, segments: Segments, keyframes: Sequence[Keyframe], folder: Path) -> None:
+        """Take the keyframes of a map; the outline is kept in its folder."""
+        self.config = config
+        self.segments = segments
+        self.verifier = SubmapVerifier(config, min_agreement=_MIN_AGREEMENT)
+        self.of_map = len(keyframes)
+        self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
+        outline = outline_of(folder, keyframes, config.local_map)
+        poses = np.array([each.T_odom_lidar for each in keyframes])
+        self.T_level_keyframes = lie.inverse(outline.T_map_level) @ poses
+        extent_m = np.ptp(outline.columns, axis=0) if len(outline.columns) else np.zeros(2)
+        self.size_m = max(outline.size_m, math.sqrt(float(extent_m.prod()) / _MAX_CELLS))
+        self.columns = outline.columns
+        self.grids: tuple[ScoreGrid, ...] = ()  # coarse and fine, drawn when first searched
+        self.next_m = 0.0
+        self.matched_m = -math.inf  # path up to the last match with the map
+        self.finds: list[Closure] = []
+
+    def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies so little behind the newest keyframe that none is due."""
+        newest = keyframes[-1]
+        since_m = newest.traveled_m - self.matched_m
+        return since_m < _MATCH_M * newest.scale and self.segments.starts[-1] != newest.index
+
+    def is_tracked(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> bool:
+        """True while the newest keyframes match the map; closures : of the newest."""
+        if any(each.verdict is Verdict.ACCEPTED and each.target < self.of_map for each in closures):
+            self.matched_m = keyframes[-1].traveled_m
+        return keyframes[-1].traveled_m - self.matched_m <= _TRACKED_M
+
+    def close(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
+    ) -> tuple[Closure, ...]:
+        """Closures of the newest keyframe with the map; the first that agree with each other are accepted.
+
+        components : (K,) of ``Segments.components``
+        """
+        newest, start = keyframes[-1], self.segments.starts[-1]
+        if newest.traveled_m < self.next_m and newest.index != start:
+            return ()
+        is_joined = bool(components[-1] == components[0])
+        begun_m = self.matched_m if is_joined else keyframes[start].traveled_m
+        self.next_m = newest.traveled_m + max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M)
+        members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
+        closure = self._found(members, keyframes)
+        if closure is None or closure.verdict is Verdict.REJECTED:
+            return () if closure is None else (closure,)
+        self.next_m = newest.traveled_m + _STEP_M
+        if is_joined:
+            problem = self._contradiction(closure, keyframes, graph.poses, newest.traveled_m - begun_m)
+            if problem:
+                return (replace(closure, verdict=Verdict.REJECTED, reason=problem),)
+        return self._confirmed(closure, keyframes)
+
+    def _found(self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> Closure | None:
+        """The closure of the newest of the members with the map, verified or not; None where nothing is alike."""
+        newest = members[-1]
+        T_newest_level = level_frame(newest, self.config.local_map)
+        seeds = self._seeds(_together(members, lie.inverse(T_newest_level)))
+        source = Submap(newest, members, self.radius_m)
+        tried: list[Closure] = []
+        for x_m, y_m, yaw_rad, _ in seeds.tolist():
+            for target in self._stories(np.array([x_m, y_m])):
+                T_level_source = self._on_ground(keyframes[target], x_m, y_m, yaw_rad) @ lie.inverse(
+                    T_newest_level
+                )
+                T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
+                verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
+                tried.append(verified.closure(target, newest.index, Proposal.PLACE))
+        accepted = [each for each in tried if each.verdict is Verdict.ACCEPTED]
+        if not accepted:
+            return tried[0] if tried else None
+        best = max(accepted, key=lambda each: each.overlap)
+        if all(_agree(best, each, keyframes) for each in accepted):
+            return best
+        return replace(best, verdict=Verdict.REJECTED, reason="another place of the map is as similar")
+
+    def _seeds(self, points: Points) -> Matrix:
+        """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined."""
+        near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
+        columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
+        if len(columns) < _MIN_COLUMNS or not len(self.columns):
+            return np.empty((0, 4))
+        if not self.grids:
+            self.grids = tuple(ScoreGrid(self.columns, cells * self.size_m) for cells in (_COARSE, 1.0))
+        coarse, fine = self.grids
+        low, high = self.columns.min(axis=0), self.columns.max(axis=0)
+        middle = lie.pose_2d(*(0.5 * (low + high)).tolist(), yaw_rad=0.0)
+        apart_m = _COARSE * _APART * self.size_m
+        anywhere = Window(0.5 * float((high - low).max()), math.pi, apart_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
+        around = Window(_COARSE * self.size_m, _REFINED_RAD, apart_m, 1.0, 1, _MIN_SHARE)
+        found = coarse.search(evenly(columns, _COARSE_COLUMNS), middle, anywhere)
+        seeds = np.vstack(
+            [np.empty((0, 4)), *(fine.search(columns, lie.pose_2d(x, y, yaw), around) for x, y, yaw, _ in found)]
+        )
+        best_first = seeds[np.argsort(-seeds[:, 3], kind="stable")][:_SEEDS]
+        return best_first[best_first[:, 3] >= _RIVAL * best_first[:1, 3]]
+
+    def _stories(self, place: NDArray[np.float64]) -> list[int]:
+        """Keyframes of the map nearest to a place (2,), one on each story."""
+        positions = self.T_level_keyframes[:, :3, 3]
+        away_m = np.linalg.norm(positions[:, :2] - place, axis=1)
+        chosen: list[int] = []
+        for index in np.argsort(away_m, kind="stable").tolist():
+            if away_m[index] > _REACH * self.radius_m or len(chosen) == _MAX_LEVELS:
+                break
+            if (np.abs(positions[chosen, 2] - positions[index, 2]) > _LEVEL_M).all():
+                chosen.append(index)
+        return chosen
+
+    def _on_ground(self, target: Keyframe, x_m: float, y_m: float, yaw_rad: float) -> Pose:
+        """T_level_source of a level source at a place, on the plane of the ground around the target."""
+        T_level_target = self.T_level_keyframes[target.index]
+        up = T_level_target[:3, :3] @ level_frame(target, self.config.local_map)[:3, 2]
+        T = upright_frame(up, np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0]))
+        aside = np.array([x_m, y_m]) - T_level_target[:2, 3]
+        T[:3, 3] = x_m, y_m, T_level_target[2, 3] - float(aside @ up[:2]) / float(up[2])
+        return T
+
+    def _submap(self, target: int, keyframes: Sequence[Keyframe]) -> Submap:
+        """The keyframes of the map around one of them, whichever path they lie on."""
+        away_m = np.linalg.norm(self.T_level_keyframes[:, :3, 3] - self.T_level_keyframes[target, :3, 3], axis=1)
+        members = [keyframes[index] for index in np.flatnonzero(away_m < self.radius_m).tolist()]
+        return Submap(keyframes[target], members, self.radius_m)
+
+    def _contradiction(
+        self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix, traveled_m: float
+    ) -> str:
+        """Reason why a find contradicts the prediction since the last match, empty if it does not."""
+        T_found = _implied_pose(closure, closure.source, keyframes)
+        moved_m = lie.apart(T_world[closure.source], T_found)[0]
+        if moved_m <= max(_DRIFT * traveled_m, self.config.loops.min_radius_m):
+            return ""
+        return f"{moved_m:.1f} m from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
+
+    def _confirmed(self, closure: Closure, keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
+        """The closure and the older ones that agree with it; rejected while there are none."""
+        old = [each for each in self.finds if each.source >= self.segments.starts[-1]]
+        agreeing = [each for each in old if _agree(closure, each, keyframes)]
+        if agreeing:
+            self.finds = []
+            return (*agreeing, closure)
+        self.finds = [*old, closure]
+        return (replace(closure, verdict=Verdict.REJECTED, reason="found anywhere, and no other find agrees yet"),)
+
+
+def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:
+    """(N, 3) points of keyframes in the level frame of the last one."""
+    T_level_odom = T_level_newest @ lie.inverse(members[-1].T_odom_lidar)
+    return np.vstack([lie.transform(T_level_odom @ each.T_odom_lidar, each.points) for each in members])
+
+
+def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe]) -> bool:
+    """True if two closures with the map imply the same pose of the newest keyframe."""
+    off_m, off_rad = lie.apart(_implied_pose(a, a.source, keyframes), _implied_pose(b, a.source, keyframes))
+    return off_m < _AGREE_M and off_rad < _AGREE_RAD
+
+
+def _implied_pose(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
+    """T_map_keyframe by a closure with the map and odometry."""
+    T_map_source = keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+    return T_map_source @ lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)

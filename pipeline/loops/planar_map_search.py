@@ -1,0 +1,101 @@
+"""Search of a whole planar map for the points along a path: surfaces speak for a pose, free space against it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import MapsConfig
+from scanchain.data import Keyframe, Matrix, Points, Pose
+from scanchain.kernels.search.branch_and_bound import fill_pyramid
+from scanchain.kernels.search.whole_map import SURFACE, climb, score_cells, search_map
+from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
+from scanchain.preprocess import downsample
+
+_TOP = 5  # levels of the pyramid above the grid itself; windows start with 2⁵ cells
+_MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
+_CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and below minus which it is free
+_POINTS, _MORE_POINTS = 200, 800  # number of points that poses are searched with and compared with
+_APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
+_ANSWERS = 12  # largest number of poses that are compared
+_RIVAL = 0.75  # share of the best score, from which on other poses are compared with it
+_MIN_RANGE_M = 1.0  # least median range that sets the step of the headings
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A pose of the lidar in the map, and the mean score of its points as a share of the highest possible.
+
+    ``rival`` is the share of the best pose elsewhere, 0 where none comes near; ``points`` is one a cell.
+    """
+
+    T_map_lidar: Pose
+    share: float
+    rival: float
+    points: int
+
+
+class MapSearch:
+    """Surfaces and free space of keyframes at their poses, in a grid in which all poses of a scan are searched.
+
+    A point of the scan scores 1 on a surface, ½ beside it, −1 in free space and nothing where the map knows
+    nothing, and the lidar itself stands in free space: a pose that fits walls but looks through others scores low.
+    """
+
+    def __init__(self, keyframes: Sequence[Keyframe], T_map_lidar: Matrix, resolution_m: float) -> None:
+        """Draw keyframes at their poses (K, 3, 3)."""
+        clouds = [keyframe.points for keyframe in keyframes]
+        reach_m = max(float(np.abs(cloud).max(initial=0.0)) for cloud in clouds)
+        self.resolution_m = fitting_resolution(
+            T_map_lidar, resolution_m=resolution_m, max_range_m=reach_m, max_cells=_MAX_CELLS
+        )
+        config = msgspec.structs.replace(MapsConfig(), grid_resolution_m=self.resolution_m)
+        grid = OccupancyGrid(config, max_range_m=math.inf)
+        grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
+        grid = grid.trimmed()
+        before, after = 2**_TOP, 2  # windows begin before the first cell; the border is unknown
+        log_odds = np.pad(grid.log_odds, (before, after))
+        self.origin_m = grid.origin_m - before * self.resolution_m
+        self.pyramid = np.zeros((_TOP + 1, *log_odds.shape), np.int8)
+        score_cells(log_odds, _CERTAIN, self.pyramid[0])
+        fill_pyramid(self.pyramid)
+
+    def best(self, points: Points, least: float) -> Hypothesis | None:
+        """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share."""
+        points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
+        few, many = points[:_POINTS].copy(), points[:_MORE_POINTS].copy()
+        if not len(few):
+            return None
+        range_m = max(float(np.median(np.hypot(few[:, 0], few[:, 1]))), _MIN_RANGE_M)
+        turns = math.ceil(2.0 * math.pi * range_m / self.resolution_m)
+        found = search_map(
+            self.pyramid, few, self.resolution_m, turns, least * SURFACE * len(few), _RIVAL, _APART_M, _ANSWERS
+        )
+        if not len(found):
+            return None
+        poses = np.empty((len(found), 3))
+        poses[:, :2] = self.origin_m + (found[:, :2] + 0.5) * self.resolution_m
+        poses[:, 2] = 2.0 * math.pi / turns * found[:, 2]
+        shares = np.array([self._climbed(many, pose, math.pi / turns) for pose in poses])
+        best = int(np.argmax(shares))
+        rival = float(shares[_is_apart(poses, poses[best])].max(initial=0.0))
+        x_m, y_m, yaw_rad = poses[best].tolist()
+        return Hypothesis(lie.pose_2d(x_m, y_m, yaw_rad), float(shares[best]), rival, len(points))
+
+    def _climbed(self, points: Points, pose: NDArray[np.float64], step_rad: float) -> float:
+        """Share of the points at a pose (3,), which moves to the best one near by."""
+        score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
+        return float(score) / SURFACE
+
+
+def _is_apart(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """True for poses (A, 3) that are not the given one."""
+    away_m = np.abs(poses[:, :2] - pose[:2]).max(axis=1)
+    away_rad = np.abs(np.angle(np.exp(1j * (poses[:, 2] - pose[2]))))
+    return (away_m >= _APART_M) | (away_rad >= _APART_RAD)

@@ -1,0 +1,358 @@
+"""Maps in one frame: each is sought in those that are joined already, then closed to them all along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Verdict
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
+from scanchain.loops import LoopCloser
+from scanchain.maps import Edges, SavedMap
+from scanchain.slam import edge_information
+
+_APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
+_OPTIMIZE_EVERY, _GROWTH = 10, 0.05  # keyframes between two optimizations: at least so many, and such a share
+_MAX_TRIES = 5  # largest number of poses at which a map is tried
+_SAME_M, _SAME_RAD = 2.0, 0.2  # distance within which two of these are the same
+_FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found, and of one session to the next
+_IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
+_MIN_CLOSURES = 3  # least number of keyframes with a closure in force that join two maps
+_MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other map
+_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
+_BINS = 360  # of azimuth, 1°; as fine in elevation
+_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
+_CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
+_RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
+_PIECE_M = 15.0  # path of a piece that is sought by itself
+_MIN_SHARE = 0.3  # least share of these among the keyframes that closures were tried from
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """One or several maps in one frame.
+
+    Attributes
+    ----------
+    maps : numbers of the maps, in the order in which they joined
+    keyframes : of all of them in this order; ``T_odom_lidar`` is the pose in the common frame
+    of_map : (K,) number of each keyframe's map
+    edges : of the maps, and the closures between them, with the weights that the optimizer left to them
+    closures : tried between maps, accepted by matching or not
+    """
+
+    maps: tuple[int, ...]
+    keyframes: tuple[Keyframe, ...]
+    of_map: NDArray[np.int64]
+    edges: Edges
+    closures: tuple[Closure, ...] = ()
+
+    @classmethod
+    def of(cls, number: int, saved: SavedMap) -> Joined:
+        """A map alone."""
+        return cls((number,), saved.keyframes, np.full(len(saved.keyframes), number), saved.edges)
+
+    @property
+    def poses(self) -> Matrix:
+        """(K, d+1, d+1) in the common frame."""
+        return np.array([keyframe.T_odom_lidar for keyframe in self.keyframes])
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.keyframes[0].T_odom_lidar.shape[0] - 1
+
+    @property
+    def length_m(self) -> float:
+        """Path from the first keyframe to the last."""
+        return self.keyframes[-1].traveled_m - self.keyframes[0].traveled_m
+
+    @property
+    def is_between(self) -> NDArray[np.bool_]:
+        """True for edges (E,) between two maps."""
+        ends = self.of_map[self.edges.pairs]
+        return ends[:, 0] != ends[:, 1]
+
+    def placed(self, poses: Matrix) -> Joined:
+        """With the keyframes at other poses (K, d+1, d+1)."""
+        moved = zip(self.keyframes, poses, strict=True)
+        return replace(self, keyframes=tuple(replace(each, T_odom_lidar=pose) for each, pose in moved))
+
+
+def join_all(
+    maps: Sequence[SavedMap], order: Sequence[int], config: Config, held: int, say: Callable[[str], None]
+) -> list[Joined]:
+    """Maps that belong together, each group in one frame, that of its first map.
+
+    order : numbers of the maps; each is tried again whenever its group has grown since
+    held : number of a map whose keyframes stay where they are, −1 for none
+    """
+    groups: list[Joined] = []
+    waiting = list(order)
+    while waiting:
+        world = Joined.of(waiting[0], maps[waiting[0]])
+        waiting = waiting[1:]
+        tried: set[tuple[int, bool, int]] = set()
+        while (following := _next(waiting, tried, world)) is not None:
+            tried.add(following)
+            number, thorough, _ = following
+            say(f"{maps[number].name}: searching in a map of {len(world.keyframes):,} keyframes")
+            joined = join(world, Joined.of(number, maps[number]), config, held, thorough=thorough)
+            if joined is not None:
+                world = joined
+                waiting.remove(number)
+        groups.append(world)
+    return groups
+
+
+def _next(
+    waiting: Sequence[int], tried: set[tuple[int, bool, int]], world: Joined
+) -> tuple[int, bool, int] | None:
+    """Number of a map that was not tried in a world of this many maps, thoroughly only once all were tried."""
+    ways = (False, True) if world.dimension == 2 else (True,)
+    untried = ((number, thorough, len(world.maps)) for thorough in ways for number in waiting)
+    return next((each for each in untried if each not in tried), None)
+
+
+def join(world: Joined, guest: Joined, config: Config, held: int = -1, *, thorough: bool = True) -> Joined | None:
+    """Both in the frame of the world; None where too few closures join them, or as many do elsewhere.
+
+    Where much of the guest overlaps the world, it is not sought elsewhere.
+    thorough : whether pieces of the guest are sought one by one and little overlap is enough; takes long
+    """
+    apart = msgspec.structs.replace(
+        config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0
+    )
+    between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
+    old, tried, trials = len(world.keyframes), list[Pose](), list[Joined]()
+    for found, T_world_guest in _sought(world, guest, between, thorough=thorough):
+        if len(tried) == _MAX_TRIES:
+            break
+        if not any(_same(T_world_guest, other) for other in tried):
+            tried.append(T_world_guest)
+            trial = _Closing(world, guest, found, T_world_guest, between, held).finish()
+            if trial is not None and _joining(trial, old) > _CLEAR * len(guest.keyframes):
+                return trial
+            trials += [trial] if trial is not None and thorough else []
+    trials.sort(key=lambda trial: -_joining(trial, old))
+    if len(trials) > 1 and _joining(trials[1], old) > _RIVAL * _joining(trials[0], old):
+        return None
+    return trials[0] if trials else None
+
+
+def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
+    """The pose graph of all edges; keyframes of the held map, its first one, are a single pose of the graph.
+
+    An edge to one of them is an edge to the first, with the pose between the two in its measurement.
+    """
+    poses, edges, body = joined.poses, joined.edges, _body(joined, held)
+    node = np.maximum(np.arange(len(poses)) - body + 1, 0)
+    T_first_held = lie.between(poses[:1], poses[:body])
+    pairs, measurements, information = edges.pairs, edges.measurements.copy(), edges.information.copy()
+    starts, ends = pairs[:, 0] < body, pairs[:, 1] < body
+    measurements[starts] = T_first_held[pairs[starts, 0]] @ measurements[starts]
+    T_held_first = lie.inverse(T_first_held[pairs[ends, 1]])
+    measurements[ends] = measurements[ends] @ T_held_first
+    to_own = lie.adjoint(T_held_first)  # a twist in the frame of the first as one in that of the other
+    information[ends] = np.swapaxes(to_own, 1, 2) @ information[ends] @ to_own
+    kept = ~(starts & ends)
+    graph = PoseGraph(joined.dimension)
+    for keyframe in (joined.keyframes[0], *joined.keyframes[body:]):
+        graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+    graph.add_edges(node[pairs[kept]], measurements[kept], information[kept], edges.is_loop[kept])
+    return graph
+
+
+def optimized(joined: Joined, config: Config, held: int = -1) -> Joined:
+    """All edges at the minimum of χ²; the keyframes of the held map stay where they are, or else the first one."""
+    graph, body = graph_of(joined, held), _body(joined, held)
+    graph.optimize(config.graph, initialize="given", rejection="refined")
+    weight = np.ones(len(joined.edges.pairs))
+    weight[~(joined.edges.pairs < body).all(axis=1)] = graph.weight
+    poses = joined.poses
+    poses[body:] = graph.poses[1:]
+    return replace(joined.placed(poses), edges=replace(joined.edges, weight=weight))
+
+
+def _body(joined: Joined, held: int) -> int:
+    """Number of the first keyframes that are one pose of the graph."""
+    return int((joined.of_map == held).sum()) or 1
+
+
+def _sought(world: Joined, guest: Joined, config: Config, *, thorough: bool) -> Iterator[tuple[Closure, Pose]]:
+    """Closures of the guest's keyframes in the world, without an expected pose, with T_world_guest by each.
+
+    What is sought in the plane in vain for long is sought seldom; ``thorough`` : pieces of it one by one.
+    """
+    for piece in _pieces(guest) if thorough and guest.dimension == 2 else [guest.keyframes]:
+        closer, keyframes, graph = LoopCloser(config, world.dimension), list(world.keyframes), graph_of(world)
+        begin_m = closer.begin_in(keyframes, is_fixed=False)
+        closer.start_segment(len(keyframes))
+        for keyframe in _after(piece, len(keyframes), begin_m):
+            keyframes.append(keyframe)
+            graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+            closures = closer.close(keyframes, graph)
+            if keyframe.index + 1 == len(world.keyframes) + len(piece):
+                closures += closer.finish(keyframes, graph)
+            for closure in closures:
+                if closure.verdict is Verdict.ACCEPTED:
+                    T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
+                    T_guest_source = keyframes[closure.source].T_odom_lidar
+                    yield closure, lie.normalize(T_world_source @ lie.inverse(T_guest_source))
+
+
+def _pieces(guest: Joined) -> Iterator[Sequence[Keyframe]]:
+    """Keyframes in pieces of some length."""
+    numbers = np.array([keyframe.traveled_m for keyframe in guest.keyframes])
+    numbers = ((numbers - numbers[0]) // _PIECE_M).astype(np.int64)
+    for number in np.unique(numbers).tolist():
+        first, last = np.searchsorted(numbers, [number, number + 1]).tolist()
+        yield guest.keyframes[first:last]
+
+
+class _Closing:
+    """Closures between a world and a guest whose pose in it is known but for a standard deviation."""
+
+    def __init__(
+        self, world: Joined, guest: Joined, found: Closure, T_world_guest: Pose, config: Config, held: int
+    ) -> None:
+        self.world, self.config, self.held = world, config, held
+        self.guest = guest.placed(T_world_guest @ guest.poses)
+        self.found = found
+        self.closer = LoopCloser(config, world.dimension)
+        self.keyframes = list(world.keyframes)
+        self.graph = graph_of(world)
+        self.closures: list[Closure] = []
+        self.waiting, self.optimized_at = False, len(self.keyframes)
+        self.T_world_odom = lie.identity(world.dimension)
+
+    def finish(self) -> Joined | None:
+        """Both joined; None where too few closures between them are in force."""
+        old, begin_m = len(self.keyframes), self.closer.begin_in(self.keyframes, is_fixed=False)
+        for index in range(_body(self.world, self.held)):
+            self.graph.fix(index)
+        edges = self.guest.edges
+        last_end = edges.pairs.max(axis=1, initial=-1)
+        for keyframe in _after(self.guest.keyframes, old, begin_m):
+            self._add(keyframe, edges.where(last_end == keyframe.index - old))
+            self._take(self.closer.close(self.keyframes, self.graph))
+            due = max(_OPTIMIZE_EVERY, _GROWTH * len(self.keyframes))
+            if self.waiting and len(self.keyframes) - self.optimized_at >= due:
+                self._optimize()
+        self._take(self.closer.finish(self.keyframes, self.graph))
+        if not any(closure.verdict is Verdict.ACCEPTED for closure in self.closures):
+            return None
+        joined = optimized(self._joined(), self.config, self.held)
+        return joined if _is_joined(joined, old) else None
+
+    def _add(self, keyframe: Keyframe, edges: Edges) -> None:
+        """Add a keyframe with its edges to older ones; where it has none, one to the last, for the time being."""
+        old = len(self.world.keyframes)
+        last = self.keyframes[-1] if keyframe.index > old else self.keyframes[self.found.target]
+        self.keyframes.append(keyframe)
+        self.graph.add_pose(lie.normalize(self.T_world_odom @ keyframe.T_odom_lidar), keyframe.stamp_ns)
+        self.graph.add_edges(edges.pairs + old, edges.measurements, edges.information, edges.is_loop)
+        if not len(edges.pairs):
+            T_last_keyframe = lie.between(last.T_odom_lidar, keyframe.T_odom_lidar)
+            sigma = lie.by_component(self.graph.freedom, _FOUND_M, _FOUND_RAD)
+            self.graph.add_edge(last.index, keyframe.index, T_last_keyframe, np.diag(sigma**-2.0))
+
+    def _take(self, closures: Sequence[Closure]) -> None:
+        """Keep closures; those accepted become edges of the graph."""
+        self.closures += closures
+        for closure in closures:
+            if closure.verdict is Verdict.ACCEPTED:
+                self.waiting = True
+                information = _information(closure, self.config)
+                self.graph.add_edge(
+                    closure.target, closure.source, closure.match.T_target_source, information, is_loop=True
+                )
+
+    def _optimize(self) -> None:
+        self.graph.optimize(self.config.graph, initialize="given", rejection="gnc")
+        self.waiting, self.optimized_at = False, len(self.keyframes)
+        self.T_world_odom = lie.normalize(self.graph.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
+
+    def _joined(self) -> Joined:
+        """World and guest with their own edges and all accepted closures, at the poses of now."""
+        world, guest, old = self.world, self.guest, len(self.world.keyframes)
+        accepted = [closure for closure in self.closures if closure.verdict is Verdict.ACCEPTED]
+        count = len(accepted)
+        closed = Edges(
+            np.array([(closure.target, closure.source) for closure in accepted], np.int64),
+            np.array([closure.match.T_target_source for closure in accepted]),
+            np.array([_information(closure, self.config) for closure in accepted]),
+            np.ones(count, np.bool_),
+            np.ones(count),
+        )
+        joined = Joined(
+            maps=world.maps + guest.maps,
+            keyframes=(*world.keyframes, *_after(guest.keyframes, old, world.keyframes[-1].traveled_m + _APART_M)),
+            of_map=np.concatenate([world.of_map, guest.of_map]),
+            edges=Edges.chained(world.edges, replace(guest.edges, pairs=guest.edges.pairs + old), closed),
+            closures=(*world.closures, *self.closures),
+        )
+        return joined.placed(self.graph.poses.copy())
+
+
+def _after(keyframes: Sequence[Keyframe], index: int, begin_m: float) -> Iterator[Keyframe]:
+    """Keyframes numbered from an index on, on a path that begins there."""
+    first_m = keyframes[0].traveled_m
+    for number, keyframe in enumerate(keyframes, start=index):
+        yield replace(keyframe, index=number, traveled_m=begin_m + keyframe.traveled_m - first_m)
+
+
+def _is_joined(joined: Joined, old: int) -> bool:
+    """True if enough closures in force join the keyframes before ``old`` to the others, and free space agrees."""
+    tried = len({closure.source for closure in joined.closures if closure.source >= old})
+    if _joining(joined, old) < max(_MIN_CLOSURES, _MIN_SHARE * tried):
+        return False
+    return contradiction(joined.keyframes[:old], joined.keyframes[old:]) <= _MAX_CONTRADICTION
+
+
+def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
+    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
+    d = some[0].T_odom_lidar.shape[0] - 1
+    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
+    agreeing = contradicting = 0
+    for viewers, viewed in ((some, others), (others, some)):
+        near = KDTree([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
+        for viewer in viewers:
+            away_m, index = near.query(viewer.T_odom_lidar[:d, d])
+            other = viewed[int(index)]
+            if away_m <= _NEAR_M[d]:
+                nearest_ranges(_in_space(viewer), ranges_m)
+                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
+                margin_m = _MARGIN_M[d] * viewer.scale
+                yes, no = compare_ranges(_in_space(other), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE)
+                agreeing, contradicting = agreeing + yes, contradicting + no
+    return contradicting / max(agreeing + contradicting, 1)
+
+
+def _in_space(keyframe: Keyframe) -> Points:
+    """(N, 3); points of the plane get height 0."""
+    points = keyframe.points
+    return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
+
+
+def _joining(joined: Joined, old: int) -> int:
+    """Number of keyframes from ``old`` on that a closure in force joins to those before."""
+    pairs = joined.edges.pairs
+    return len(np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1]))
+
+
+def _information(closure: Closure, config: Config) -> Matrix:
+    return edge_information(closure.match.information, config.loops.edge_sigma_m, config.loops.edge_sigma_rad)
+
+
+def _same(T_a: Pose, T_b: Pose) -> bool:
+    away_m, away_rad = lie.apart(T_a, T_b)
+    return away_m < _SAME_M and away_rad < _SAME_RAD

@@ -1,0 +1,173 @@
+"""The map of several sessions: final poses of their keyframes and scans, and the files of its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import REJECTED_WEIGHT, Keyframe, Matrix, Trajectory
+from scanchain.errors import InputError
+from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.loops import refined, spread
+from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
+from scanchain.point_store import PointStore
+from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
+from scanchain.runs.directory import directory_name
+from scanchain.runs.results import GRAPH_FILE, Cloud, cloud_of, grid_of
+from scanchain.sessions.joining import Joined, graph_of
+from scanchain.trajectory import read_tum, write_tum
+
+
+@dataclass(frozen=True, slots=True)
+class MergedMap:
+    """Maps in one frame, with their sessions.
+
+    Attributes
+    ----------
+    joined : the graph
+    T_world_keyframes : (K, d+1, d+1) final poses; in the plane finer than those of the graph
+    sessions : of all maps, with names that differ, in the order of time
+    session : (K,) number of each keyframe's session
+    trajectories : of the sessions; of all scans where a run has them, else of the keyframes
+    cloud : the point cloud of all keyframes
+    """
+
+    joined: Joined
+    T_world_keyframes: Matrix
+    sessions: tuple[Session, ...]
+    session: NDArray[np.int64]
+    trajectories: tuple[Trajectory, ...]
+    cloud: Cloud
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """Keyframes of all sessions."""
+        return self.joined.keyframes
+
+
+@dataclass(frozen=True, slots=True)
+class _Posed:
+    """Keyframes with their final poses, as point cloud and grid are made of."""
+
+    keyframes: Sequence[Keyframe]
+    T_world_keyframes: Matrix
+
+
+def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[int, int], str]:
+    """Name of every session by the numbers of its map and of itself there.
+
+    A run of one log is called by its directory; of equal names the later ones, in this order, get a number.
+    """
+    names: dict[tuple[int, int], str] = {}
+    for number in order:
+        saved = maps[number]
+        for index, session in enumerate(saved.sessions):
+            stem = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
+            taken, count, name = set(names.values()), 2, stem
+            while name in taken:
+                name, count = f"{stem}-{count}", count + 1
+            names[number, index] = name
+    return names
+
+
+def merged_map(
+    joined: Joined,
+    maps: Sequence[SavedMap],
+    names: dict[tuple[int, int], str],
+    config: Config,
+    *,
+    first: int,
+    held: int,
+) -> MergedMap:
+    """The map of joined maps, in the frame of the map ``first``: its first keyframe stays where it was.
+
+    names : of the sessions, by map and number; held : map whose poses stay as they are, or −1
+    """
+    poses = _refined(joined, config, held)
+    if held < 0:
+        at = int(np.flatnonzero(joined.of_map == first)[0])
+        T_first_world = maps[first].keyframes[0].T_odom_lidar @ lie.inverse(poses[at])
+        poses = T_first_world @ poses
+        joined = joined.placed(T_first_world @ joined.poses)
+    chosen = [(number, index) for number in joined.maps for index in range(len(maps[number].sessions))]
+    chosen.sort(key=lambda each: maps[each[0]].sessions[each[1]].first_stamp_ns)
+    session = np.empty(len(poses), np.int64)
+    sessions, trajectories = [], []
+    for new, (number, index) in enumerate(chosen):
+        of_session = np.flatnonzero(joined.of_map == number)[maps[number].session == index]
+        session[of_session] = new
+        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
+        trajectories.append(_trajectory(maps[number], index, poses[of_session]))
+    cloud = cloud_of(_Posed(joined.keyframes, poses), config)
+    return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), cloud)
+
+
+def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
+    """Every closure tried between maps with its final verdict."""
+    state, edges = graph_of(merged.joined).state(), merged.joined.edges
+    order = np.argsort(edges.is_loop, kind="stable")  # of the state: odometry first
+    between = merged.joined.is_between[order]
+    return final_verdicts(merged.joined.closures, replace(state, is_loop=between, weight=edges.weight[order]))
+
+
+def write_merged(folder: Path, merged: MergedMap, final: Sequence[FinalClosure], config: Config) -> None:
+    """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
+    edges, poses = merged.joined.edges, merged.T_world_keyframes
+    in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
+    write_saved_map(folder / MAP_FOLDER, merged.keyframes, poses, merged.session, merged.sessions, in_force)
+    for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
+        write_tum(folder / f"{session.name}.tum", trajectory)
+    write_ply(folder / "map.ply", merged.cloud.points)
+    if merged.joined.dimension == 2:
+        write_map(folder, grid_of(_Posed(merged.keyframes, poses), config.maps))
+    write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
+    write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
+
+
+def _refined(joined: Joined, config: Config, held: int) -> Matrix:
+    """Final poses (K, d+1, d+1): in the plane, each keyframe aligned once more to the map of all of them."""
+    poses = joined.poses
+    if joined.dimension == 3 or not config.loops.refine:
+        return poses
+    store = PointStore(2)
+    stored = [store.add(keyframe.points) for keyframe in joined.keyframes]
+    spans = np.array([(each.first, each.count) for each in stored], np.int64)
+    free = joined.of_map != held
+    poses[free] = refined(poses[free], spans[free], store, joined.keyframes, joined.poses, config)
+    return poses
+
+
+def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
+    """Poses of a session's scans, from its first keyframe on, moved along with its keyframes (K, d+1, d+1)."""
+    keyframes = [saved.keyframes[k] for k in np.flatnonzero(saved.session == index).tolist()]
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    before = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+    file = "trajectory.tum" if len(saved.sessions) == 1 else f"{saved.sessions[index].name}.tum"
+    scans = _read(saved.folder.parent / file, saved.dimension)
+    rows = np.array([keyframe.scan_index for keyframe in keyframes], np.int64)
+    if scans is not None:
+        for first in (0, int(rows[0])):  # a merged map's file begins at the first keyframe
+            found = rows - first
+            if found[-1] < len(scans) and np.array_equal(scans.stamps_ns[found], stamps_ns):
+                if np.array_equal(poses, before):
+                    return Trajectory(scans.stamps_ns[found[0] :], scans.poses[found[0] :])
+                moved = spread(poses, found - found[0], scans.poses[found[0] :])
+                return Trajectory(scans.stamps_ns[found[0] :], moved)
+    return Trajectory(stamps_ns, poses)
+
+
+def _read(file: Path, dimension: int) -> Trajectory | None:
+    """A trajectory of poses of this dimension; None where there is none that can be read."""
+    try:
+        trajectory = read_tum(file)
+    except InputError:
+        return None
+    poses = lie.flatten(trajectory.poses) if dimension == 2 else trajectory.poses
+    return Trajectory(trajectory.stamps_ns, poses)

@@ -1,0 +1,266 @@
+"""Merging: run directories of one place in, one map out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from scanchain.clock import announcing_compilation, compiled_s, working_s
+from scanchain.config import Config
+from scanchain.data import REJECTED_WEIGHT, Verdict
+from scanchain.errors import InputError, ScanchainError
+from scanchain.graph.optimization import fit
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.runs.closures import FinalClosure
+from scanchain.runs.directory import RUN_FILE, RunDirectory
+from scanchain.runs.job import Progress
+from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.sessions.joining import Joined, graph_of, join_all
+from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
+from scanchain.settings import Override, dump, load_settings
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+
+
+@dataclass(frozen=True, slots=True)
+class MergeJob:
+    """Maps to merge.
+
+    Attributes
+    ----------
+    runs : run directories, or map folders; the first one's frame is that of the merged map
+    out : the directory to create
+    config_file : on top of the preset; overrides : on top of both
+    fixed : whether the keyframes of the first run stay where they are, to the bit
+    force : whether a directory of that name is replaced
+    command : the command line, for run.json
+    """
+
+    runs: tuple[Path, ...]
+    out: Path
+    config_file: Path | None = None
+    overrides: tuple[Override, ...] = ()
+    fixed: bool = False
+    force: bool = False
+    command: tuple[str, ...] = ()
+
+
+class SessionMetrics(msgspec.Struct, frozen=True):
+    """A session of the merged map: its keyframes, and the closures in force between it and other maps."""
+
+    name: str
+    first_stamp_ns: int
+    last_stamp_ns: int
+    keyframes: int
+    closures: int
+
+
+class MergeMetrics(msgspec.Struct, frozen=True):
+    """Contents of metrics.json of a merge.
+
+    Attributes
+    ----------
+    sessions : those in the map, in the order of time
+    apart : those that are not, each with the other sessions of its own place, if any
+    closures_tried, closures_in_force : between maps
+    chi2, degrees_of_freedom, certified, certificate : of the pose graph
+    map_points, moving_points_removed : of map.ply
+    run_s : wall time, without compilation
+    """
+
+    dimension: int
+    sessions: tuple[SessionMetrics, ...]
+    apart: tuple[tuple[str, ...], ...]
+    keyframes: int
+    closures_tried: int
+    closures_in_force: int
+    chi2: float
+    degrees_of_freedom: int
+    fit: str
+    certified: bool
+    certificate: str
+    map_points: int
+    moving_points_removed: int
+    run_s: float
+    compile_s: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """A finished merge: its directory, metrics, summary and warnings."""
+
+    path: Path
+    metrics: MergeMetrics
+    summary: str
+    warnings: tuple[str, ...]
+
+
+def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> Merged:
+    """Join the maps, write the directory, to which ``report`` adds page and recording in the end.
+
+    Raises InputError for bad input, and ScanchainError where no two maps belong together.
+    """
+    started, compiled_before_s = working_s(), compiled_s()
+    directory = RunDirectory(job.out, force=job.force)
+    maps = _opened(job)
+    dimension = maps[0].dimension
+    settings = load_settings(dimension, file=job.config_file, overrides=job.overrides)
+    config, held = settings.config, 0 if job.fixed else -1
+    order = _canonical(maps, held)
+    names = session_names(maps, order)
+    provenance = describe_start(job.command, [saved.folder for saved in maps], settings.source)
+    with directory, announcing_compilation(progress.say), Hashing([saved.folder for saved in maps]) as hashing:
+        groups = join_all(maps, order, config, held, progress.say)
+        joined = _chosen(groups, held, [saved.folder.parent for saved in maps])
+        progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
+        first = min(joined.maps)
+        merged = merged_map(joined, maps, names, config, first=first, held=held)
+        final = final_closures(merged)
+        write_merged(directory.path, merged, final, config)
+        apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
+        warnings = tuple(_apart_text(each) for each in apart)
+        compile_s = compiled_s() - compiled_before_s
+        run_s = working_s() - started
+        metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings)
+        write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
+        text = _summary(metrics, names[first, 0], settings.source, fixed=job.fixed)
+        (directory.path / "summary.txt").write_text(text, encoding="utf-8")
+        write_whole(directory.path / "config.toml", dump(config).encode())
+        done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
+        done.write(directory.path / RUN_FILE)
+        progress.say("drawing the report")
+        report(directory.path)
+        directory.complete()
+    return Merged(directory.path, metrics, text, warnings)
+
+
+def _opened(job: MergeJob) -> list[SavedMap]:
+    """The maps of a job. Raises InputError where they cannot be merged."""
+    if len(job.runs) < 2:
+        raise InputError("merge takes two run directories or more; name another one")
+    maps = [open_saved_map(run) for run in job.runs]
+    for run, saved in zip(job.runs, maps, strict=True):
+        if saved.dimension != maps[0].dimension:
+            raise InputError(
+                f"{run}: is a {saved.dimension}D map, {job.runs[0]} a {maps[0].dimension}D one; merge maps of one "
+                "kind"
+            )
+        if not saved.keyframes:
+            raise InputError(f"{run}: its map has no keyframe; leave it out")
+        if job.out.resolve() in (run.resolve(), saved.folder.resolve()):
+            raise InputError(f"{job.out}: is one of the runs; choose another --out")
+    holders: dict[tuple[int, int, int], Path] = {}
+    for run, saved in zip(job.runs, maps, strict=True):
+        for session in saved.sessions:
+            key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
+            if key in holders:
+                raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
+            holders[key] = run
+    return maps
+
+
+def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
+    """Numbers of the maps, the held one first, then the largest, whatever order they were named in."""
+
+    def key(number: int) -> tuple[object, ...]:
+        saved = maps[number]
+        stamps = [(session.first_stamp_ns, session.last_stamp_ns) for session in saved.sessions]
+        return (number != held, -len(saved.keyframes), saved.name, stamps)
+
+    return sorted(range(len(maps)), key=key)
+
+
+def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path]) -> Joined:
+    """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
+    if held >= 0:
+        chosen = next(group for group in groups if held in group.maps)
+    else:
+        chosen = max(groups, key=lambda group: (len(group.maps), len(group.keyframes)))
+    if len(chosen.maps) < 2:
+        what = f"nothing belongs to {runs[held]}" if held >= 0 else "no two of the maps belong together"
+        raise ScanchainError(
+            f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
+            "--loops.max_radius_m where they have drifted far"
+        )
+    return chosen
+
+
+def _names(group: Joined, maps: Sequence[SavedMap], names: dict[tuple[int, int], str]) -> tuple[str, ...]:
+    return tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
+
+
+def _apart_text(names: Sequence[str]) -> str:
+    together = "; they belong together: merge them on their own" if len(names) > 1 else ""
+    return f"{', '.join(names)}: not in this map, too few closures agree{together}"
+
+
+def _measured(
+    merged: MergedMap,
+    final: Sequence[FinalClosure],
+    config: Config,
+    held: int,
+    apart: tuple[tuple[str, ...], ...],
+    run_s: float,
+    compile_s: float,
+    warnings: tuple[str, ...],
+) -> MergeMetrics:
+    graph = graph_of(merged.joined, held)
+    state = graph.optimize(config.graph, initialize="given", rejection="refined").state
+    certificate = graph.certify()
+    edges = merged.joined.edges
+    between = edges.where(merged.joined.is_between & (edges.weight >= REJECTED_WEIGHT))
+    ends = merged.session[between.pairs]
+    return MergeMetrics(
+        dimension=merged.joined.dimension,
+        sessions=tuple(
+            SessionMetrics(
+                each.name,
+                each.first_stamp_ns,
+                each.last_stamp_ns,
+                int((merged.session == number).sum()),
+                int((ends == number).any(axis=1).sum()),
+            )
+            for number, each in enumerate(merged.sessions)
+        ),
+        apart=apart,
+        keyframes=len(merged.keyframes),
+        closures_tried=len(final),
+        closures_in_force=sum(item.verdict is Verdict.ACCEPTED for item in final),
+        chi2=state.chi2,
+        degrees_of_freedom=state.degrees_of_freedom,
+        fit=fit(state),
+        certified=certificate.certified,
+        certificate=certificate.verdict,
+        map_points=len(merged.cloud.points),
+        moving_points_removed=merged.cloud.removed,
+        run_s=run_s - compile_s,
+        compile_s=compile_s,
+        warnings=warnings,
+    )
+
+
+def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) -> str:
+    """The metrics as text."""
+    width = max(len(each.name) for each in m.sessions)
+    lines = [
+        f"merged         {counted(len(m.sessions), 'session')} in the frame of {first}"
+        + (", whose poses are fixed" if fixed else ""),
+        *(
+            f"session        {each.name:<{width}}  {counted(each.keyframes, 'keyframe')}, "
+            f"{counted(each.closures, 'closure')} to other sessions"
+            for each in m.sessions
+        ),
+        *(f"apart          {warning}" for warning in m.warnings),
+        f"configuration  {configuration}",
+        f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
+        f"pose graph     {m.fit}",
+        f"certificate    {m.certificate}",
+        f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
+        f"time           {m.run_s:.1f} s"
+        + (f" (and {m.compile_s:.0f} s compiling)" if m.compile_s >= 1.0 else ""),
+    ]
+    return "\n".join(lines) + "\n"

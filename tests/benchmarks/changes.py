@@ -1,0 +1,194 @@
+"""Changes named between two maps of simulated places against what changed in truth.
+
+    python -m tests.benchmarks.changes FOLDER [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
+        [--later-seconds S] [--unchanged]
+
+For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
+stay in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so
+many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is right
+where most of its points lie on an object that vanished or appeared. With ``--later-seconds`` the second drive sees
+a part of the first one's world only, with ``--unchanged`` nothing changed: every cluster is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import scanchain
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.sessions.alignment import align_maps
+from scanchain.sessions.changes import Changes, Part, changes_between
+from scanchain.settings import load_settings
+from scanchain.simulation import Drive, plan
+from scanchain.simulation.drive import EPOCH_NS
+from scanchain.simulation.log import record
+from scanchain.simulation.solids import FIXED, Solids
+
+LEAST_M = 0.3  # size of the objects that count
+LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
+REACH_M = {2: 8.6, 3: 34.0}  # farthest that scans are compared at: docs/maps.md
+MARGIN_M = {2: 0.1, 3: 0.3}  # around an object, within which points belong to it
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Events are sides of a change: an object that vanished from a place, one that appeared."""
+
+    events: int
+    found: int
+    clusters: int
+    right: int
+    moved_named: int
+    moved_right: int
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--world", default="office")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--sensor")
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--later-seconds", type=float)
+    parser.add_argument("--unchanged", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    scores = [score_of(options, seed) for seed in options.seeds]
+    total = Score(*(sum(getattr(score, name) for score in scores) for name in Score.__slots__))
+    for name, score in (*zip(map(str, options.seeds), scores, strict=True), ("all", total)):
+        print(
+            f"{options.world} {name:>4s}: found {score.found:3d} of {score.events:3d} "
+            f"({100 * score.found / max(score.events, 1):5.1f} %), right {score.right:3d} of {score.clusters:3d} "
+            f"({100 * score.right / max(score.clusters, 1):5.1f} %), "
+            f"counterparts right {score.moved_right} of {score.moved_named}"
+        )
+
+
+def score_of(options: argparse.Namespace, seed: int) -> Score:
+    later_s = options.later_seconds or options.seconds
+    first = plan(options.world, seed=seed, sensor=options.sensor, duration_s=options.seconds)
+    second = plan(options.world, seed=seed, sensor=options.sensor, duration_s=later_s, changed=1)
+    if options.unchanged:
+        second = Drive(first.solids, second.motion, second.sensor, second.T_base_lidar, second.scans)
+    stem = f"{options.world}_{options.sensor or 'own'}_{seed}_{options.seconds or 'all'}"
+    tail = f"_b{options.later_seconds or ''}{'_unchanged' if options.unchanged else ''}"
+    a = _run(first, options.folder / f"{stem}_a", seed, None)
+    b = _run(second, options.folder / f"{stem}{tail}", seed, 1)
+    config = load_settings(a.dimension).config
+    aligned = align_maps(a, b, config)
+    found = changes_between(Part("a", a.keyframes, a.poses), Part("b", b.keyframes, aligned.poses), config)
+    return _score(found, first, second, a, b, verbose=options.verbose)
+
+
+def _run(drive: Drive, path: Path, seed: int, changed: int | None) -> SavedMap:
+    """The map of a drive, which is made where it is not there yet."""
+    if not (path / "map").is_dir():
+        log = path.with_suffix(".mcap")
+        record(drive, log, seed=seed, changed=changed, force=True)
+        scanchain.run(log, path, recording=False, force=True)
+        log.unlink()
+    return open_saved_map(path)
+
+
+def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap, *, verbose: bool) -> Score:
+    d, points = a.dimension, _in_world(found.points, first, a)
+    count = len(found.clusters) + 1
+    size = np.bincount(found.of_cluster, minlength=count)
+    right, owner = np.zeros(count, bool), np.full(count, -1)
+    events = hits = 0
+    for kind, here, there in (("vanished", (first, a), (second, b)), ("appeared", (second, b), (first, a))):
+        solids, is_kind = here[0].solids, np.array([False, *(each.kind == kind for each in found.clusters)])
+        changed = [
+            each for each in second.changes if np.isfinite(each.before if here[0] is first else each.after).all()
+        ]
+        both = _with_objects(there[0].solids, solids, [change.owner for change in changed])
+        rays = np.minimum(_rays_by_owner(*here, solids), _rays_by_owner(*there, both))
+        for change in changed:
+            on = _on(points, solids, change.owner, MARGIN_M[d])
+            mine = np.bincount(found.of_cluster[on], minlength=count)
+            covers = is_kind & (mine > 0.5 * size)
+            right |= covers
+            owner[covers] = change.owner
+            if change.size_m[:d].max() < LEAST_M or rays[change.owner] < LEAST_RAYS[d]:
+                continue
+            events += 1
+            is_hit = bool((covers | (is_kind & (mine > 0.2 * on.sum()))).any())
+            hits += is_hit
+            if verbose and not is_hit:
+                labels = np.bincount(found.labels[on], minlength=4)
+                print(f"  missed {change.kind} {kind} {change.size_m.round(2)} {rays[change.owner]} rays {labels}")
+    if verbose:
+        for each in found.clusters:
+            if not right[each.number]:
+                print("  wrong", each.kind, each.center.round(1), each.size_m.round(2), each.points)
+    moved = [cluster for cluster in found.clusters if cluster.kind == "vanished" and cluster.counterpart]
+    matched = sum(0 <= owner[each.number] == owner[each.counterpart] for each in moved)
+    return Score(events, hits, len(found.clusters), int(right[1:].sum()), len(moved), matched)
+
+
+def _in_world(points: Matrix, drive: Drive, saved: SavedMap) -> Matrix:
+    """Points (N, 3) of the map in the simulator's world; those of the plane at the height of the lidar."""
+    starts_s = np.array([keyframe.stamp_ns - EPOCH_NS for keyframe in saved.keyframes]) * 1e-9
+    true = drive.motion.lidar(starts_s)
+    T = (lie.flatten(true) if saved.dimension == 2 else true) @ lie.inverse(saved.poses)
+    T_world_map = T[len(T) // 2]
+    moved = lie.transform(T_world_map, points)
+    return moved if saved.dimension == 3 else np.column_stack([moved, np.full(len(moved), true[0, 2, 3])])
+
+
+def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarray:
+    """True for points within a margin of the solids of one object."""
+    on = np.zeros(len(points), bool)
+    parts = np.split(solids.owner == owner, np.cumsum([len(solids.boxes), len(solids.cylinders)]))
+    for x, y, half_x, half_y, low, high, c, s in solids.boxes[parts[0]]:
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        inside = (np.abs(c * dx + s * dy) < half_x + margin_m) & (np.abs(-s * dx + c * dy) < half_y + margin_m)
+        on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
+    for x, y, radius, low, high in solids.cylinders[parts[1]]:
+        inside = np.hypot(points[:, 0] - x, points[:, 1] - y) < radius + margin_m
+        on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
+    for row in solids.ellipsoids[parts[2]]:
+        on |= (((points - row[:3]) / (row[3:] + margin_m)) ** 2).sum(axis=1) < 1.0
+    return on
+
+
+def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
+    """The solids, which no longer count as these objects, and the objects as they stand on another day."""
+    rows, owner = [], []
+    for k, name in enumerate(("boxes", "cylinders", "ellipsoids")):
+        kept = ~np.isin(own := _owner(solids, k), owners)
+        added = np.isin(of_others := _owner(others, k), owners)
+        rows.append(np.vstack([getattr(solids, name), getattr(others, name)[added]]))
+        owner.append(np.concatenate([np.where(kept, own, FIXED), of_others[added]]))
+    return Solids(*rows, ground=solids.ground, owner=np.concatenate(owner))
+
+
+def _owner(solids: Solids, kind: int) -> np.ndarray:
+    ends = np.cumsum([0, len(solids.boxes), len(solids.cylinders), len(solids.ellipsoids)])
+    return solids.owner[ends[kind] : ends[kind + 1]]
+
+
+def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
+    """Number of rays of a drive's keyframes that end on each object (O,) of a world, its own or another one."""
+    counts = np.zeros(10_000, np.int64)
+    for keyframe in saved.keyframes:
+        start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
+        rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
+        poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
+        _, solid = solids.strike(
+            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension])
+        )
+        owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
+        counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
+    return counts
+
+
+if __name__ == "__main__":
+    main()

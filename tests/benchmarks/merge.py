@@ -1,0 +1,109 @@
+"""Sessions cut from logs and merged, their starts unknown: ``python -m tests.benchmarks.merge [--cache DIR]``.
+
+Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
+Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
+ATE over all scans of both after rigid alignment. CSAIL is added to the parts of Intel. Eight parts of Intel of
+2,000 scans each are merged; their time is that of their runs together. Runs stay in the cache; what is there is
+not run again, its time is that of then. Prints a Markdown table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+import scanchain as sc
+from scanchain.data import Trajectory
+from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
+from scanchain.runs.metrics import Metrics
+from scanchain.sessions.merging import Merged
+from scanchain.trajectory import read_tum
+
+DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "2d"
+INTEL, RELATIONS, CSAIL = DATA / "intel.mcap", DATA / "intel.relations", DATA / "mit_csail.mcap"
+LENGTH_S, SCANS = 2691.3, 2000
+
+
+def run(cache: Path, name: str, log: Path, start_s: float = 0.0, end_s: float = np.inf) -> Path:
+    """The run of a part of a log."""
+    out = cache / name
+    if not out.exists():
+        sc.run(log, out, recording=False, log__start_s=start_s, log__end_s=end_s)
+    return out
+
+
+def run_s(runs: Sequence[Path]) -> float:
+    """Seconds that runs took together, without compilation."""
+    return sum(msgspec.json.decode((each / "metrics.json").read_bytes(), type=Metrics).run_s for each in runs)
+
+
+def trajectory(merged: Merged) -> Trajectory:
+    """All scans of all sessions."""
+    parts = [read_tum(merged.path / f"{session.name}.tum") for session in merged.metrics.sessions]
+    return Trajectory(np.concatenate([p.stamps_ns for p in parts]), np.concatenate([p.poses for p in parts]))
+
+
+def show(name: str, runs: Sequence[Path], merged: Merged, error: str = "") -> None:
+    """A row of the table."""
+    metrics = merged.metrics
+    apart = ", ".join(" + ".join(group) for group in metrics.apart) or "none"
+    certified = "yes" if metrics.certified else "no"
+    print(
+        f"| {name} | {len(metrics.sessions)} of {len(runs)} | {apart} | {metrics.closures_in_force:,} of "
+        f"{metrics.closures_tried:,} | {certified} | {error} | {run_s(runs):.1f} s | {metrics.run_s:.1f} s |",
+        flush=True,
+    )
+
+
+def intel(cache: Path, folder: Path) -> None:
+    quarter_s = LENGTH_S / 4.0
+    parts = [run(cache, f"intel-{k + 1}", INTEL, k * quarter_s, (k + 1) * quarter_s) for k in range(4)]
+    whole = read_tum(run(cache, "intel", INTEL) / "trajectory.tum")
+    merged = sc.merge(parts, folder / "intel")
+    relations = read_relations(RELATIONS)
+    found, known = (relation_error(each, relations).translation_m.mean for each in (trajectory(merged), whole))
+    error = f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm ({100.0 * (found / known - 1.0):+.1f} %)"
+    show("Intel in four parts", parts, merged, error)
+    parts.append(run(cache, "csail", CSAIL))
+    show("the same, and CSAIL", parts, sc.merge(parts, folder / "csail"))
+
+
+def eight(cache: Path, folder: Path) -> None:
+    long_s = LENGTH_S * SCANS / 13_631
+    starts_s = np.linspace(0.0, LENGTH_S - long_s, 8).tolist()
+    parts = [run(cache, f"eighth-{k + 1}", INTEL, at_s, at_s + long_s) for k, at_s in enumerate(starts_s)]
+    show("eight parts of Intel of 2,000 scans", parts, sc.merge(parts, folder / "eight"))
+
+
+def town(cache: Path, folder: Path) -> None:
+    log = cache / "town.mcap"
+    truth = (
+        read_tum(log.with_suffix(".tum")) if log.exists() else sc.simulate("town", log, seed=1, duration_s=60.0)
+    )
+    parts = [run(cache, "town-1", log, end_s=32.0), run(cache, "town-2", log, start_s=28.0)]
+    merged = sc.merge(parts, folder / "town")
+    error = absolute_error(pair(trajectory(merged), truth)).translation_m.rmse
+    show("town, two sessions", parts, merged, f"ATE {error:.4f} m")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, help="folder of the runs")
+    cache = parser.parse_args().cache
+    print("| sessions | in the map | apart | closures in force | certified | error | runs | merge |")
+    print("|---|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        runs = cache or Path(folder) / "runs"
+        runs.mkdir(parents=True, exist_ok=True)
+        for part in (intel, eight, town):
+            part(runs, Path(folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scanchain
+from scanchain import lie
+from scanchain.__main__ import main
+from scanchain.data import Keyframe
+from scanchain.errors import InputError
+from scanchain.logs.formats.cloud_file import read_ply
+from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
+from scanchain.sessions.changes import Changes, Label, Part, changes_between
+from scanchain.settings import load_settings
+from scanchain.simulation.solids import Scenery, Solids
+
+BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
+
+
+class Held:
+    def __init__(self, points):
+        self.points = points
+
+    def read(self):
+        return self.points
+
+
+def room(*boxes: tuple[float, float]) -> Solids:
+    """12 x 8 m, with a wall that hides its far corner, a table, and boxes of 0.6 m."""
+    scenery = Scenery()
+    for center, size in (((6, 0), (12, 0.2)), ((6, 8), (12, 0.2)), ((0, 4), (0.2, 8)), ((12, 4), (0.2, 8))):
+        scenery.box(center, size, (0.0, 2.5))
+    scenery.box((8.5, 5.0), (7.0, 0.2), (0.0, 2.5))
+    scenery.box((2.0, 6.0), (1.2, 0.7), (0.0, 2.5))
+    for center in boxes:
+        scenery.box(center, (0.6, 0.6), (0.0, 2.5))
+    return scenery.finish()
+
+
+def hall() -> Solids:
+    """Another place: 20 x 4 m with three pillars."""
+    scenery = Scenery()
+    for center, size in (((6, 0), (20, 0.2)), ((6, 4), (20, 0.2)), ((-4, 2), (0.2, 4)), ((16, 2), (0.2, 4))):
+        scenery.box(center, size, (0.0, 2.5))
+    for x in (-1.0, 5.0, 12.5):
+        scenery.box((x, 2.8), (0.8, 0.8), (0.0, 2.5))
+    return scenery.finish()
+
+
+def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
+    """A map of views along the room, in the plane."""
+    angle = np.linspace(-np.pi, np.pi, 720, endpoint=False)
+    directions = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(720)])
+    T_map_room = lie.identity(2) if T_map_room is None else T_map_room
+    keyframes, poses = [], []
+    for k, x in enumerate(np.linspace(1.5, 10.0, count)):
+        lidar = np.eye(4)
+        lidar[:3, 3] = x, 1.5, 0.3
+        ranges_m = solids.cast(lidar[None], np.zeros(720, np.int32), directions, 30.0)
+        pose = T_map_room @ lie.pose_2d(float(x), 1.5, 0.0)
+        keyframes.append(Keyframe(k, k, k, Held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
+        poses.append(pose)
+    return Part(name, keyframes, np.array(poses))
+
+
+def _finite(keyframe: Keyframe) -> Keyframe:
+    points = keyframe.points
+    return replace(keyframe, stored=Held(points[np.isfinite(points).all(axis=1)]))
+
+
+def compared(before: Solids, after: Solids, **options) -> Changes:
+    return changes_between(part("a", before), part("b", after), load_settings(2).config, **options)
+
+
+def saved(folder: Path, *parts: Part) -> Path:
+    """A map of one or several sessions, as a run leaves it."""
+    keyframes = [keyframe for each in parts for keyframe in each.keyframes]
+    poses = np.concatenate([each.poses for each in parts])
+    numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
+    sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
+    none = Edges(*(np.empty(shape) for shape in ((0, 3, 3), (0, 3, 3), (0, 3, 3), 0, 0)))
+    none = Edges(np.empty((0, 2), np.int64), none.measurements, none.information, np.empty(0, bool), none.weight)
+    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, none)
+    return folder
+
+
+def test_what_moved_vanished_where_it_was_and_appeared_where_it_is():
+    found = compared(room(BOX), room((3.0, 3.5)))
+    assert {(each.kind, *np.round(each.center)) for each in found.clusters} == {
+        ("vanished", 5.0, 3.0), ("appeared", 3.0, 3.0)
+    }  # fmt: skip
+    for cluster in found.clusters:
+        assert 0.55 < cluster.size_m[0] < 0.8
+        on = found.points[found.of_cluster == cluster.number]
+        assert len(on) == cluster.points
+        assert (found.labels[found.of_cluster == cluster.number] == Label[cluster.kind.upper()]).all()
+
+
+def test_nothing_is_named_where_nothing_changed():
+    found = compared(room(BOX), room(BOX))
+    assert found.clusters == ()
+    assert found.agreement == 1.0
+
+
+def test_what_the_other_map_did_not_see_is_unknown():
+    before, after = part("a", room(BOX)), part("b", room(), count=3)
+    hidden = Keyframe(8, 8, 8, Held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), before.poses[0], 20.0)
+    there = lie.pose_2d(*HIDDEN, 0.0)
+    seen_once = Part("a", [*before.keyframes, hidden], np.concatenate([before.poses, there[None]]))
+    found = changes_between(seen_once, after, load_settings(2).config)
+    near = np.linalg.norm(found.points - HIDDEN, axis=1) < 0.5
+    assert near.sum() > 30
+    assert (found.labels[near] == Label.UNKNOWN).all()
+    assert [each.kind for each in found.clusters] == ["vanished"]
+
+
+def test_what_is_smaller_than_asked_for_is_unknown():
+    found = compared(room(BOX), room(), min_size_m=2.0)
+    assert found.clusters == ()
+    assert not (found.labels == Label.VANISHED).any()
+
+
+def test_maps_in_different_frames_are_refused():
+    other = part("b", room(), lie.pose_2d(1.0, 0.7, 0.4))
+    with pytest.raises(InputError, match="not in one frame"):
+        changes_between(part("a", room()), other, load_settings(2).config)
+
+
+def test_the_command_writes_labels_a_table_and_pictures(tmp_path, capsys):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room((3.0, 3.5))))
+    assert main(["changes", str(a), str(b), "--aligned", "--out", str(tmp_path / "ab")]) == 0
+    assert "1 cluster" in capsys.readouterr().out
+    names = {path.name for path in (tmp_path / "ab").iterdir()}
+    assert names == {
+        "changes.ply", "changes.csv", "changes.parquet", "summary.txt", "metrics.json", "report.html",
+        "recording.rrd", "run.json",
+    }  # fmt: skip
+    cloud = read_ply(tmp_path / "ab" / "changes.ply")
+    assert set(cloud["label"]) >= {Label.SAME, Label.APPEARED, Label.VANISHED}
+    with (tmp_path / "ab" / "changes.csv").open() as file:
+        assert [row["kind"] for row in csv.DictReader(file)] == sorted(("appeared", "vanished"), reverse=True)
+
+
+def test_a_given_transform_brings_the_later_map_into_the_frame_of_the_earlier(tmp_path):
+    T = lie.pose_2d(2.0, -1.0, np.pi / 2)
+    a = saved(tmp_path / "a", part("a", room(BOX)))
+    b = saved(tmp_path / "b", part("b", room(), lie.inverse(T)))
+    found = scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=T, recording=False)
+    assert [each.kind for each in found.clusters] == ["vanished"]
+    assert main(["changes", str(a), str(b), "--transform", "2,-1,90", "--out", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "changes.csv").read_bytes() == (tmp_path / "ab" / "changes.csv").read_bytes()
+
+
+def test_the_newest_session_of_a_merged_map_is_compared_with_those_before(tmp_path):
+    merged = saved(tmp_path / "m", part("monday", room(BOX)), part("friday", room()))
+    found = scanchain.changes(merged, None, tmp_path / "out", recording=False)
+    assert found.names == ("monday", "friday")
+    assert [each.kind for each in found.clusters] == ["vanished"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["A"], "has one session"),
+        (["A", "B"], "is not found in"),
+        (["A", "B", "--transform", "1,2"], "give X,Y,YAW"),
+        (["A", "B", "--transform", "1,2,0", "--aligned"], "give one of them"),
+        (["A", "none"], "holds no map"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys, words, message):
+    saved(tmp_path / "A", part("a", room(BOX), count=3))
+    saved(tmp_path / "B", part("b", hall(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
+    words = [str(tmp_path / word) if word in ("A", "B", "none") else word for word in words]
+    assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["A", "B"]
+
+
+def test_maps_stay_as_they_were(tmp_path):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
+    before = {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
+    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
+    assert before == {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
+    assert open_saved_map(a).sessions[0].name == "a"

@@ -1,0 +1,247 @@
+"""Sessions of one place, each with a start of its own, become one map in one frame; strangers stay apart."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import scanchain as sc
+from scanchain import lie
+from scanchain.data import Keyframe, Trajectory
+from scanchain.errors import InputError, ScanchainError
+from scanchain.evaluation import absolute_error, pair
+from scanchain.maps import Edges, open_saved_map
+from scanchain.runs.job import Unwatched
+from scanchain.sessions.joining import Joined, contradiction, graph_of
+from scanchain.sessions.merging import MergeJob, merge
+from scanchain.trajectory import read_tum
+
+PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}
+FILES = ("map/points.i16", "map/edges.npz", "map/keyframes.npz", "map.ply", "map.pgm", "evening.tum", "graph.g2o")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Three sessions in an office and one elsewhere, and the truth."""
+    folder = tmp_path_factory.mktemp("sessions")
+    truth = sc.simulate("office", folder / "office.mcap", seed=2, duration_s=34.0)
+    for name, (start_s, end_s) in PARTS.items():
+        sc.run(folder / "office.mcap", folder / name, recording=False, log__start_s=start_s, log__end_s=end_s)
+    sc.simulate("identical", folder / "other.mcap", duration_s=12.0)
+    sc.run(folder / "other.mcap", folder / "stranger", recording=False)
+    return folder, truth
+
+
+@pytest.fixture(scope="module")
+def merged(runs, tmp_path_factory):
+    folder, _ = runs
+    out = tmp_path_factory.mktemp("merged") / "all"
+    return sc.merge([folder / name for name in (*PARTS, "stranger")], out)
+
+
+def quietly(*runs, out, **options):
+    return merge(MergeJob(tuple(runs), out, **options), Unwatched(), lambda folder: None)
+
+
+def ate_m(out, truth, names):
+    """ATE over the scans of all sessions, rigidly aligned as one."""
+    parts = [read_tum(out / f"{name}.tum") for name in names]
+    stamps_ns, poses = np.concatenate([part.stamps_ns for part in parts]), np.concatenate([p.poses for p in parts])
+    true = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
+    return absolute_error(pair(Trajectory(stamps_ns, poses), true)).translation_m.rmse
+
+
+def test_sessions_with_unknown_starts_become_one_certified_map(runs, merged):
+    folder, truth = runs
+    saved = open_saved_map(merged.path)
+    assert [session.name for session in saved.sessions] == list(PARTS)
+    assert len(saved.keyframes) == sum(len(open_saved_map(folder / name).keyframes) for name in PARTS)
+    assert ate_m(merged.path, truth, PARTS) < 0.02
+    assert merged.metrics.certified
+    assert all(session.closures > 0 for session in merged.metrics.sessions)
+    traveled_m = [keyframe.traveled_m for keyframe in saved.keyframes]
+    assert (np.diff(traveled_m) >= 0.0).all()
+
+
+def test_every_scan_of_a_session_keeps_its_motion_to_the_next(runs, merged):
+    folder, _ = runs
+    for name in PARTS:
+        before, after = read_tum(folder / name / "trajectory.tum"), read_tum(merged.path / f"{name}.tum")
+        assert np.array_equal(before.stamps_ns, after.stamps_ns)
+        moves = [lie.between(each.poses[:-1], each.poses[1:]) for each in (before, after)]
+        assert np.abs(moves[0] - moves[1]).max() < 0.02
+
+
+def test_a_session_of_another_place_stays_apart_and_is_named(merged):
+    assert merged.metrics.apart == (("stranger",),)
+    assert any("stranger" in line and "not in this map" in line for line in merged.warnings)
+    assert "stranger" in merged.summary
+    assert not (merged.path / "stranger.tum").exists()
+    assert "not in this map" in (merged.path / "report.html").read_text()
+
+
+def test_a_merge_leaves_what_a_run_leaves(merged):
+    names = {path.name for path in merged.path.iterdir()}
+    assert names >= {
+        "map",
+        "map.ply",
+        "map.pgm",
+        "map.yaml",
+        "summary.txt",
+        "metrics.json",
+        "run.json",
+        "config.toml",
+    }
+    assert names >= {
+        "report.html",
+        "recording.rrd",
+        "loops.parquet",
+        "graph.g2o",
+        *(f"{name}.tum" for name in PARTS),
+    }
+    assert json.loads((merged.path / "run.json").read_text())["complete"]
+
+
+def test_the_first_run_keeps_its_frame_and_the_order_of_the_others_does_not_matter(runs, merged, tmp_path):
+    folder, _ = runs
+    names = ("morning", "stranger", "evening", "noon")
+    other = quietly(*(folder / name for name in names), out=tmp_path / "other")
+    for file in FILES:
+        assert (other.path / file).read_bytes() == (merged.path / file).read_bytes(), file
+    first = read_tum(folder / "morning" / "trajectory.tum").poses[0]
+    assert np.abs(read_tum(merged.path / "morning.tum").poses[0] - first).max() < 1e-8
+    third = quietly(*(folder / name for name in reversed(names)), out=tmp_path / "third")
+    between = [
+        lie.between(*(read_tum(out.path / f"{name}.tum").poses[7] for name in ("noon", "evening")))
+        for out in (merged, third)
+    ]
+    assert np.abs(between[0] - between[1]).max() < 1e-8
+
+
+def test_fixed_leaves_the_poses_of_the_first_run_to_the_bit_and_is_certified(runs, tmp_path):
+    folder, truth = runs
+    out = quietly(folder / "noon", folder / "morning", out=tmp_path / "fixed", fixed=True)
+    saved, before = open_saved_map(out.path), open_saved_map(folder / "noon")
+    number = [session.name for session in saved.sessions].index("noon")
+    assert np.array_equal(saved.poses[saved.session == number], before.poses)
+    written, given = read_tum(out.path / "noon.tum"), read_tum(folder / "noon" / "trajectory.tum")
+    assert np.abs(written.poses - given.poses).max() < 1e-8
+    assert out.metrics.certified
+    assert ate_m(out.path, truth, ("noon", "morning")) < 0.02
+
+
+def test_a_merged_map_is_merged_further(runs, tmp_path):
+    folder, truth = runs
+    two = quietly(folder / "morning", folder / "noon", out=tmp_path / "two")
+    three = quietly(two.path, folder / "evening", out=tmp_path / "three")
+    saved = open_saved_map(three.path)
+    assert {session.name for session in saved.sessions} == set(PARTS)
+    assert set(np.unique(saved.session)) == {0, 1, 2}
+    assert ate_m(three.path, truth, PARTS) < 0.02
+
+
+def test_runs_of_equal_names_get_names_that_differ(runs, tmp_path):
+    folder, _ = runs
+    shutil.copytree(folder / "morning", tmp_path / "noon")
+    out = quietly(folder / "noon", tmp_path / "noon", out=tmp_path / "out")
+    assert sorted(session.name for session in out.metrics.sessions) == ["noon", "noon-2"]
+
+
+def test_nothing_that_belongs_together_is_an_error_of_one_line_and_leaves_nothing(runs, call, tmp_path):
+    folder, _ = runs
+    code, output, said = call("merge", folder / "noon", folder / "stranger", "--out", tmp_path / "out")
+    assert (code, output) == (1, "")
+    assert "error: no two of the maps belong together" in said
+    with pytest.raises(ScanchainError, match=r"nothing belongs to .*noon"):
+        quietly(folder / "noon", folder / "stranger", out=tmp_path / "out", fixed=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_merge_that_is_killed_leaves_the_runs_as_they_were_and_nothing_else(runs, tmp_path):
+    folder, _ = runs
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    def interrupted(directory):
+        raise KeyboardInterrupt
+
+    job = MergeJob((folder / "morning", folder / "noon"), tmp_path / "out")
+    with pytest.raises(KeyboardInterrupt):
+        merge(job, Unwatched(), interrupted)
+    assert not list(tmp_path.iterdir())
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("damage", ["missing", "version", "points", "index"])
+def test_a_damaged_map_is_refused_by_name_before_anything_is_made(runs, tmp_path, damage):
+    folder, _ = runs
+    shutil.copytree(folder / "noon", tmp_path / "copy")
+    index, points = tmp_path / "copy" / "map" / "map.json", tmp_path / "copy" / "map" / "points.i16"
+    match damage:
+        case "missing":
+            shutil.rmtree(tmp_path / "copy" / "map")
+        case "version":
+            index.write_text(index.read_text().replace('"version": 1', '"version": 99'))
+        case "points":
+            points.write_bytes(points.read_bytes()[:-2])
+        case "index":
+            index.write_text("{")
+    with pytest.raises(InputError, match="copy") as caught:
+        quietly(folder / "morning", tmp_path / "copy", out=tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, tmp_path):
+    folder, _ = runs
+    noon, out = folder / "noon", tmp_path / "out"
+    for runs_, options, message in (
+        ((noon,), {}, "two run directories or more"),
+        ((noon, noon), {}, "holds a session"),
+        ((merged.path, noon), {}, "holds a session"),
+        ((noon, folder / "morning"), {"out": noon, "force": True}, "is one of the runs"),
+    ):
+        with pytest.raises(InputError, match=message):
+            quietly(*runs_, **({"out": out} | options))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
+    rng = np.random.default_rng(3)
+    k = 3 if dimension == 2 else 6
+    poses = lie.exp(rng.normal(0.0, 1.0, (7, k)))
+    pairs = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 1), (2, 5), (0, 6)])
+    measured = lie.between(poses[pairs[:, 0]], poses[pairs[:, 1]]) @ lie.exp(rng.normal(0.0, 0.1, (9, k)))
+    roots = rng.normal(0.0, 1.0, (9, k, k))
+    information = roots @ np.swapaxes(roots, 1, 2) + np.eye(k)
+    edges = Edges(pairs, measured, information, np.zeros(9, np.bool_), np.ones(9))
+    joined = _joined(poses, edges)
+    held, whole = graph_of(joined, held=0), graph_of(joined)
+    assert len(held) == 5
+    inside = (pairs < 3).all(axis=1)
+    assert np.allclose(held.state().edge_chi2, whole.state().edge_chi2[~inside], rtol=1e-9)
+
+
+def _joined(poses, edges):
+    keyframes = tuple(Keyframe(i, i, i, None, pose, float(i)) for i, pose in enumerate(poses))
+    return Joined((0, 1), keyframes, np.array([0, 0, 0, 1, 1, 1, 1]), edges)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_free_space_tells_a_map_that_lies_where_the_other_saw_through(dimension):
+    room, behind = _room(dimension, 4.0), _room(dimension, 9.0)
+    assert contradiction([room], [room]) == 0.0
+    assert contradiction([room], [behind]) > 0.3
+
+
+def _room(dimension, half_m):
+    """A keyframe in the middle of a square room, or of a cube."""
+    rays = np.random.default_rng(1).normal(size=(60_000, dimension))
+    points = half_m * rays / np.abs(rays).max(axis=1, keepdims=True)
+
+    class Points:
+        def read(self):
+            return points
+
+    return Keyframe(0, 0, 0, Points(), lie.identity(dimension), 0.0)

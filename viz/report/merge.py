@@ -1,0 +1,116 @@
+"""report.html of a merge, made of the files in its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from scanchain.maps import read_ply
+from scanchain.runs.directory import RUN_FILE
+from scanchain.runs.provenance import Provenance
+from scanchain.sessions.merging import MergeMetrics
+from scanchain.viz.pictures.map_figures import surroundings
+from scanchain.viz.pictures.merge import DrawnMerge, picture, read_merge
+from scanchain.viz.pictures.trajectory_figures import PathLine
+from scanchain.viz.recording.shapes import in_space
+from scanchain.viz.report.page import (
+    REPORT_FILE,
+    Cell,
+    Chip,
+    Collapsible,
+    Drawing,
+    Grid,
+    Head,
+    Page,
+    Row,
+    Section,
+    write_page,
+)
+from scanchain.viz.report.sections import provenance_sections
+from scanchain.viz.report.trajectory_map import SCRIPT, map_scene
+from scanchain.words import counted
+
+_HEADS = (
+    Head("session"),
+    Head("from", "UTC", is_text=True),
+    Head("keyframes"),
+    Head("closures", "", "closures in force between this session and those of other maps"),
+)
+
+
+def write_merge_report(directory: Path) -> None:
+    """Draw and write the page of a merge."""
+    metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=MergeMetrics)
+    made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
+    summary = (directory / "summary.txt").read_text(encoding="utf-8")
+    drawn = read_merge(directory)
+    page = Page(
+        title="Merged map",
+        subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
+        facts=tuple(_facts(metrics)),
+        warnings=metrics.warnings,
+        notes=(),
+        sections=(_map_section(directory, drawn, metrics), _sessions(drawn, metrics)),
+        collapsibles=(
+            *provenance_sections(made, {}),
+            Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
+        ),
+        script=SCRIPT,
+    )
+    write_page(directory / REPORT_FILE, page)
+
+
+def _facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
+    yield "sessions", f"{len(m.sessions)} of {len(m.sessions) + sum(map(len, m.apart))}"
+    yield "keyframes", f"{m.keyframes:,}"
+    yield "closures", f"{m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force"
+    yield "pose graph", m.fit
+    yield "certificate", m.certificate
+    yield "map", counted(m.map_points, "point")
+    yield "time", f"{m.run_s:.1f} s"
+
+
+def _map_section(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
+    points = in_space(read_ply(directory / "map.ply")).astype(float)
+    low, high = surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
+    lines = [PathLine(each.positions, each.color, 1.4) for each in drawn.sessions]
+    is_flat = metrics.dimension == 2
+    drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
+    drawings = (
+        Drawing(
+            "Sessions over the map",
+            "Seen from above; thin lines: closures in force between sessions.",
+            picture("merge", drawn, points, low, high),
+        ),
+        Drawing(
+            "Interactive map",
+            f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
+            map_scene(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        ),
+    )
+    chips = tuple(Chip(each.name, each.color) for each in drawn.sessions)
+    return Section("Map", chips=chips, drawings=drawings)
+
+
+def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
+    rows = tuple(
+        Row(
+            each.name,
+            (Cell(_date(each.first_stamp_ns)), Cell(f"{each.keyframes:,}"), Cell(f"{each.closures:,}")),
+            chip=Chip(each.name, line.color),
+        )
+        for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
+    )
+    apart = tuple(
+        Row(name, (Cell("not in this map: too few closures agree", is_wide=True, is_bad=True),))
+        for group in metrics.apart
+        for name in group
+    )
+    return Section("Sessions", grid=Grid(_HEADS, rows + apart))
+
+
+def _date(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(sep=" ", timespec="seconds")[:19]
