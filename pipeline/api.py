@@ -97,12 +97,14 @@ def merge(
     *,
     config: str | Path | None = None,
     fixed: bool = False,
+    update: bool = False,
     force: bool = False,
     **overrides: object,
 ) -> Merged:
     """Merge the maps of run directories into one, as ``scanchain merge`` does; nothing is printed.
 
     runs : two or more; the map is in the frame of the first, whose poses stay as they are if ``fixed``
+    update : whether points that newer sessions saw through are removed from the keyframes of older ones
     Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
     are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
     """
@@ -115,6 +117,7 @@ def merge(
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
         fixed=checks.truth(fixed, "fixed"),
+        update=checks.truth(update, "update"),
         force=force,
     )
     return merge_maps(job, Unwatched(), present_merge)

@@ -15,6 +15,7 @@ from scanchain.commands.options import OverrideCommand, overrides
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to create.")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
+@click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
 @click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run or merge.")
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context
@@ -24,6 +25,7 @@ def merge(
     out: Path,
     config: Path | None,
     fixed: bool,
+    update: bool,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -33,12 +35,13 @@ def merge(
     between the runs, and the graph of all of them is optimized and certified. The map is in the frame of the first
     RUN; the order of the others does not matter. Runs that too few closures join to the others are named and stay
     apart; where no two belong together, the exit code is 1. DIR is a map like any other: it can be merged further.
+    With --update it follows its newest session: what is gone is removed from the keyframes of older ones.
 
     \b
     Examples:
       scanchain merge runs/monday runs/tuesday --out runs/both
       scanchain merge runs/survey runs/today --fixed --out runs/extended
-      scanchain merge runs/both runs/wednesday --out runs/week --json
+      scanchain merge runs/both runs/wednesday --update --out runs/week --json
     """
     from scanchain.api import present_merge
     from scanchain.commands.terminal import Terminal
@@ -51,6 +54,7 @@ def merge(
         config_file=config,
         overrides=overrides(ctx),
         fixed=fixed,
+        update=update,
         force=force,
         command=tuple(sys.argv),
     )

@@ -1,8 +1,8 @@
 """A map to localize in and to merge: keyframes with their final poses, and the edges between them, in a folder.
 
     map.json       version, dimension, number of keyframes and points, the sessions it was made of
-    keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, first, count
-                   and step_m (K,)
+    keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, first,
+                   count, step_m and last_seen_ns (K,)
     edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
     points.i16     int16 (N, d), little-endian: of a keyframe the rows first to first + count, times its step_m
 
@@ -118,6 +118,7 @@ class SavedMap:
     session : (K,) number of the session that each keyframe comes from
     sessions : in the order they joined
     edges : in force between the keyframes
+    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each, its own at least
     """
 
     folder: Path
@@ -126,6 +127,7 @@ class SavedMap:
     session: NDArray[np.int64]
     sessions: tuple[Session, ...]
     edges: Edges
+    last_seen_ns: NDArray[np.int64]
 
     @property
     def poses(self) -> Matrix:
@@ -145,10 +147,12 @@ def write_saved_map(
     session: NDArray[np.int64],
     sessions: Sequence[Session],
     edges: Edges,
+    last_seen_ns: NDArray[np.int64] | None = None,
 ) -> None:
     """Write a map of keyframes at these poses (K, d+1, d+1) into a new folder; map.json comes last.
 
     session : (K,) number of each keyframe's session
+    last_seen_ns : (K,) as in ``SavedMap``; the keyframes' own stamps where left out
     """
     folder.mkdir(parents=True)
     steps_m, counts = [], []
@@ -160,6 +164,7 @@ def write_saved_map(
             steps_m.append(step_m)
             counts.append(len(points))
     count = np.array(counts, np.int64)
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     np.savez(
         folder / _KEYFRAMES,
         poses=poses,
@@ -167,7 +172,8 @@ def write_saved_map(
         first=np.cumsum(count) - count,
         count=count,
         step_m=np.array(steps_m),
-        stamps_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64),
+        stamps_ns=stamps_ns,
+        last_seen_ns=stamps_ns if last_seen_ns is None else last_seen_ns,
         scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
         traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
         scale=np.array([keyframe.scale for keyframe in keyframes]),
@@ -194,14 +200,14 @@ def open_saved_map(path: Path) -> SavedMap:
     try:
         keyframes = _keyframes(rows, _points(folder / _POINTS, index))
         edges = Edges(**_arrays(folder / _EDGES))
-        session = rows["session"]
-        if len(keyframes) != index.keyframes or len(session) != index.keyframes:
+        session, last_seen_ns = rows["session"], rows.get("last_seen_ns", rows["stamps_ns"])
+        if any(len(each) != index.keyframes for each in (keyframes, session, last_seen_ns)):
             raise ValueError(f"{len(keyframes)} keyframes of {index.keyframes}")
         if edges.pairs.max(initial=-1) >= len(keyframes):
             raise ValueError("edges of keyframes that are not there")
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise _damaged(folder, error) from error
-    return SavedMap(folder, index.dimension, keyframes, session, index.sessions, edges)
+    return SavedMap(folder, index.dimension, keyframes, session, index.sessions, edges, last_seen_ns)
 
 
 def _keyframes(rows: dict[str, Any], points: NDArray[np.int16]) -> tuple[Keyframe, ...]:

@@ -22,6 +22,7 @@ from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
 from scanchain.runs.directory import directory_name
 from scanchain.runs.results import GRAPH_FILE, Cloud, cloud_of, grid_of
 from scanchain.sessions.joining import Joined, graph_of
+from scanchain.sessions.updating import updated
 from scanchain.trajectory import read_tum, write_tum
 
 
@@ -37,6 +38,9 @@ class MergedMap:
     session : (K,) number of each keyframe's session
     trajectories : of the sessions; of all scans where a run has them, else of the keyframes
     cloud : the point cloud of all keyframes
+    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each
+    removed : (K,) number of each keyframe's points that newer sessions saw through, where the map was updated
+    warnings : of the update
     """
 
     joined: Joined
@@ -45,6 +49,9 @@ class MergedMap:
     session: NDArray[np.int64]
     trajectories: tuple[Trajectory, ...]
     cloud: Cloud
+    last_seen_ns: NDArray[np.int64]
+    removed: NDArray[np.int64]
+    warnings: tuple[str, ...] = ()
 
     @property
     def keyframes(self) -> tuple[Keyframe, ...]:
@@ -85,10 +92,12 @@ def merged_map(
     *,
     first: int,
     held: int,
+    update: bool = False,
 ) -> MergedMap:
     """The map of joined maps, in the frame of the map ``first``: its first keyframe stays where it was.
 
     names : of the sessions, by map and number; held : map whose poses stay as they are, or −1
+    update : whether points that newer sessions saw through are removed
     """
     poses = _refined(joined, config, held)
     if held < 0:
@@ -105,8 +114,17 @@ def merged_map(
         session[of_session] = new
         sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
         trajectories.append(_trajectory(maps[number], index, poses[of_session]))
+    last_seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
+    removed, warnings = np.zeros(len(poses), np.int64), ()
+    if update:
+        new = updated(joined.keyframes, poses, session, sessions, config)
+        joined = replace(joined, keyframes=new.keyframes)
+        last_seen_ns = np.maximum(last_seen_ns, new.last_seen_ns)
+        removed, warnings = new.removed, new.warnings
     cloud = cloud_of(_Posed(joined.keyframes, poses), config)
-    return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), cloud)
+    return MergedMap(
+        joined, poses, tuple(sessions), session, tuple(trajectories), cloud, last_seen_ns, removed, warnings
+    )
 
 
 def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
@@ -121,7 +139,15 @@ def write_merged(folder: Path, merged: MergedMap, final: Sequence[FinalClosure],
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
     edges, poses = merged.joined.edges, merged.T_world_keyframes
     in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
-    write_saved_map(folder / MAP_FOLDER, merged.keyframes, poses, merged.session, merged.sessions, in_force)
+    write_saved_map(
+        folder / MAP_FOLDER,
+        merged.keyframes,
+        poses,
+        merged.session,
+        merged.sessions,
+        in_force,
+        merged.last_seen_ns,
+    )
     for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
         write_tum(folder / f"{session.name}.tum", trajectory)
     write_ply(folder / "map.ply", merged.cloud.points)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -13,7 +14,7 @@ from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, Verdict
 from scanchain.errors import InputError, ScanchainError
 from scanchain.graph.optimization import fit
-from scanchain.maps import SavedMap, open_saved_map
+from scanchain.maps import SavedMap, Session, open_saved_map
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
@@ -35,6 +36,7 @@ class MergeJob:
     out : the directory to create
     config_file : on top of the preset; overrides : on top of both
     fixed : whether the keyframes of the first run stay where they are, to the bit
+    update : whether points that newer sessions saw through are removed from the keyframes of older ones
     force : whether a directory of that name is replaced
     command : the command line, for run.json
     """
@@ -44,18 +46,26 @@ class MergeJob:
     config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
     fixed: bool = False
+    update: bool = False
     force: bool = False
     command: tuple[str, ...] = ()
 
 
 class SessionMetrics(msgspec.Struct, frozen=True):
-    """A session of the merged map: its keyframes, and the closures in force between it and other maps."""
+    """A session of the merged map.
+
+    Attributes
+    ----------
+    closures : in force between it and other maps
+    removed_points : of its keyframes, that newer sessions saw through; 0 where the map was not updated
+    """
 
     name: str
     first_stamp_ns: int
     last_stamp_ns: int
     keyframes: int
     closures: int
+    removed_points: int = 0
 
 
 class MergeMetrics(msgspec.Struct, frozen=True):
@@ -68,6 +78,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     closures_tried, closures_in_force : between maps
     chi2, degrees_of_freedom, certified, certificate : of the pose graph
     map_points, moving_points_removed : of map.ply
+    updated : whether the map follows its newest session
     run_s : wall time, without compilation
     """
 
@@ -87,6 +98,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     run_s: float
     compile_s: float
     warnings: tuple[str, ...]
+    updated: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +130,14 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
         joined = _chosen(groups, held, [saved.folder.parent for saved in maps])
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
         first = min(joined.maps)
-        merged = merged_map(joined, maps, names, config, first=first, held=held)
+        merged = merged_map(joined, maps, names, config, first=first, held=held, update=job.update)
         final = final_closures(merged)
         write_merged(directory.path, merged, final, config)
         apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
-        warnings = tuple(_apart_text(each) for each in apart)
+        warnings = (*(_apart_text(each) for each in apart), *merged.warnings)
         compile_s = compiled_s() - compiled_before_s
         run_s = working_s() - started
-        metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings)
+        metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings, updated=job.update)
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
         text = _summary(metrics, names[first, 0], settings.source, fixed=job.fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
@@ -160,7 +172,18 @@ def _opened(job: MergeJob) -> list[SavedMap]:
             if key in holders:
                 raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
             holders[key] = run
+    if job.update:
+        _check_order([session for saved in maps for session in saved.sessions])
     return maps
+
+
+def _check_order(sessions: Sequence[Session]) -> None:
+    """Raise InputError where it is not known which of two sessions is the newer one."""
+    for before, after in pairwise(sorted(sessions, key=lambda session: session.first_stamp_ns)):
+        if before.first_stamp_ns == after.first_stamp_ns:
+            raise InputError(
+                f"{before.name}, {after.name}: begin at the same time, none is newer; leave out --update"
+            )
 
 
 def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
@@ -207,6 +230,8 @@ def _measured(
     run_s: float,
     compile_s: float,
     warnings: tuple[str, ...],
+    *,
+    updated: bool,
 ) -> MergeMetrics:
     graph = graph_of(merged.joined, held)
     state = graph.optimize(config.graph, initialize="given", rejection="refined").state
@@ -223,6 +248,7 @@ def _measured(
                 each.last_stamp_ns,
                 int((merged.session == number).sum()),
                 int((ends == number).any(axis=1).sum()),
+                int(merged.removed[merged.session == number].sum()),
             )
             for number, each in enumerate(merged.sessions)
         ),
@@ -237,9 +263,10 @@ def _measured(
         certificate=certificate.verdict,
         map_points=len(merged.cloud.points),
         moving_points_removed=merged.cloud.removed,
-        run_s=run_s - compile_s,
+        run_s=run_s,
         compile_s=compile_s,
         warnings=warnings,
+        updated=updated,
     )
 
 
@@ -252,9 +279,11 @@ def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) ->
         *(
             f"session        {each.name:<{width}}  {counted(each.keyframes, 'keyframe')}, "
             f"{counted(each.closures, 'closure')} to other sessions"
+            + (f", {counted(each.removed_points, 'point')} removed as gone" if m.updated else "")
             for each in m.sessions
         ),
-        *(f"apart          {warning}" for warning in m.warnings),
+        *(f"apart          {warning}" for warning in m.warnings[: len(m.apart)]),
+        *(f"update         {warning}" for warning in m.warnings[len(m.apart) :]),
         f"configuration  {configuration}",
         f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
         f"pose graph     {m.fit}",

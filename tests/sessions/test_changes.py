@@ -13,6 +13,7 @@ from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import read_ply
 from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
+from scanchain.sessions.updating import updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
 
@@ -185,3 +186,55 @@ def test_maps_stay_as_they_were(tmp_path):
     scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
     assert before == {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
     assert open_saved_map(a).sessions[0].name == "a"
+
+
+def updated_rooms(*parts: Part):
+    """Sessions of 8 keyframes each, brought up to date."""
+    keyframes = [
+        replace(keyframe, stamp_ns=start + k)
+        for start, each in zip((0, 100, 200), parts, strict=False)
+        for k, keyframe in enumerate(each.keyframes)
+    ]
+    numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
+    sessions = [Session(each.name, start, start + 9, 8) for start, each in zip((0, 100, 200), parts, strict=False)]
+    poses = np.concatenate([each.poses for each in parts])
+    return keyframes, updated(keyframes, poses, numbers, sessions, load_settings(2).config)
+
+
+def in_world(keyframe: Keyframe) -> np.ndarray:
+    return lie.transform(keyframe.T_odom_lidar, keyframe.points)
+
+
+def on_box(points: np.ndarray) -> np.ndarray:
+    return (np.abs(points - BOX) < 0.32).all(axis=1)
+
+
+def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_else():
+    before, after = updated_rooms(part("monday", room(BOX)), part("tuesday", room(BOX)), part("friday", room()))
+    for k, (old, new) in enumerate(zip(before, after.keyframes, strict=True)):
+        is_box = on_box(in_world(old)) & (k < 16)
+        assert np.array_equal(new.points, old.points[~is_box])
+        assert after.removed[k] == is_box.sum()
+    assert after.removed[:8].sum() > 100
+    assert after.warnings == ()
+
+
+def test_what_came_stays_and_what_no_newer_session_saw_stays():
+    _, after = updated_rooms(part("monday", room((8.0, 3.0))), part("friday", room(BOX, (8.0, 3.0))))
+    assert after.removed.sum() == 0
+    corner = Keyframe(0, 0, 5, Held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), lie.identity(2), 0.0)
+    hidden = part("monday", room(BOX))
+    there = Part("monday", [*hidden.keyframes, replace(corner, T_odom_lidar=lie.pose_2d(*HIDDEN, 0.0))],
+                 np.concatenate([hidden.poses, lie.pose_2d(*HIDDEN, 0.0)[None]]))  # fmt: skip
+    before, after = updated_rooms(there, part("friday", room()))
+    assert after.removed[8] == 0
+    assert len(after.keyframes[8].points) == 200
+    assert after.last_seen_ns[8] == before[8].stamp_ns == 8
+    assert (after.last_seen_ns[:8] >= 100).all()
+    assert (after.last_seen_ns >= [keyframe.stamp_ns for keyframe in before]).all()
+
+
+def test_a_session_that_shares_no_view_removes_nothing_and_is_named():
+    _, after = updated_rooms(part("monday", room(BOX)), part("friday", hall(), lie.pose_2d(70.0, 0.0, 1.0)))
+    assert after.removed.sum() == 0
+    assert [warning.partition(":")[0] for warning in after.warnings] == ["friday"]

@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.data import Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
-from scanchain.maps import Edges, open_saved_map
+from scanchain.maps import Edges, open_saved_map, read_ply
 from scanchain.runs.job import Unwatched
 from scanchain.sessions.joining import Joined, contradiction, graph_of
 from scanchain.sessions.merging import MergeJob, merge
@@ -194,16 +194,103 @@ def test_a_damaged_map_is_refused_by_name_before_anything_is_made(runs, tmp_path
 
 def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, tmp_path):
     folder, _ = runs
-    noon, out = folder / "noon", tmp_path / "out"
+    noon, out, noon_again = folder / "noon", tmp_path / "out", tmp_path / "again"
+    shutil.copytree(noon, noon_again)
+    index = noon_again / "map" / "map.json"
+    last_ns = open_saved_map(noon).sessions[0].last_stamp_ns
+    index.write_text(index.read_text().replace(str(last_ns), str(last_ns + 1)))
     for runs_, options, message in (
         ((noon,), {}, "two run directories or more"),
         ((noon, noon), {}, "holds a session"),
         ((merged.path, noon), {}, "holds a session"),
+        ((noon, noon_again), {"update": True}, "begin at the same time"),
         ((noon, folder / "morning"), {"out": noon, "force": True}, "is one of the runs"),
     ):
         with pytest.raises(InputError, match=message):
             quietly(*runs_, **({"out": out} | options))
     assert not out.exists()
+
+
+@pytest.fixture(scope="module")
+def updates(runs, tmp_path_factory):
+    """A session of another day, merged with one before it without and with ``update``."""
+    folder, _ = runs
+    out = tmp_path_factory.mktemp("updates")
+    sc.simulate("office", out / "later.mcap", seed=2, duration_s=34.0, changed=1)
+    sc.run(out / "later.mcap", out / "later", recording=False, log__start_s=6.0, log__end_s=24.0)
+    sc.merge([folder / "morning", out / "later"], out / "plain")
+    return out, sc.merge([folder / "morning", out / "later"], out / "updated", update=True)
+
+
+def test_an_updated_map_loses_what_the_newest_session_saw_through_and_nothing_else(updates):
+    folder, merged = updates
+    plain, new = open_saved_map(folder / "plain"), open_saved_map(merged.path)
+    assert np.array_equal(plain.poses, new.poses)
+    found = sc.changes(folder / "plain", None, folder / "found", recording=False)
+    removed = 0
+    for k, (before, after) in enumerate(zip(plain.keyframes, new.keyframes, strict=True)):
+        points = lie.transform(plain.poses[k], before.points)
+        remaining = {tuple(row) for row in np.rint(after.points / 0.001).astype(int).tolist()}
+        is_gone = np.array(
+            [tuple(row) not in remaining for row in np.rint(before.points / 0.001).astype(int).tolist()]
+        )
+        assert len(after.points) == len(before.points) - is_gone.sum()
+        for cluster in found.clusters:
+            if cluster.kind == "vanished":
+                on = found.points[found.of_cluster == cluster.number]
+                is_near = np.linalg.norm(points[:, None] - on, axis=2).min(axis=1) < 0.15
+                is_gone &= ~is_near
+                removed += is_near.sum()
+        assert not is_gone.any()
+    assert removed > 0
+    again = sc.changes(merged.path, None, folder / "again", recording=False)
+    kinds = [[cluster.kind for cluster in each.clusters] for each in (found, again)]
+    assert "vanished" not in kinds[1]
+    assert kinds[0].count("vanished") >= 3
+    assert kinds[0].count("appeared") == kinds[1].count("appeared")
+    assert len(read_ply(merged.path / "map.ply")) < len(read_ply(folder / "plain" / "map.ply"))
+
+
+def test_an_update_says_of_which_session_how_many_points_went_and_when_places_were_last_seen(updates):
+    folder, merged = updates
+    plain, new = open_saved_map(folder / "plain"), open_saved_map(merged.path)
+    lost = [sum(len(k.points) for k in m.keyframes) for m in (plain, new)]
+    sessions = {session.name: session.removed_points for session in merged.metrics.sessions}
+    assert sessions == {"morning": lost[0] - lost[1], "later": 0}
+    assert f"{sessions['morning']:,} points removed as gone" in merged.summary
+    assert f"{sessions['morning']:,}" in (merged.path / "report.html").read_text()
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in new.keyframes])
+    assert np.array_equal(plain.last_seen_ns, stamps_ns)
+    assert (new.last_seen_ns >= stamps_ns).all()
+    later = new.sessions[1]
+    assert (new.last_seen_ns[new.session == 0] > later.first_stamp_ns).mean() > 0.9
+    assert new.last_seen_ns.max() <= later.last_stamp_ns
+
+
+def test_an_updated_map_is_localized_in_and_merged_further_with_its_dates(runs, updates, tmp_path):
+    folder, _ = runs
+    out, merged = updates
+    log, options = out / "later.mcap", {"recording": False, "log__end_s": 16.0}
+    found = sc.localize(log, merged.path, tmp_path / "found", **options)
+    assert found.metrics.placed == found.metrics.scans > 50
+    three = quietly(merged.path, folder / "evening", out=tmp_path / "three", fixed=True)
+    before, after = open_saved_map(merged.path), open_saved_map(three.path)
+    kept = np.isin(after.session, [k for k, each in enumerate(after.sessions) if each.name != "evening"])
+    assert np.array_equal(after.last_seen_ns[kept], before.last_seen_ns)
+    assert [len(k.points) for k in np.array(after.keyframes)[kept]] == [len(k.points) for k in before.keyframes]
+    updated = quietly(merged.path, folder / "evening", out=tmp_path / "updated", fixed=True, update=True)
+    again = open_saved_map(updated.path)
+    assert np.array_equal(again.poses[kept], before.poses)
+    assert (again.last_seen_ns[kept] >= before.last_seen_ns).all()
+
+
+def test_a_map_without_dates_of_last_sight_opens_with_those_of_its_keyframes(runs, tmp_path):
+    folder, _ = runs
+    shutil.copytree(folder / "noon" / "map", tmp_path / "map")
+    with np.load(tmp_path / "map" / "keyframes.npz") as file:
+        rows = {name: file[name] for name in file.files if name != "last_seen_ns"}
+    np.savez(tmp_path / "map" / "keyframes.npz", **rows)
+    assert np.array_equal(open_saved_map(tmp_path).last_seen_ns, rows["stamps_ns"])
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

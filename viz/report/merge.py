@@ -39,6 +39,7 @@ _HEADS = (
     Head("keyframes"),
     Head("closures", "", "closures in force between this session and those of other maps"),
 )
+_GONE = Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
 
 
 def write_merge_report(directory: Path) -> None:
@@ -99,7 +100,12 @@ def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
     rows = tuple(
         Row(
             each.name,
-            (Cell(_date(each.first_stamp_ns)), Cell(f"{each.keyframes:,}"), Cell(f"{each.closures:,}")),
+            (
+                Cell(_date(each.first_stamp_ns)),
+                Cell(f"{each.keyframes:,}"),
+                Cell(f"{each.closures:,}"),
+                *([Cell(f"{each.removed_points:,}")] if metrics.updated else []),
+            ),
             chip=Chip(each.name, line.color),
         )
         for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
@@ -109,7 +115,7 @@ def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
         for group in metrics.apart
         for name in group
     )
-    return Section("Sessions", grid=Grid(_HEADS, rows + apart))
+    return Section("Sessions", grid=Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows + apart))
 
 
 def _date(stamp_ns: int) -> str:
