@@ -28,7 +28,7 @@ from tests.support.recordings import EVERY_SCAN, FOR_EVER, column, rows_of, stat
 from tests.support.scenes import ROOT, configured, shared_data
 
 FILES = {
-    "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
+    "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map", "map.ply", "map.pgm", "map.yaml",
     "recording.rrd", "steps.parquet", "loops.parquet", "metrics.json", "summary.txt", "config.toml", "run.json",
     "report.html",
 }  # fmt: skip

@@ -141,7 +141,7 @@ def test_passwords_and_signatures_are_written_nowhere(site, tmp_path, capfd):
     site.files["/logs/office.mcap?signature=secret"] = site.files["/logs/office.mcap"]
     words = ["run", signed, "--out", str(tmp_path / "run"), "--end", "0.5", "--rerun", "off"]
     assert main(words) == 0
-    written = [file.read_bytes() for file in (tmp_path / "run").iterdir()]
+    written = [file.read_bytes() for file in (tmp_path / "run").rglob("*") if file.is_file()]
     assert not any(b"secret" in content for content in written) and "secret" not in "".join(capfd.readouterr())
 
 

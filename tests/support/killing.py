@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 
 from scanchain.graph.files.g2o import read_g2o
-from scanchain.maps import read_map, read_ply
+from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume.checkpoint import read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
@@ -64,6 +64,8 @@ def wait_for_steps(child, out, steps, *, checkpoint=True):
 def same_result(a, b):
     for name in ("trajectory.tum", "trajectory.kitti.txt", "odometry.tum", "graph.g2o", "map.ply", "map.pgm"):
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
+    for path in (a / MAP_FOLDER).iterdir():
+        assert path.read_bytes() == (b / MAP_FOLDER / path.name).read_bytes(), path.name
     tables = [pq.read_table(folder / "steps.parquet", columns=COLUMNS) for folder in (a, b)]
     assert tables[0].equals(tables[1])
     names_a, names_b = ({path.name for path in folder.iterdir()} for folder in (a, b))
@@ -169,6 +171,7 @@ def _read_text(path):
 _READ = {
     JOURNAL_FILE: lambda path: len(read_journal(path.parent)[0]),
     CHECKPOINT_FILE: _read_checkpoint,
+    MAP_FOLDER: open_saved_map,
     POINTS_FILE: lambda path: np.fromfile(path, np.float32),
     ".tum": lambda path: len(read_tum(path)),
     "trajectory.kitti.txt": lambda path: len(read_kitti(path)),
