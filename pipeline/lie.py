@@ -92,6 +92,13 @@ def lift(T: Pose) -> Pose:
     return result
 
 
+def lift_points(points: NDArray[np.floating]) -> Matrix:
+    """Points (N, 2) of the plane as (N, 3) with z = 0; a copy of those in space (N, 3)."""
+    result = np.zeros((len(points), 3))
+    result[:, : points.shape[1]] = points
+    return result
+
+
 def rotation_angle(T: Pose) -> NDArray[np.float64]:
     """Angle of a pose's rotation, rad, in [0, π]; accurate near 0 and near π."""
     if T.shape[-1] == 3:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import working_s
-from scanchain.config import Config
+from scanchain.config import Config, LoopsConfig
 from scanchain.data import (
     Closure,
     GraphState,
@@ -137,10 +137,7 @@ class Slam:
     ) -> Step:
         """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does."""
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
-        self.live_stamps.check(scan)
-        step = self.process(scan)
-        self.live_stamps.take(scan)
-        return step
+        return self.live_stamps.passed(scan, self.process)
 
     def process(self, scan: Scan) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
@@ -273,7 +270,7 @@ class Slam:
             is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
             if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
                 self.by_map = closure
-                self.T_world_odom = self._by_map(closure)
+                self.T_world_odom = self._odom_by(closure)
         return closures
 
     def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
@@ -285,7 +282,7 @@ class Slam:
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
         self._optimize("gnc")
 
-    def _by_map(self, closure: Closure) -> Pose:
+    def _odom_by(self, closure: Closure) -> Pose:
         """T_world_odom by a closure with a keyframe of the map."""
         T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
         return lie.normalize(T_world_source @ lie.inverse(self.keyframes[closure.source].T_odom_lidar))
@@ -307,7 +304,7 @@ class Slam:
     def _add(self, closure: Closure) -> Closure:
         """Make an edge of a closure; returns the closure with its innovation in the graph before."""
         config = self.config.loops
-        information = edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
+        information = loop_information(closure, config)
         Z_ij = closure.match.T_target_source
         expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
         error = lie.log(lie.between(Z_ij, expected))
@@ -351,6 +348,11 @@ class Slam:
         self.joins_segment = False
         self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
         return state
+
+
+def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:
+    """Information (k, k) of the pose-graph edge of a closure."""
+    return edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
 
 
 def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ import click
 from scanchain.commands.options import (
     LOG,
     OverrideCommand,
+    collect_garbage_seldom,
     matcher_options,
     method_of,
     overrides,
@@ -25,8 +25,6 @@ from scanchain.source import Source
 if TYPE_CHECKING:
     from scanchain.data import Pose
     from scanchain.maps import SavedMap
-
-_GARBAGE_EVERY = 500_000  # new objects; most stay to the end
 
 
 @click.command(cls=OverrideCommand, options_metavar="--map RUN --out DIR [OPTIONS] [--section.key VALUE]...")
@@ -69,7 +67,7 @@ def localize(
       scanchain localize monday.mcap --map runs/sunday --out runs/monday --initial 12.5,-3,90
       scanchain localize part_0.mcap part_1.mcap --map runs/sunday --out runs/monday --topic /points
     """
-    gc.set_threshold(_GARBAGE_EVERY)
+    collect_garbage_seldom()
     from scanchain.api import draw_localization
     from scanchain.commands.terminal import Terminal
     from scanchain.sessions.localize import Localizing

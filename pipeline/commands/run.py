@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import click
 from scanchain.commands.options import (
     LOG,
     OverrideCommand,
+    collect_garbage_seldom,
     ground_truth,
     matcher_options,
     max_gap_option,
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
-_GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
@@ -97,7 +96,7 @@ def run(
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
-    gc.set_threshold(_GARBAGE_EVERY)
+    collect_garbage_seldom()
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job

@@ -71,11 +71,11 @@ class LoopCloser:
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
         if self.map_search is not None:
-            if not self.map_search.is_tracked(keyframes, closures):
-                closures += self.map_search.close(keyframes, graph, components)
-            else:
+            self.map_search.take(keyframes, closures)
+            if self.map_search.is_tracking(keyframes):
                 self.places.skip(keyframes)
                 return closures
+            closures += self.map_search.close(keyframes, graph, components)
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:

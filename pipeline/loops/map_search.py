@@ -71,10 +71,13 @@ class MapSearch:
         since_m = newest.traveled_m - self.matched_m
         return since_m < _MATCH_M * newest.scale and self.segments.starts[-1] != newest.index
 
-    def is_tracked(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> bool:
-        """True while the newest keyframes match the map; closures : of the newest."""
+    def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
+        """Remember whether the newest keyframe, of these closures, matches the map."""
         if any(each.verdict is Verdict.ACCEPTED and each.target < self.of_map for each in closures):
             self.matched_m = keyframes[-1].traveled_m
+
+    def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies little behind the newest keyframe."""
         return keyframes[-1].traveled_m - self.matched_m <= _TRACKED_M
 
     def close(

@@ -41,7 +41,7 @@ class Hypothesis:
     points: int
 
 
-class MapSearch:
+class PlanarMapSearch:
     """Surfaces and free space of keyframes at their poses, in a grid in which all poses of a scan are searched.
 
     A point of the scan scores 1 on a surface, ½ beside it, −1 in free space and nothing where the map knows

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.planar_map_search import MapSearch
+from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
@@ -122,7 +122,7 @@ class Relocalizer:
         self.next_m = 0.0
         self.turn = 0
         self.found: list[Find] = []
-        self.searched: MapSearch | None = None
+        self.searched: PlanarMapSearch | None = None
         self.searched_poses = np.empty((0, 3, 3))
 
     def close(
@@ -169,7 +169,9 @@ class Relocalizer:
         if self.searched is None or not np.array_equal(self.searched_poses, T_world[old]):
             voxel_size_m = self.submaps.config.voxel_size_m
             self.searched_poses = T_world[old]
-            self.searched = MapSearch([keyframes[k] for k in old.tolist()], self.searched_poses, voxel_size_m)
+            self.searched = PlanarMapSearch(
+                [keyframes[k] for k in old.tolist()], self.searched_poses, voxel_size_m
+            )
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
         best = self.searched.best(points, _LEAST_SHARE)

@@ -68,12 +68,12 @@ def sightings(
 
     enough : a point that so many scans saw is not tested again
     """
-    index = _Cells(_in_space(voxels), reach_of(voxel_size_m))
+    index = _Cells(lie.lift_points(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
     with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
         for view in views:
-            nearest_ranges(_in_space(view.points), ranges_m)
+            nearest_ranges(lie.lift_points(view.points), ranges_m)
             T_world_lidar = lie.lift(view.T_world_lidar)
             T_lidar_world, spans = lie.inverse(T_world_lidar), index.within_reach(T_world_lidar[:3, 3])
             limits = np.array([
@@ -91,11 +91,6 @@ def sightings(
                 part.result()
     order = np.argsort(index.order)
     return seen[order], seen_through[order]
-
-
-def _in_space(points: Points) -> Points:
-    """(N, 3); points of the plane get height 0."""
-    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
 class _Cells:

@@ -71,7 +71,7 @@ class Edges:
     weight: NDArray[np.float64]
 
     def among(self, chosen: NDArray[np.int64]) -> Edges:
-        """Those between chosen keyframes, which are numbered anew in this order."""
+        """Those between chosen keyframes, renumbered in this order."""
         number = np.full(max(int(self.pairs.max(initial=-1)), int(chosen.max(initial=-1))) + 1, -1)
         number[chosen] = np.arange(len(chosen))
         pairs = number[self.pairs]

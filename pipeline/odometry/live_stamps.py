@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from scanchain.checks import SMALLER_UNITS
 from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.trajectory import format_stamp
+
+Result = TypeVar("Result")
 
 _LOOKED_AT = 3  # intervals: of fewer, a burst or a gap may be the rule
 _MOST_SWEEPS = 2.0  # intervals between scans that the times of a scan's points may span
@@ -19,6 +24,13 @@ class LiveStamps:
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self.intervals_s: list[float] = []
+
+    def passed(self, scan: Scan, process: Callable[[Scan], Result]) -> Result:
+        """The result of a scan, which is checked before and remembered after it. Raises InputError."""
+        self.check(scan)
+        result = process(scan)
+        self.take(scan)
+        return result
 
     def check(self, scan: Scan) -> None:
         """Refuse a scan whose stamp or point times contradict those before. Raises InputError; nothing changes."""

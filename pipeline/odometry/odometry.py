@@ -100,10 +100,7 @@ class Odometry:
         ``times_s`` cannot be seconds.
         """
         scan = Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base)
-        self.live_stamps.check(scan)
-        tracked = self.process(scan)
-        self.live_stamps.take(scan)
-        return tracked
+        return self.live_stamps.passed(scan, self.process)
 
     def process(self, scan: Scan) -> Tracked:
         """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""

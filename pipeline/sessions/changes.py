@@ -31,7 +31,7 @@ _BESIDE_VOXELS = 4.0  # distance of such a cluster's points to that surface, in 
 
 
 class Label(IntEnum):
-    """What became of a point from the earlier map to the later one."""
+    """Fate of a point from the earlier map to the later one."""
 
     SAME = 0
     APPEARED = 1
@@ -122,7 +122,7 @@ class Changes:
 def changes_between(
     earlier: Part, later: Part, config: Config, *, voxel_size_m: float | None = None, min_size_m: float = 0.2
 ) -> Changes:
-    """What changed from one map to the other, both in one frame.
+    """The changes from one map to the other, both in one frame.
 
     A point vanished if the later map clearly saw through where it was, and appeared if the earlier one saw through
     where it came to be; where the other did not look, its fate is unknown. What moved while a map was made is left

@@ -42,7 +42,7 @@ _MAX_POSITIONS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was written: dimension, numbers of points read and of keyframes made, spacing of these in meters."""
+    """An imported map: dimension, numbers of points read and of keyframes made, spacing of these in meters."""
 
     dimension: int
     points: int
@@ -229,7 +229,7 @@ def _in_view(points: Points) -> Points:
     """Points (M, d) around a lidar that no nearer ones hide."""
     rows, columns = _BINS[points.shape[1]]
     ranges_m = np.empty((rows, columns))
-    in_space = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    in_space = lie.lift_points(points)
     nearest_ranges(in_space, ranges_m)
     range_m = np.linalg.norm(in_space, axis=1)
     elevation = np.arcsin(in_space[:, 2] / np.maximum(range_m, 1e-9)) / np.pi + 0.5

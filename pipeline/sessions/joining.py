@@ -12,12 +12,12 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Pose, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser
 from scanchain.maps import Edges, SavedMap
-from scanchain.slam import edge_information
+from scanchain.slam import loop_information
 
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
 _OPTIMIZE_EVERY, _GROWTH = 10, 0.05  # keyframes between two optimizations: at least so many, and such a share
@@ -271,7 +271,7 @@ class _Closing:
         for closure in closures:
             if closure.verdict is Verdict.ACCEPTED:
                 self.waiting = True
-                information = _information(closure, self.config)
+                information = loop_information(closure, self.config.loops)
                 self.graph.add_edge(
                     closure.target, closure.source, closure.match.T_target_source, information, is_loop=True
                 )
@@ -289,7 +289,7 @@ class _Closing:
         closed = Edges(
             np.array([(closure.target, closure.source) for closure in accepted], np.int64),
             np.array([closure.match.T_target_source for closure in accepted]),
-            np.array([_information(closure, self.config) for closure in accepted]),
+            np.array([loop_information(closure, self.config.loops) for closure in accepted]),
             np.ones(count, np.bool_),
             np.ones(count),
         )
@@ -329,28 +329,20 @@ def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float
             away_m, index = near.query(viewer.T_odom_lidar[:d, d])
             other = viewed[int(index)]
             if away_m <= _NEAR_M[d]:
-                nearest_ranges(_in_space(viewer), ranges_m)
+                nearest_ranges(lie.lift_points(viewer.points), ranges_m)
                 T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
                 margin_m = _MARGIN_M[d] * viewer.scale
-                yes, no = compare_ranges(_in_space(other), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE)
+                yes, no = compare_ranges(
+                    lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
+                )
                 agreeing, contradicting = agreeing + yes, contradicting + no
     return contradicting / max(agreeing + contradicting, 1)
-
-
-def _in_space(keyframe: Keyframe) -> Points:
-    """(N, 3); points of the plane get height 0."""
-    points = keyframe.points
-    return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
 
 
 def _joining(joined: Joined, old: int) -> int:
     """Number of keyframes from ``old`` on that a closure in force joins to those before."""
     pairs = joined.edges.pairs
     return len(np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1]))
-
-
-def _information(closure: Closure, config: Config) -> Matrix:
-    return edge_information(closure.match.information, config.loops.edge_sigma_m, config.loops.edge_sigma_rad)
 
 
 def _same(T_a: Pose, T_b: Pose) -> bool:

@@ -114,7 +114,7 @@ class LocalizeMetrics(Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class LocalizedLog:
-    """What was written, for pictures and recordings: the map, the log's places, points of its keyframes."""
+    """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
 
     path: Path
     prior: SavedMap

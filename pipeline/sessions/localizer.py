@@ -13,8 +13,7 @@ from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory
 from scanchain.maps import SavedMap, open_saved_map
-from scanchain.odometry import LiveStamps
-from scanchain.slam import Slam, SlamResult, edge_information
+from scanchain.slam import Slam, SlamResult, loop_information
 
 _RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
 _TURN = 0.1  # drift in radians a meter, as a share of loops.drift
@@ -107,7 +106,6 @@ class Localizer:
         dimension = self.map.dimension
         self.slam = Slam(config, T_base_lidar, points_file, dimension=dimension, prior=self.map)
         self.initial = None if initial is None else checks.pose(initial, "initial", dimension)
-        self.live_stamps = LiveStamps()
         self.states: list[MapState] = []
         self.live: list[Pose] = []
         self.sigma_m: list[float] = []
@@ -125,10 +123,7 @@ class Localizer:
     ) -> Placed:
         """Place a scan as a driver gives it; arguments as in ``Odometry.track``."""
         scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
-        self.live_stamps.check(scan)
-        placed = self.process(scan)
-        self.live_stamps.take(scan)
-        return placed
+        return self.slam.live_stamps.passed(scan, self.process)
 
     def process(self, scan: Scan) -> Placed:
         """Place one scan of a log."""
@@ -186,7 +181,7 @@ class Localizer:
         drift = lie.by_component(k, config.drift * since_m, _TURN * config.drift * since_m)
         if by_map is None:
             return np.diag(lie.by_component(k, *INITIAL_SIGMAS) ** 2 + drift**2)
-        information = edge_information(by_map.match.information, config.edge_sigma_m, config.edge_sigma_rad)
+        information = loop_information(by_map, config)
         T_source_lidar = lie.between(slam.keyframes[by_map.source].T_odom_lidar, T_odom_lidar)
         Ad = lie.adjoint(lie.inverse(T_source_lidar))
         return Ad @ np.linalg.inv(information) @ Ad.T + np.diag(drift**2)

@@ -7,7 +7,7 @@ from scanchain import lie
 from scanchain.data import Keyframe
 from scanchain.kernels.search.branch_and_bound import fill_pyramid
 from scanchain.kernels.search.whole_map import FREE, NEAR, SURFACE, score_cells, search_map
-from scanchain.loops.planar_map_search import MapSearch
+from scanchain.loops.planar_map_search import PlanarMapSearch
 from tests.support.scenes import stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
@@ -33,7 +33,7 @@ def rooms(pillars):
     poses = np.repeat(CENTERS, 2, axis=0)
     clouds = [stored(room(pillar)) for pillar in np.repeat(pillars, 2)]
     keyframes = [Keyframe(k, k, k, cloud, poses[k], 30.0 * k) for k, cloud in enumerate(clouds)]
-    return MapSearch(keyframes, poses, 0.1)
+    return PlanarMapSearch(keyframes, poses, 0.1)
 
 
 def seen(with_pillar):

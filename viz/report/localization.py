@@ -52,7 +52,7 @@ def map_points(prior: SavedMap, limit: int = _MAX_POINTS) -> Points:
     for keyframe in prior.keyframes:
         points = keyframe.points
         some = lie.transform(keyframe.T_odom_lidar, points[:: max(1, -(-len(points) // each))])
-        clouds.append(np.pad(some, ((0, 0), (0, 3 - some.shape[1]))))
+        clouds.append(lie.lift_points(some))
     return np.vstack(clouds)
 
 
@@ -93,20 +93,22 @@ def _path(localized: LocalizedLog) -> Drawing:
     low, high = extent(points)
     lines = []
     if found.is_placed.any():
-        final = _in_space(found.trajectory.poses[:, :-1, -1])
+        final = lie.lift_points(found.trajectory.poses[:, :-1, -1])
         later = np.where((found.is_placed & (found.states == MapState.SEARCHING))[:, None], final, np.nan)
         lines.append(PathLine(later, _PLACED_LATER, is_dashed=True, width=1.2))
         low, high = (
             np.minimum(low, final[found.is_placed].min(axis=0)),
             np.maximum(high, final[found.is_placed].max(axis=0)),
         )
-    live = _in_space(found.live[:, :-1, -1])
+    live = lie.lift_points(found.live[:, :-1, -1])
     for state, color in COLORS.items():
         lines.append(
             PathLine(np.where((found.states == state)[:, None], live, np.nan), color, is_dashed=False, width=1.4)
         )
     known = np.flatnonzero(found.is_placed)
-    ends = _in_space(found.trajectory.poses[known][[0, -1], :-1, -1]) if len(known) else np.full((2, 3), np.nan)
+    ends = (
+        lie.lift_points(found.trajectory.poses[known][[0, -1], :-1, -1]) if len(known) else np.full((2, 3), np.nan)
+    )
     margin = 0.02 * (high - low)
     svg = path_over_map("path", points, ends, lines, low - margin, high + margin)
     return Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
@@ -132,7 +134,3 @@ def _states(localized: LocalizedLog) -> Drawing:
             f"Behind it the state, in the colors above; {count} tried.",
             figure.svg(),
         )
-
-
-def _in_space(positions: Points) -> Points:
-    return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
