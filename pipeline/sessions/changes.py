@@ -21,6 +21,7 @@ from scanchain.maps import View, build_point_map, clearly_through, moved, reach_
 _SAME_VOXELS = 1.5  # distance, in voxels, within which the other map has the same surface
 _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong to one cluster
 _LEAST_POINTS = {2: 3, 3: 6}  # of a cluster
+_LEG_M, _LEGS_M = 0.2, 1.0  # size of legs of furniture, and distance within which they belong to one piece
 _LEAST_AGREEMENT = 0.4  # least share of same points among those that both maps had in sight
 _ANGLES = 90  # headings that a box around a cluster is tried at, over 90°
 _ALIKE_SHARE, _ALIKE_VOXELS = 0.1, 1.0  # by which lengths of one object may differ that was seen from two sides
@@ -189,15 +190,11 @@ def _clusters(
     points: Points, labels: NDArray[np.uint8], size_m: float, min_size_m: float
 ) -> tuple[NDArray[np.int64], list[Cluster]]:
     """Number of each point's cluster (N,), 0 for none, and the clusters, the largest first."""
-    dimension = points.shape[1]
     found: list[tuple[Cluster, NDArray[np.int64]]] = []
     kinds: tuple[tuple[Kind, Label], ...] = (("vanished", Label.VANISHED), ("appeared", Label.APPEARED))
     rest = KDTree(points[(labels == Label.SAME) | (labels == Label.UNKNOWN)])
     for kind, label in kinds:
-        chosen = np.flatnonzero(labels == label)
-        group = _groups(points[chosen], _JOINED_VOXELS[dimension] * size_m)
-        for number in np.flatnonzero(np.bincount(group) >= _LEAST_POINTS[dimension]).tolist():
-            members = chosen[group == number]
+        for members in _groups(points, np.flatnonzero(labels == label), size_m):
             center, size, yaw_rad = _box(points[members], size_m)
             if size.max() >= min_size_m and not _is_grazed(points[members], rest, size_m):
                 found.append((Cluster(kind, 0, center, size, yaw_rad, len(members)), members))
@@ -228,14 +225,26 @@ def _is_grazed(points: Points, rest: KDTree, size_m: float) -> bool:
     return continued > 0.5 * len(points)
 
 
-def _groups(points: Points, reach_m: float) -> NDArray[np.int64]:
-    """Number of the connected group of each point (N,): those within reach of each other belong together."""
-    count = len(points)
+def _groups(points: Points, chosen: NDArray[np.int64], size_m: float) -> list[NDArray[np.int64]]:
+    """Rows of the chosen points that belong together: close to each other, or legs of one piece of furniture."""
+    dimension = points.shape[1]
+    groups = _connected(points, chosen, _JOINED_VOXELS[dimension] * size_m)
+    groups = [group for group in groups if len(group) >= _LEAST_POINTS[dimension]]
+    is_leg = [np.ptp(points[group], axis=0).max() + size_m < _LEG_M for group in groups]
+    legs = [group for group, short in zip(groups, is_leg, strict=True) if short]
+    others = [group for group, short in zip(groups, is_leg, strict=True) if not short]
+    return others + _connected(points, np.concatenate([*legs, chosen[:0]]), _LEGS_M)
+
+
+def _connected(points: Points, chosen: NDArray[np.int64], reach_m: float) -> list[NDArray[np.int64]]:
+    """Rows of the chosen points, in groups of those within reach of each other."""
+    count = len(chosen)
     if not count:
-        return np.zeros(0, np.int64)
-    pairs = KDTree(points).query_pairs(reach_m, output_type="ndarray")
+        return []
+    pairs = KDTree(points[chosen]).query_pairs(reach_m, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return connected_components(links, directed=False)[1].astype(np.int64)
+    group = connected_components(links, directed=False)[1]
+    return [chosen[group == number] for number in range(group.max() + 1)]
 
 
 def _box(points: Points, size_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:

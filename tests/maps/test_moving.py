@@ -111,5 +111,14 @@ def test_a_pole_before_a_far_wall_stands_though_most_rays_pass_it():
     assert gone.tolist() == [False] * len(heights) + [True]
 
 
+def test_a_leg_hides_what_is_behind_it_and_not_what_is_beside():
+    angle = np.radians(np.arange(-20.0, 20.0, 0.5) + 0.25)
+    ranges = np.where(np.abs(angle) < np.radians(0.5), 2.0, 9.0)  # the leg, a degree wide, before a wall
+    scan = ranges[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    behind, beside = [6.0, 0.0], 6.0 * np.array([np.cos(np.radians(0.8)), np.sin(np.radians(0.8))])
+    gone = moved(np.vstack([behind, beside]), 0.05, [View(lie.identity(2), scan, 0.01)] * 3)
+    assert gone.tolist() == [False, True]
+
+
 def test_maps_of_nothing_have_nothing_that_moved():
     assert moved(np.empty((0, 3)), 0.2, [View(np.eye(4), np.empty((0, 3)), 0.5)]).shape == (0,)

@@ -28,15 +28,15 @@ class Held:
         return self.points
 
 
-def room(*boxes: tuple[float, float]) -> Solids:
-    """12 x 8 m, with a wall that hides its far corner, a table, and boxes of 0.6 m."""
+def room(*boxes: tuple[float, float], edge_m: float = 0.6) -> Solids:
+    """12 x 8 m, with a wall that hides its far corner, a cupboard, and boxes."""
     scenery = Scenery()
     for center, size in (((6, 0), (12, 0.2)), ((6, 8), (12, 0.2)), ((0, 4), (0.2, 8)), ((12, 4), (0.2, 8))):
         scenery.box(center, size, (0.0, 2.5))
     scenery.box((8.5, 5.0), (7.0, 0.2), (0.0, 2.5))
     scenery.box((2.0, 6.0), (1.2, 0.7), (0.0, 2.5))
     for center in boxes:
-        scenery.box(center, (0.6, 0.6), (0.0, 2.5))
+        scenery.box(center, (edge_m, edge_m), (0.0, 2.5))
     return scenery.finish()
 
 
@@ -121,6 +121,14 @@ def test_what_is_smaller_than_asked_for_is_unknown():
     found = compared(room(BOX), room(), min_size_m=2.0)
     assert found.clusters == ()
     assert not (found.labels == Label.VANISHED).any()
+
+
+def test_legs_of_a_table_are_one_change_and_a_post_alone_is_unknown():
+    legs = [(4.2, 2.6), (5.0, 2.6), (4.2, 3.2), (5.0, 3.2)]
+    found = compared(room(*legs, edge_m=0.06), room())
+    assert [each.kind for each in found.clusters] == ["vanished"]
+    assert np.abs(found.clusters[0].center - [4.6, 2.9]).max() < 0.1
+    assert compared(room(legs[0], edge_m=0.06), room()).clusters == ()
 
 
 def test_maps_in_different_frames_are_refused():

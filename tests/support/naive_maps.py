@@ -82,8 +82,11 @@ def sight(point, ranges_m, limits):
         for r in range(max(row - 1, 0), min(row + half + 1, rows))
         for c in range(column - half, column + half + 1)
     }
+    slack = margin + margin_share * range_m
     place = min(around, key=around.get)
-    nearest, slack = around[place], margin + margin_share * range_m
+    if around[place] < range_m - slack:
+        place = (row, column)
+    nearest = around[place]
     if nearest >= 1e9 or nearest < range_m - slack:
         return 0
     if nearest <= range_m + slack:

@@ -55,8 +55,9 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
     single bin, or else the ground would confirm what passes above it. The point was seen where the nearest of them
     ended there, within the margin: so a thin pole before a far wall is not free space, though most rays miss
     it. It was seen through where the nearest went on behind it, unless that one ended at the same height, as
-    rays do on ground that they graze, and where one is within a bin of its direction. Otherwise it is hidden or
-    out of sight.
+    rays do on ground that they graze, and where one is within a bin of its direction. Where some ended before it,
+    the bin of its direction alone is compared: what hides a point does not hide those beside it. Otherwise it is
+    hidden or out of sight.
 
     points : (N, 3) meters, world; spans : (S, 2) int64 first and last + 1 of the points to test
     T : (4, 4) T_lidar_world; ranges_m : (E, A) of ``nearest_ranges``; one row for scans in a plane
@@ -94,6 +95,8 @@ def _sight(x, y, z, ranges_m, limits):
     margin = margin_m + margin_share * range_m
     half = max(int(np.ceil(0.5 * window_m / (range_m * step_rad))), 1)
     nearest_m, row_of_nearest = _least(ranges_m, row, column, half, range_m - margin)
+    if nearest_m < range_m - margin:
+        nearest_m, row_of_nearest = ranges_m[row, column], row
     if nearest_m >= FAR or nearest_m < range_m - margin:
         return 0
     if nearest_m <= range_m + margin:
