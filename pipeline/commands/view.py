@@ -23,7 +23,7 @@ from scanchain.errors import InputError
 def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map to a picture.
 
-    DIR is a run directory, or a .rrd file.
+    DIR is a directory of run, localize, merge or changes, or a .rrd file; a picture needs a trajectory.
 
     \b
     Examples:

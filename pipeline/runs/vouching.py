@@ -32,9 +32,10 @@ def evidence_of_run(folder: Path) -> Evidence:
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
     except FileNotFoundError:
-        raise InputError(
-            f"{folder}: has no steps.parquet: no run directory, or that of an unfinished run (--resume goes on)"
-        ) from None
+        told = "no run directory, or that of an unfinished run (--resume goes on)"
+        if (folder / "summary.txt").exists():  # of another command
+            told = "only scanchain run writes it; see summary.txt"
+        raise InputError(f"{folder}: has no steps.parquet: {told}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"

@@ -13,7 +13,6 @@ from scanchain.errors import InputError
 from scanchain.maps import SavedMap
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match
-from scanchain.settings import load_settings
 from scanchain.slam import Slam
 from scanchain.words import counted
 
@@ -32,12 +31,11 @@ class Alignment:
     loops: int
 
 
-def align_maps(target: SavedMap, source: SavedMap, config: Config | None = None) -> Alignment:
+def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
     """The keyframes of ``source`` in the frame of ``target``, wherever they are in it; the target stays as it is.
 
     Raises InputError where the source is not found in the target.
     """
-    config = load_settings(source.dimension).config if config is None else config
     slam = Slam(config, dimension=source.dimension, prior=target)
     first, information = source.keyframes[0], _information(source, config)
     for keyframe, known in zip(source.keyframes, information, strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import Config
 from scanchain.data import Pose
 from scanchain.errors import InputError
 from scanchain.maps import SavedMap, open_saved_map
@@ -55,10 +56,10 @@ def compare_maps(
     present : adds report and recording to a directory; say : called with each stage when it begins
     Raises InputError for bad input, and where the maps are not of one place.
     """
-    first = open_saved_map(comparison.earlier)
-    config = load_settings(first.dimension).config
+    maps = [_opened(run, comparison.out) for run in (comparison.earlier, comparison.later) if run is not None]
+    config = load_settings(maps[0].dimension).config
     with RunDirectory(comparison.out, force=comparison.force) as directory:
-        earlier, later, alignment = _parts(first, comparison, say)
+        earlier, later, alignment = _parts(maps, comparison, config, say)
         say("comparing")
         changes = changes_between(
             earlier, later, config, voxel_size_m=comparison.voxel_size_m, min_size_m=comparison.min_size_m
@@ -66,17 +67,29 @@ def compare_maps(
         say("writing")
         write_change_files(directory.path, changes, alignment)
         present(directory.path, changes)
-        provenance = describe_start(sys.argv, [first.folder / "map.json"], "")
+        provenance = describe_start(sys.argv, [saved.folder for saved in maps], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()
     return changes
 
 
-def _parts(first: SavedMap, comparison: Comparison, say: Callable[[str], None]) -> tuple[Part, Part, str]:
+def _opened(run: Path, out: Path) -> SavedMap:
+    """The map of a run. Raises InputError where it cannot be compared."""
+    saved = open_saved_map(run)
+    if not saved.keyframes:
+        raise InputError(f"{run}: its map has no keyframe; give another one")
+    if out.resolve() in (run.resolve(), saved.folder.resolve()):
+        raise InputError(f"{out}: is one of the maps; choose another --out")
+    return saved
+
+
+def _parts(
+    maps: Sequence[SavedMap], comparison: Comparison, config: Config, say: Callable[[str], None]
+) -> tuple[Part, Part, str]:
     """The earlier and the later map in one frame, and how they came into it, in words."""
-    if comparison.later is None:
-        return *_sessions(first), "sessions of one map"
-    second = open_saved_map(comparison.later)
+    if len(maps) == 1:
+        return *_sessions(maps[0]), "sessions of one map"
+    first, second = maps
     if second.dimension != first.dimension:
         raise InputError(
             f"{comparison.later}: is a {second.dimension}D map, {comparison.earlier} a {first.dimension}D one; "
@@ -87,7 +100,7 @@ def _parts(first: SavedMap, comparison: Comparison, say: Callable[[str], None]) 
         names = str(comparison.earlier), str(comparison.later)
     if comparison.transform is None:
         say(f"placing {names[1]} in {names[0]}")
-        alignment = align_maps(first, second)
+        alignment = align_maps(first, second, config)
         poses, text = alignment.poses, f"by {counted(alignment.loops, 'loop closure')}"
     else:
         T = comparison.transform

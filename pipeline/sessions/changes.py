@@ -141,7 +141,7 @@ def changes_between(
     if agreement < _LEAST_AGREEMENT:
         raise InputError(
             f"{later.name}: only {100.0 * agreement:.0f} % of what both maps had in sight is the same as in "
-            f"{earlier.name}, they are not in one frame; leave out --aligned or give another --transform"
+            f"{earlier.name}, they are not in one frame; give another --transform or none, and maps of one place"
         )
     is_new = labels_after != Label.SAME
     points, labels = np.vstack([before, after[is_new]]), np.append(labels_before, labels_after[is_new])

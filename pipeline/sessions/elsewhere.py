@@ -113,9 +113,7 @@ def _read(file: Path) -> _Surfaces:
         return _read_grid(file)
     try:
         if suffix in LAS_SUFFIXES:
-            import laspy
-
-            points = np.asarray(laspy.read(file).xyz, np.float64)
+            points = _read_las(file)
         elif suffix in SUFFIXES:
             rows = read_cloud_file(file)
             points = np.column_stack([rows[name] for name in "xyz"]).astype(np.float64)
@@ -126,14 +124,21 @@ def _read(file: Path) -> _Surfaces:
         raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
     except CloudFileError as error:
         raise InputError(f"{file}: {error}") from error
-    except Exception as error:  # laspy raises what its decoder does
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file}: is no LAS or LAZ file ({type(error).__name__}: {error})") from error
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise InputError(f"{file}: has no points")
     return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points)
+
+
+def _read_las(file: Path) -> Points:
+    import laspy
+
+    try:
+        return np.asarray(laspy.read(file).xyz, np.float64)
+    except OSError:
+        raise
+    except Exception as error:  # whatever a damaged file makes laspy and its decoder raise
+        raise InputError(f"{file}: is no LAS or LAZ file ({type(error).__name__}: {error})") from error
 
 
 def _read_grid(file: Path) -> _Surfaces:

@@ -1,4 +1,5 @@
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -186,6 +187,31 @@ def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys,
     assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["A", "B"]
+
+
+def test_no_map_is_replaced_by_the_comparison_and_both_are_named_in_it(tmp_path, capsys):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
+    for run in (a, b):
+        assert main(["changes", str(a), str(b), "--aligned", "--force", "--out", str(run)]) == 2
+        assert "is one of the maps" in capsys.readouterr().err
+    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
+    logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
+    assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
+
+
+def test_a_directory_that_is_no_run_is_not_checked_or_drawn_and_says_where_to_look(tmp_path, capsys):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
+    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
+    assert main(["check", str(tmp_path / "ab")]) == 2
+    assert "see summary.txt" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2
+    assert "open report.html" in capsys.readouterr().err
+
+
+def test_a_map_without_keyframes_is_refused(tmp_path, capsys):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", Part("b", [], np.empty((0, 3, 3))))
+    assert main(["changes", str(a), str(b), "--out", str(tmp_path / "ab")]) == 2
+    assert "has no keyframe" in capsys.readouterr().err
 
 
 def test_maps_stay_as_they_were(tmp_path):

@@ -53,6 +53,8 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
         assert (tmp_path / "loc" / name).stat().st_size > 100, name
     metrics = json.loads((tmp_path / "loc/metrics.json").read_text())
     assert metrics["placed"] == metrics["scans"] == len(states)
+    assert call("view", tmp_path / "loc", "--png", tmp_path / "loc.png")[0] == 0
+    assert (tmp_path / "loc.png").stat().st_size > 10_000
 
 
 def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
@@ -63,6 +65,8 @@ def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
     assert code == 1 and "not trustworthy: not from this place: nothing in " in out and "is in map" in error
     assert not (tmp_path / "loc/trajectory.tum").exists()
     assert json.loads((tmp_path / "loc/metrics.json").read_text())["placed"] == 0
+    code, _, error = call("view", tmp_path / "loc", "--png", tmp_path / "loc.png")
+    assert code == 2 and "there is no trajectory to draw" in error
 
 
 def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office, tmp_path, call):

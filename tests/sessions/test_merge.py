@@ -16,6 +16,7 @@ from scanchain.runs.job import Unwatched
 from scanchain.sessions.joining import Joined, contradiction, graph_of
 from scanchain.sessions.merging import MergeJob, merge
 from scanchain.trajectory import read_tum
+from scanchain.viz.pictures.run import draw_run
 
 PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}
 FILES = ("map/points.i16", "map/edges.npz", "map/keyframes.npz", "map.ply", "map.pgm", "evening.tum", "graph.g2o")
@@ -101,6 +102,8 @@ def test_a_merge_leaves_what_a_run_leaves(merged):
         *(f"{name}.tum" for name in PARTS),
     }
     assert json.loads((merged.path / "run.json").read_text())["complete"]
+    draw_run(merged.path, merged.path.with_suffix(".png"))
+    assert merged.path.with_suffix(".png").stat().st_size > 10_000
 
 
 def test_the_first_run_keeps_its_frame_and_the_order_of_the_others_does_not_matter(runs, merged, tmp_path):

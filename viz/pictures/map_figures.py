@@ -8,13 +8,16 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.data import Points
+from scanchain.maps import SavedMap
 from scanchain.runs.overlay import Overlay
 from scanchain.viz.pictures.figure import INK, SvgFigure
 from scanchain.viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, Floats, PathLine
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
+_SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
 _LOWEST = 5.0  # percentile of the heights that is taken for the ground's
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
@@ -34,6 +37,17 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     size[:2] = size[:2].max()
     inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
     return inside.min(axis=0).astype(np.float64), inside.max(axis=0).astype(np.float64)
+
+
+def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:
+    """(N, 3) some points of all keyframes of a map, in its frame."""
+    each = max(limit // max(len(prior.keyframes), 1), 1)
+    clouds = [np.empty((0, 3))]
+    for keyframe in prior.keyframes:
+        points = keyframe.points
+        some = lie.transform(keyframe.T_odom_lidar, points[:: max(1, -(-len(points) // each))])
+        clouds.append(lie.lift_points(some))
+    return np.vstack(clouds)
 
 
 def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:

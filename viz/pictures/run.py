@@ -1,4 +1,4 @@
-"""A run as one picture: its trajectories, before and after optimization, over its map, seen from above."""
+"""A run, a localized log or a merged map as one picture: trajectories over the map, seen from above."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
-from scanchain.maps import read_map, read_ply
+from scanchain.maps import open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures.figure import write_figure
-from scanchain.viz.pictures.map_figures import extent
-from scanchain.viz.pictures.trajectory_figures import TRUTH
+from scanchain.viz.pictures.map_figures import extent, map_points
+from scanchain.viz.pictures.trajectory_figures import TRUTH, color_of
 from scanchain.viz.stretch_colors import STRETCH_COLORS
 
 if TYPE_CHECKING:
@@ -55,17 +55,20 @@ def draw_map(
     optimized: Matrix,
     odometry: Matrix | None = None,
     ground_truth: Matrix | None = None,
+    sessions: Sequence[tuple[str, Matrix]] = (),
     stretches: Sequence[Stretch] = (),
     points: NDArray[np.floating] | None = None,
     grid: GridPicture | None = None,
 ) -> None:
     """Draw trajectories (N, d+1, d+1) over a map, all in the world frame, to a PNG.
 
+    sessions : names and poses of those of a merged map, instead of one trajectory
     stretches : to check, of the optimized trajectory
     points : (M, d) of the map; of a 3D one the height is the shade
     ground_truth : already aligned to the estimate
     """
-    paths = [path for path in (optimized, odometry, ground_truth) if path is not None and len(path)]
+    drawn = (optimized, odometry, ground_truth, *(poses for _, poses in sessions))
+    paths = [path for path in drawn if path is not None and len(path)]
     low, high = _frame(paths, points, grid)
     figure, axes = _figure(low, high)
     if grid is not None:
@@ -75,6 +78,8 @@ def draw_map(
     _draw_path(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
     _draw_path(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
     _draw_path(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
+    for number, (name, poses) in enumerate(sessions):
+        _draw_path(axes, poses, name, color_of(number), "-", 1.4)
     _mark_stretches(axes, optimized, stretches)
     _mark_ends(axes, optimized)
     axes.set_xlim(low[0], high[0])
@@ -176,32 +181,59 @@ def _mark_ends(axes: Axes, poses: Matrix) -> None:
 
 
 def draw_run(directory: Path, picture: Path) -> None:
-    """Draw trajectories, ground truth and map of a run to a PNG: the occupancy grid in 2D, the cloud in 3D.
+    """Draw trajectories, ground truth and map to a PNG: the occupancy grid in 2D, the cloud in 3D.
 
-    Raises InputError where the directory is no run's, or the picture cannot be written.
+    directory : of a run, a localized log or a merged map
+    Raises InputError where it is none of these, or the picture cannot be written.
     """
-    if not (directory / "trajectory.tum").exists():
-        raise InputError(f"{directory}: holds no trajectory.tum; give the directory of a finished run")
-    points = read_ply(directory / "map.ply")
-    is_planar = not points[:, 2].any()
-    cells, resolution_m, origin_m = read_map(directory)
-    optimized, odometry = read_tum(directory / "trajectory.tum"), read_tum(directory / "odometry.tum")
-    truth_file = directory / TRUTH_FILE
+    try:
+        metrics = json.loads((directory / "metrics.json").read_bytes())
+    except (OSError, ValueError):
+        metrics = {}
+    if "stretches" in metrics:
+        drawn = _run(directory, metrics)
+    elif "placed" in metrics:
+        drawn = _localized(directory, metrics)
+    elif "sessions" in metrics:
+        names = [each["name"] for each in metrics["sessions"]]
+        sessions = [(name, read_tum(directory / f"{name}.tum").poses) for name in names]
+        drawn = {"optimized": np.empty((0, 4, 4)), "sessions": sessions, **_map(directory)}
+    else:
+        raise InputError(
+            f"{directory}: holds no trajectory to draw; give the directory of a run, of localize or of merge, or "
+            "open report.html"
+        )
+    try:
+        draw_map(picture, title=directory.resolve().name, **drawn)
+    except OSError as error:
+        raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error
+
+
+def _run(directory: Path, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of ``draw_map`` for a run."""
+    optimized, truth_file = read_tum(directory / "trajectory.tum"), directory / TRUTH_FILE
     truth = None
-    metrics = json.loads((directory / "metrics.json").read_bytes())
     if truth_file.exists():
         accuracy = metrics["ground_truth"] or {}
         truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
-    try:
-        draw_map(
-            picture,
-            title=directory.resolve().name,
-            optimized=optimized.poses,
-            odometry=odometry.poses,
-            ground_truth=None if truth is None else truth.poses,
-            stretches=msgspec.convert(metrics["stretches"], tuple[Stretch, ...]),
-            points=None if is_planar else points,
-            grid=GridPicture(cells, resolution_m, origin_m) if is_planar else None,
-        )
-    except OSError as error:
-        raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error
+    return {
+        "optimized": optimized.poses,
+        "odometry": read_tum(directory / "odometry.tum").poses,
+        "ground_truth": None if truth is None else truth.poses,
+        "stretches": msgspec.convert(metrics["stretches"], tuple[Stretch, ...]),
+        **_map(directory),
+    }
+
+
+def _localized(directory: Path, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of ``draw_map`` for a localized log, over the map that it was sought in."""
+    if not metrics["placed"]:
+        raise InputError(f"{directory}: {metrics['reason']}; there is no trajectory to draw")
+    prior = open_saved_map(Path(metrics["map"]))
+    points = map_points(prior)[:, : prior.dimension]
+    return {"optimized": read_tum(directory / "trajectory.tum").poses, "points": points}
+
+
+def _map(directory: Path) -> dict[str, Any]:
+    points = read_ply(directory / "map.ply")
+    return {"points": points} if points[:, 2].any() else {"grid": GridPicture(*read_map(directory))}

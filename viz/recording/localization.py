@@ -12,11 +12,11 @@ import rerun.blueprint as rrb
 from scanchain.data import Verdict
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
+from scanchain.viz.pictures.map_figures import map_points
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.blueprint import eye, time_panel, whole_log
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import open_stream, write_recording
-from scanchain.viz.report.localization import map_points
 
 _LIVE, _FINAL, _SCAN = "world/lidar", "world/final", "world/lidar/scan"
 _ACCEPTED, _REJECTED, _SIGMA = "world/matches/accepted", "world/matches/rejected", "plots/sigma"

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Points
-from scanchain.maps import SavedMap
 from scanchain.sessions.localize import LocalizedLog, Part
 from scanchain.sessions.localizer import MapState
 from scanchain.viz.pictures.figure import INK, SvgFigure
-from scanchain.viz.pictures.map_figures import extent, path_over_map
+from scanchain.viz.pictures.map_figures import extent, map_points, path_over_map
 from scanchain.viz.pictures.trajectory_figures import PathLine
 from scanchain.viz.report.page import REPORT_FILE, Cell, Chip, Drawing, Grid, Head, Page, Row, Section, write_page
 from scanchain.words import counted
@@ -24,7 +22,6 @@ COLORS = {
     MapState.WITHOUT_MAP: "#c77800",
     MapState.LOST: "#e0532f",
 }
-_MAX_POINTS = 200_000
 _PLACED_LATER = "#0f9bb5"
 
 
@@ -43,17 +40,6 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
     verdict = Section("Verdict", m.sentence)
     sections = (verdict, *_sections(localized))
     write_page(folder / REPORT_FILE, Page("Localization", subtitle, facts, m.warnings, (), sections))
-
-
-def map_points(prior: SavedMap, limit: int = _MAX_POINTS) -> Points:
-    """(N, 3) some points of all keyframes of a map, in its frame."""
-    each = max(limit // max(len(prior.keyframes), 1), 1)
-    clouds = [np.empty((0, 3))]
-    for keyframe in prior.keyframes:
-        points = keyframe.points
-        some = lie.transform(keyframe.T_odom_lidar, points[:: max(1, -(-len(points) // each))])
-        clouds.append(lie.lift_points(some))
-    return np.vstack(clouds)
 
 
 def _sections(localized: LocalizedLog) -> Iterator[Section]:
