@@ -153,6 +153,8 @@ class Slam:
         keyframe = self._keyframe(located)
         closures: tuple[Closure, ...] = ()
         state = None
+        if self.config.loops.enabled:
+            self.closer.advance()
         if keyframe >= 0 and self.config.loops.enabled:
             closures = self._close_loops()
             state = self._optimize_when_due()

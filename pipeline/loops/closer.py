@@ -49,6 +49,8 @@ class LoopCloser:
         if is_fixed:
             self.near.of_map = len(keyframes)
             self.near.submaps.begin_in(keyframes)
+            if self.relocalizer is not None and self.config.loops.enabled:
+                self.relocalizer.begin_in(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
         if folder is not None and self.relocalizer is None and self.config.loops.enabled:
             self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
         return self.places.begin_in(keyframes, are_added=self.map_search is None)
@@ -56,6 +58,11 @@ class LoopCloser:
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
+
+    def advance(self) -> None:
+        """Go on with a search of the whole map that is under way: once a scan, in slices of equal work."""
+        if self.relocalizer is not None:
+            self.relocalizer.advance()
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.

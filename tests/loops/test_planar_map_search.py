@@ -6,7 +6,17 @@ import pytest
 from scanchain import lie
 from scanchain.data import Keyframe
 from scanchain.kernels.search.branch_and_bound import fill_pyramid
-from scanchain.kernels.search.whole_map import FREE, NEAR, SURFACE, score_cells, search_map
+from scanchain.kernels.search.whole_map import (
+    FREE,
+    NEAR,
+    SURFACE,
+    best_poses,
+    find_room,
+    interleave,
+    score_cells,
+    score_windows,
+    turned,
+)
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from tests.support.scenes import stored
 
@@ -69,7 +79,11 @@ def test_the_search_finds_the_best_of_all_poses_with_the_lidar_in_free_space():
     pyramid[0] = cells
     fill_pyramid(pyramid)
     points, turns = rng.uniform(-1.0, 1.0, (40, 2)), 12
-    found = search_map(pyramid, points, 0.1, turns, 0.0, 0.9, 0.5, 1)
+    spans = np.empty((15, 2), np.int64)
+    has_room = find_room(cells, 2, spans)
+    of_points, blocks = turned(points, 0.1, turns), interleave(pyramid[2], 2)
+    windows = [score_windows(blocks, 2, has_room, spans, of_points[k : k + 5], k, 0.0) for k in range(0, turns, 5)]
+    found = best_poses(pyramid, of_points, np.vstack(windows), 0.1, 0.0, 0.9, 0.5, 1)
     scores = {}
     for turn in range(turns):
         c, s = np.cos(2.0 * np.pi * turn / turns), np.sin(2.0 * np.pi * turn / turns)
