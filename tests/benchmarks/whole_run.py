@@ -108,6 +108,7 @@ def track(path: Path) -> float:
 def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
     """A run in this process, which was begun at that time, with a watch over what it consists of."""
     from scanchain import api
+    from scanchain.__main__ import main as scanchain
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.loops import LoopCloser
     from scanchain.point_store import PointStore
@@ -118,7 +119,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch = Stopwatch()
     watch.add("start and imports", time() - began)
     watch.over("opening the log", run, "open_log")
-    watch.over("odometry", Odometry, "track")
+    watch.over("odometry", Odometry, "process")
     watch.over("loops", LoopCloser, "close", "finish")
     watch.over("optimizing", PoseGraph, "optimize")
     watch.over("points kept", PointStore, "add", "read")
@@ -139,7 +140,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
 
     api.open_recorder = watch.timed("recording", record)
     with tempfile.TemporaryDirectory() as folder:
-        assert main(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
+        assert scanchain(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
     return watch.seconds
 
 
