@@ -100,9 +100,9 @@ class PlanarMapSearch:
         return search.best()
 
     def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
-        """The pose of the last keyframe of a path that its points fit best; None where they fit none."""
-        T_last_odom = lie.inverse(path[-1].T_odom_lidar)
-        points = np.vstack([lie.transform(T_last_odom @ each.T_odom_lidar, each.points) for each in path])
+        """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
+        T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
+        points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in path])
         best = self.best(points, LEAST_SHARE)
         return best if best is not None and best.is_likely else None
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
@@ -29,12 +28,14 @@ _FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
 _MIN_CLOSURES = 3  # least number of keyframes with a closure in force that join two maps
 _MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other map
+_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is told, and times that within the maps
+_WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
 _BINS = 360  # of azimuth, 1°; as fine in elevation
 _MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
 _CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
 _RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
-_PATH_M, _SHORT_M = 8.0, 0.5  # length of a path whose points are sought together, in the plane; and the least one
+_PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
 _MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
 _MIN_PATHS = 2  # least number of agreeing paths
@@ -169,7 +170,7 @@ def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined
     if others and _overlap(others[0], world) > _RIVAL * _overlap(best, world):
         doubt = "nearly as many closures agree at another pose"
     else:
-        doubt = _look_alike(best, old, config) if world.dimension == 2 else ""
+        doubt = look_alike(best, old, config) if world.dimension == 2 else ""
     return Doubt(guest.maps[0], world.maps[0], best.poses[old], doubt) if doubt else best
 
 
@@ -213,7 +214,10 @@ def _body(joined: Joined, held: int) -> int:
 
 
 def _sought(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[int, int, Pose]]:
-    """Poses found for the guest without an expected one: keyframe of the world near by, of the guest, T_world_guest."""
+    """Poses of the guest's keyframes, sought everywhere in the world; in the plane where two paths agree.
+
+    Yields the numbers of a keyframe of the world near by and of the guest's, and T_world_keyframe of that.
+    """
     if world.dimension == 3:
         yield from _recognized(world, guest, config)
         return
@@ -223,15 +227,16 @@ def _sought(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[int,
         best = search.likely([guest.keyframes[index] for index in path])
         if best is None or best.is_ambiguous:
             continue
-        T_guest_source = guest.poses[path[-1]]
+        source = path[len(path) // 2]
+        T_guest_source = guest.poses[source]
         if any(_agree(T_world_guest @ T_guest_source, best.T_map_lidar) for T_world_guest in finds):
             away_m = np.linalg.norm((world.poses - best.T_map_lidar)[:, :2, 2], axis=1)
-            yield int(away_m.argmin()), path[-1], best.T_map_lidar
+            yield int(away_m.argmin()), source, best.T_map_lidar
         finds.append(best.T_map_lidar @ lie.inverse(T_guest_source))
 
 
 def _recognized(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[int, int, Pose]]:
-    """Poses of the guest's keyframes by closures in the world."""
+    """The same in space, by recognized places."""
     old, keyframes, graph = len(world.keyframes), list(world.keyframes), graph_of(world)
     closer = LoopCloser(config, world.dimension)
     begin_m = closer.begin_in(keyframes, is_fixed=False)
@@ -248,14 +253,13 @@ def _recognized(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[
                 yield closure.target, closure.source - old, T_world_source
 
 
-def _paths(keyframes: Sequence[Keyframe]) -> Iterator[range]:
-    """Numbers of the keyframes along paths of some length, each half overlapping the next."""
+def _paths(keyframes: Sequence[Keyframe]) -> list[range]:
+    """Numbers of the keyframes along overlapping paths of some length."""
     traveled_m = np.array([keyframe.traveled_m for keyframe in keyframes]) - keyframes[0].traveled_m
-    length_m = min(_PATH_M, traveled_m[-1] / 1.5)
-    for begin_m in np.arange(
-        0.0, max(traveled_m[-1] - 0.99 * length_m, _SHORT_M), 0.5 * max(length_m, _SHORT_M)
-    ).tolist():
-        yield range(*np.searchsorted(traveled_m, [begin_m, begin_m + length_m + _SHORT_M]).tolist())
+    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + _STEP_M, _STEP_M)
+    ends = np.searchsorted(traveled_m, [begin_m, begin_m + length_m])
+    return [range(first, end) for first, end in np.unique(ends, axis=1).T.tolist() if first < end]
 
 
 class _Closing:
@@ -360,26 +364,54 @@ def _is_joined(joined: Joined, old: int) -> bool:
 
 def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
     """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
-    d = some[0].T_odom_lidar.shape[0] - 1
+    agreeing, contradicting = _compared(some, others) + _compared(others, some)
+    return float(contradicting / max(agreeing + contradicting, 1))
+
+
+def changed(joined: Joined) -> dict[int, float]:
+    """Contradiction of maps with those they joined, by number, where it is far more than within them."""
+    parts = {
+        number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
+    }
+    agreeing, contradicting = sum((_compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
+    least = max(_MIN_CHANGE, _TIMES_WITHIN * contradicting / max(agreeing + contradicting, 1))
+    found: dict[int, float] = {}
+    for number in joined.maps[1:]:
+        others = [k for other, part in parts.items() if other != number for k in part]
+        share = contradiction(others, parts[number])
+        if share > least:
+            found[number] = share
+    return found
+
+
+def _compared(
+    viewers: Sequence[Keyframe], viewed: Sequence[Keyframe], min_path_m: float = 0.0
+) -> NDArray[np.int64]:
+    """Numbers of points (2,), of the viewed keyframe nearest to each viewer, that agree and that contradict.
+
+    min_path_m : least path between the two
+    """
+    d = viewers[0].T_odom_lidar.shape[0] - 1
     ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
-    agreeing = contradicting = 0
-    for viewers, viewed in ((some, others), (others, some)):
-        near = KDTree([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
-        for viewer in viewers:
-            away_m, index = near.query(viewer.T_odom_lidar[:d, d])
-            other = viewed[int(index)]
-            if away_m <= _NEAR_M[d]:
-                nearest_ranges(lie.lift_points(viewer.points), ranges_m)
-                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
-                margin_m = _MARGIN_M[d] * viewer.scale
-                yes, no = compare_ranges(
-                    lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
-                )
-                agreeing, contradicting = agreeing + yes, contradicting + no
-    return contradicting / max(agreeing + contradicting, 1)
+    positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
+    traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
+    counts = np.zeros(2, np.int64)
+    for viewer in viewers:
+        away_m = np.linalg.norm(positions - viewer.T_odom_lidar[:d, d], axis=1)
+        away_m[np.abs(traveled_m - viewer.traveled_m) < min_path_m] = np.inf
+        nearest = int(away_m.argmin())
+        if away_m[nearest] <= _NEAR_M[d]:
+            other = viewed[nearest]
+            nearest_ranges(lie.lift_points(viewer.points), ranges_m)
+            T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
+            margin_m = _MARGIN_M[d] * viewer.scale
+            counts += compare_ranges(
+                lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
+            )
+    return counts
 
 
-def _look_alike(joined: Joined, old: int, config: Config) -> str:
+def look_alike(joined: Joined, old: int, config: Config) -> str:
     """Reason why the keyframes from ``old`` on may agree with those of a look-alike, empty if there is none.
 
     Where paths that agree fit elsewhere in one of both maps, too, the place repeats itself, maybe beyond the maps.
@@ -394,7 +426,10 @@ def _look_alike(joined: Joined, old: int, config: Config) -> str:
     for path in paths:
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]
-        repeated += any(fit.is_ambiguous or not _agree(fit.T_map_lidar, members[-1].T_odom_lidar) for fit in fits)
+        repeated += any(
+            fit.is_ambiguous or not _agree(fit.T_map_lidar, members[len(members) // 2].T_odom_lidar)
+            for fit in fits
+        )
     if repeated > _MAX_REPEATED * len(paths):
         return f"{repeated} of {counted(len(paths), 'path')} that agree look like other places, too"
     return "" if len(paths) >= _MIN_PATHS else "they agree along a short path only"

@@ -20,7 +20,7 @@ from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.sessions.joining import Doubt, Joined, graph_of, join_all
+from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import Override, dump, load_settings
 from scanchain.whole_file import write_whole
@@ -154,7 +154,8 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
         final = final_closures(merged)
         write_merged(directory.path, merged, final, config)
         apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
-        warnings = (*(_apart_text(each, uncertain) for each in apart), *merged.warnings)
+        different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
+        warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
         compile_s = compiled_s() - compiled_before_s
         run_s = working_s() - started
         metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings, updated=job.update)
@@ -263,6 +264,13 @@ def _apart_text(names: Sequence[str], uncertain: Sequence[UncertainJoin]) -> str
     return f"{', '.join(names)}: not in this map; {reason}{together}"
 
 
+def _changed_text(name: str, share: float) -> str:
+    return (
+        f"{name}: {100.0 * share:.1f} % of what it and the others had in sight differs; much has changed, or "
+        "it is of another floor of the same plan; then leave it out"
+    )
+
+
 def _measured(
     merged: MergedMap,
     final: Sequence[FinalClosure],
@@ -325,7 +333,7 @@ def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) ->
             for each in m.sessions
         ),
         *(f"apart          {warning}" for warning in m.warnings[: len(m.apart)]),
-        *(f"update         {warning}" for warning in m.warnings[len(m.apart) :]),
+        *(f"warning        {warning}" for warning in m.warnings[len(m.apart) :]),
         f"configuration  {configuration}",
         f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
         f"pose graph     {m.fit}",
