@@ -37,6 +37,7 @@ _CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it 
 _RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
 _PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
 _MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
 _MIN_PATHS = 2  # least number of agreeing paths
 _MIN_SHARE = 0.3  # least share of these among the keyframes that closures were tried from
@@ -257,7 +258,8 @@ def _paths(keyframes: Sequence[Keyframe]) -> list[range]:
     """Numbers of the keyframes along overlapping paths of some length."""
     traveled_m = np.array([keyframe.traveled_m for keyframe in keyframes]) - keyframes[0].traveled_m
     length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
-    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + _STEP_M, _STEP_M)
+    step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
+    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.searchsorted(traveled_m, [begin_m, begin_m + length_m])
     return [range(first, end) for first, end in np.unique(ends, axis=1).T.tolist() if first < end]
 
