@@ -59,10 +59,9 @@ class LoopCloser:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
 
-    def advance(self) -> None:
-        """Go on with a search of the whole map that is under way: once a scan, in slices of equal work."""
-        if self.relocalizer is not None:
-            self.relocalizer.advance()
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures by a search of the whole map, which goes on with every scan, in slices of equal work."""
+        return () if self.relocalizer is None else self.relocalizer.advance(keyframes, graph)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.
@@ -86,9 +85,10 @@ class LoopCloser:
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the submaps that the end of the log leaves incomplete."""
+        """Closures of the submaps and searches that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        return self.places.close(keyframes, graph, components == components[-1], finish=True)
+        searched = () if self.relocalizer is None else self.relocalizer.finish(keyframes, graph)
+        return searched + self.places.close(keyframes, graph, components == components[-1], finish=True)
 
 
 class ProximityCloser:

@@ -130,10 +130,12 @@ class Relocalizer:
         """Draw a map, with keyframes at their poses (K, 3, 3), before its first search."""
         self._draw(keyframes, T_map_lidar)
 
-    def advance(self) -> None:
-        """Go on with the search that is under way, for a scan."""
-        if self.underway is not None:
-            self.underway.search.advance()
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Go on with the search that is under way, for a scan; closures once it is done, as of ``close``."""
+        if self.underway is None:
+            return ()
+        self.underway.search.advance()
+        return self._found(keyframes, graph.poses) if self.underway.search.is_done else ()
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
@@ -146,22 +148,33 @@ class Relocalizer:
         unknown = np.flatnonzero(components != components[-1])
         if not len(unknown) or (self.underway is not None and self.underway.source < start):
             self.underway = None
-        if len(unknown) and self.underway is None:
-            self._begin(start, unknown, components, keyframes, graph.poses)
-        if self.underway is None or not self.underway.search.is_done:
+        if not len(unknown) or self.underway is not None or not self._is_due(start, keyframes):
             return ()
-        old = self.underway.old
-        find, self.underway = self.underway.find(), None
+        self._begin(start, self._next_component(unknown, components), keyframes, graph.poses)
+        return self.advance(keyframes, graph)
+
+    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures by the search that the end of the log left under way."""
+        closures: tuple[Closure, ...] = ()
+        while self.underway is not None:
+            closures = self.advance(keyframes, graph)
+        return closures
+
+    def _found(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
+        """Closures by the search that is done, where it agrees with another one of the newest segment."""
+        assert self.underway is not None
+        old, find = self.underway.old, self.underway.find()
+        self.underway = None
         if find is None:
             return ()
+        start = self.segments.starts[-1]
         self.found = [each for each in self.found if each.source >= start]
         agreeing = any(_agree(other, find, keyframes) for other in self.found)
         self.found.append(find)
         if not agreeing:
             return ()
-        closures = self._verified(
-            find, np.arange(_path_begin(keyframes, start), len(keyframes)), old, keyframes, graph.poses
-        )
+        path = np.arange(_path_begin(keyframes, start), len(keyframes))
+        closures = self._verified(find, path, old, keyframes, T_world)
         if any(closure.verdict is Verdict.ACCEPTED for closure in closures):
             self.found = []
         return closures
@@ -172,26 +185,21 @@ class Relocalizer:
         self.turn += 1
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
 
-    def _begin(
-        self,
-        start: int,
-        unknown: NDArray[np.int64],
-        components: NDArray[np.int64],
-        keyframes: Sequence[Keyframe],
-        T_world: Matrix,
-    ) -> None:
-        """Begin a search for the end of the newest segment, if one is due."""
+    def _is_due(self, start: int, keyframes: Sequence[Keyframe]) -> bool:
+        """True if the newest segment has gone far enough for the next search, which sets the distance after it."""
         traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
         if traveled_m < _FIRST_M or keyframes[-1].traveled_m < self.next_m:
-            return
+            return False
         self.next_m = keyframes[-1].traveled_m + max(_BACKOFF * traveled_m, _APART_M)
-        old = self._next_component(unknown, components)
+        return True
+
+    def _begin(self, start: int, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> None:
+        """Begin a search for the end of the newest segment among older keyframes."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
         target = self._draw([keyframes[k] for k in old.tolist()], T_world[old])
         self.underway = Search(path[-1].index, old, WholeSearch(target, points, _LEAST_SHARE))
-        self.advance()
 
     def _draw(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> PlanarMapSearch:
         """The map of keyframes at their poses; the last one where these are the same."""

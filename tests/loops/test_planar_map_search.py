@@ -17,7 +17,8 @@ from scanchain.kernels.search.whole_map import (
     score_windows,
     turned,
 )
-from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.loops import planar_map_search
+from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from tests.support.scenes import stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
@@ -62,6 +63,22 @@ def test_free_space_tells_rooms_apart_that_have_the_same_walls(which):
 def test_two_identical_rooms_rival_each_other():
     best = rooms([True, True]).best(seen(with_pillar=True), 0.3)
     assert best.rival > 0.95 * best.share
+
+
+def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
+    target, points = rooms([True, False]), seen(with_pillar=True)
+    at_once = WholeSearch(target, points, 0.3)
+    at_once.advance()
+    assert at_once.is_done
+    monkeypatch.setattr(planar_map_search, "_ADDITIONS", 20_000_000)
+    sliced = WholeSearch(target, points, 0.3)
+    sliced.advance()
+    assert not sliced.is_done
+    while not sliced.is_done:
+        sliced.advance()
+    one, other = at_once.best(), sliced.best()
+    assert (one.T_map_lidar == other.T_map_lidar).all()
+    assert (one.share, one.rival, one.points) == (other.share, other.rival, other.points)
 
 
 def test_a_room_of_another_shape_is_nowhere():
