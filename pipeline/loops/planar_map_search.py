@@ -36,6 +36,9 @@ _APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
 _ANSWERS = 12  # largest number of poses that are compared
 _RIVAL = 0.75  # share of the best score, from which on other poses are compared with it
 _MIN_RANGE_M = 1.0  # least median range that sets the step of the headings
+LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
+_CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
+_AMBIGUOUS = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +52,16 @@ class Hypothesis:
     share: float
     rival: float
     points: int
+
+    @property
+    def is_likely(self) -> bool:
+        """True if the pose fits better than any does by chance."""
+        return self.share >= LEAST_SHARE + _CHANCE / math.sqrt(self.points)
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True if the points fit nearly as well elsewhere."""
+        return self.rival > _AMBIGUOUS * self.share
 
 
 class PlanarMapSearch:
@@ -85,6 +98,13 @@ class PlanarMapSearch:
         while not search.is_done:
             search.advance()
         return search.best()
+
+    def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
+        """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
+        T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
+        points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in path])
+        best = self.best(points, LEAST_SHARE)
+        return best if best is not None and best.is_likely else None
 
     def climbed(self, points: Points, pose: NDArray[np.float64], step_rad: float) -> float:
         """Share of the points at a pose (3,), which moves to the best one near by."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
@@ -16,8 +15,10 @@ from scanchain.data import Closure, Keyframe, Matrix, Pose, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser
+from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.slam import loop_information
+from scanchain.words import counted
 
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
 _OPTIMIZE_EVERY, _GROWTH = 10, 0.05  # keyframes between two optimizations: at least so many, and such a share
@@ -27,12 +28,18 @@ _FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
 _MIN_CLOSURES = 3  # least number of keyframes with a closure in force that join two maps
 _MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other map
+_MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is told, and times that within the maps
+_WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
 _BINS = 360  # of azimuth, 1°; as fine in elevation
 _MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
 _CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
 _RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
-_PIECE_M = 15.0  # path of a piece that is sought by itself
+_PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
+_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
+_MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
+_MIN_PATHS = 2  # least number of agreeing paths
 _MIN_SHARE = 0.3  # least share of these among the keyframes that closures were tried from
 
 
@@ -56,8 +63,9 @@ class Joined:
     closures: tuple[Closure, ...] = ()
 
     @classmethod
-    def of(cls, number: int, saved: SavedMap) -> Joined:
-        """A map alone."""
+    def of(cls, number: int, maps: Sequence[SavedMap]) -> Joined:
+        """One of several maps alone."""
+        saved = maps[number]
         return cls((number,), saved.keyframes, np.full(len(saved.keyframes), number), saved.edges)
 
     @property
@@ -87,65 +95,84 @@ class Joined:
         return replace(self, keyframes=tuple(replace(each, T_odom_lidar=pose) for each, pose in moved))
 
 
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """A pose at which a map might join others, without enough evidence.
+
+    Attributes
+    ----------
+    guest : number of the map; host : of that whose frame the pose is given in
+    T_host_guest : pose of the guest's first keyframe
+    reason : why it is not certain
+    """
+
+    guest: int
+    host: int
+    T_host_guest: Pose
+    reason: str
+
+
 def join_all(
     maps: Sequence[SavedMap], order: Sequence[int], config: Config, held: int, say: Callable[[str], None]
-) -> list[Joined]:
-    """Maps that belong together, each group in one frame, that of its first map.
+) -> tuple[list[Joined], list[Doubt]]:
+    """Maps that belong together, each group in one frame, that of its first map; and what might belong to them.
 
     order : numbers of the maps; each is tried again whenever its group has grown since
     held : number of a map whose keyframes stay where they are, −1 for none
     """
     groups: list[Joined] = []
+    doubts: dict[int, Doubt] = {}
     waiting = list(order)
     while waiting:
-        world = Joined.of(waiting[0], maps[waiting[0]])
-        waiting = waiting[1:]
-        tried: set[tuple[int, bool, int]] = set()
-        while (following := _next(waiting, tried, world)) is not None:
-            tried.add(following)
-            number, thorough, _ = following
-            say(f"{maps[number].name}: searching in a map of {len(world.keyframes):,} keyframes")
-            joined = join(world, Joined.of(number, maps[number]), config, held, thorough=thorough)
+        world = Joined.of(waiting.pop(0), maps)
+        joined: Joined | None = world
+        while joined is not None:
+            world, joined = joined, None
+            for number in waiting:
+                say(f"{maps[number].name}: searching in a map of {len(world.keyframes):,} keyframes")
+                trial = join(world, Joined.of(number, maps), config, held)
+                if isinstance(trial, Doubt):
+                    doubts[number] = trial
+                elif trial is not None and (joined is None or _overlap(trial, world) > _overlap(joined, world)):
+                    joined = trial
+                    if _overlap(joined, world) > _CLEAR:
+                        break
             if joined is not None:
-                world = joined
-                waiting.remove(number)
+                waiting.remove(joined.maps[-1])
+                doubts.pop(joined.maps[-1], None)
         groups.append(world)
-    return groups
+    return groups, list(doubts.values())
 
 
-def _next(
-    waiting: Sequence[int], tried: set[tuple[int, bool, int]], world: Joined
-) -> tuple[int, bool, int] | None:
-    """Number of a map that was not tried in a world of this many maps, thoroughly only once all were tried."""
-    ways = (False, True) if world.dimension == 2 else (True,)
-    untried = ((number, thorough, len(world.maps)) for thorough in ways for number in waiting)
-    return next((each for each in untried if each not in tried), None)
-
-
-def join(world: Joined, guest: Joined, config: Config, held: int = -1, *, thorough: bool = True) -> Joined | None:
-    """Both in the frame of the world; None where too few closures join them, or as many do elsewhere.
+def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined | Doubt | None:
+    """Both in the frame of the world; None where too few closures join them, a doubt where they do not suffice.
 
     Where much of the guest overlaps the world, it is not sought elsewhere.
-    thorough : whether pieces of the guest are sought one by one and little overlap is enough; takes long
     """
     apart = msgspec.structs.replace(
         config.loops, min_travel_m=max(guest.length_m, config.loops.min_travel_m) + 1.0
     )
     between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
-    old, tried, trials = len(world.keyframes), list[Pose](), list[Joined]()
-    for found, T_world_guest in _sought(world, guest, between, thorough=thorough):
-        if len(tried) == _MAX_TRIES:
+    old, tried, trials = len(world.keyframes), list[Matrix](), list[Joined]()
+    for target, source, T_world_source in _sought(world, guest, between):
+        if any(_same(T_world_source, poses[source]) for poses in tried):
+            continue
+        T_world_guest = lie.normalize(T_world_source @ lie.inverse(guest.poses[source]))
+        trial = _Closing(world, guest, target, T_world_guest, between, held).finish()
+        tried.append(T_world_guest @ guest.poses if trial is None else trial.poses[old:])
+        if trial is not None:
+            trials.append(trial)
+        if len(tried) == _MAX_TRIES or (trial is not None and _overlap(trial, world) > _CLEAR):
             break
-        if not any(_same(T_world_guest, other) for other in tried):
-            tried.append(T_world_guest)
-            trial = _Closing(world, guest, found, T_world_guest, between, held).finish()
-            if trial is not None and _joining(trial, old) > _CLEAR * len(guest.keyframes):
-                return trial
-            trials += [trial] if trial is not None and thorough else []
-    trials.sort(key=lambda trial: -_joining(trial, old))
-    if len(trials) > 1 and _joining(trials[1], old) > _RIVAL * _joining(trials[0], old):
+    if not trials:
         return None
-    return trials[0] if trials else None
+    trials.sort(key=lambda trial: -_overlap(trial, world))
+    best, *others = trials
+    if others and _overlap(others[0], world) > _RIVAL * _overlap(best, world):
+        doubt = "nearly as many closures agree at another pose"
+    else:
+        doubt = look_alike(best, old, config) if world.dimension == 2 else ""
+    return Doubt(guest.maps[0], world.maps[0], best.poses[old], doubt) if doubt else best
 
 
 def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
@@ -187,46 +214,65 @@ def _body(joined: Joined, held: int) -> int:
     return int((joined.of_map == held).sum()) or 1
 
 
-def _sought(world: Joined, guest: Joined, config: Config, *, thorough: bool) -> Iterator[tuple[Closure, Pose]]:
-    """Closures of the guest's keyframes in the world, without an expected pose, with T_world_guest by each.
+def _sought(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[int, int, Pose]]:
+    """Poses of the guest's keyframes, sought everywhere in the world; in the plane where two paths agree.
 
-    What is sought in the plane in vain for long is sought seldom; ``thorough`` : pieces of it one by one.
+    Yields the numbers of a keyframe of the world near by and of the guest's, and T_world_keyframe of that.
     """
-    for piece in _pieces(guest) if thorough and guest.dimension == 2 else [guest.keyframes]:
-        closer, keyframes, graph = LoopCloser(config, world.dimension), list(world.keyframes), graph_of(world)
-        begin_m = closer.begin_in(keyframes, is_fixed=False)
-        closer.start_segment(len(keyframes))
-        for keyframe in _after(piece, len(keyframes), begin_m):
-            keyframes.append(keyframe)
-            graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
-            closures = closer.close(keyframes, graph)
-            if keyframe.index + 1 == len(world.keyframes) + len(piece):
-                closures += closer.finish(keyframes, graph)
-            for closure in closures:
-                if closure.verdict is Verdict.ACCEPTED:
-                    T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
-                    T_guest_source = keyframes[closure.source].T_odom_lidar
-                    yield closure, lie.normalize(T_world_source @ lie.inverse(T_guest_source))
+    if world.dimension == 3:
+        yield from _recognized(world, guest, config)
+        return
+    search = PlanarMapSearch(world.keyframes, world.poses, config.local_map.voxel_size_m)
+    finds: list[Pose] = []
+    for path in _paths(guest.keyframes):
+        best = search.likely([guest.keyframes[index] for index in path])
+        if best is None or best.is_ambiguous:
+            continue
+        source = path[len(path) // 2]
+        T_guest_source = guest.poses[source]
+        if any(_agree(T_world_guest @ T_guest_source, best.T_map_lidar) for T_world_guest in finds):
+            away_m = np.linalg.norm((world.poses - best.T_map_lidar)[:, :2, 2], axis=1)
+            yield int(away_m.argmin()), source, best.T_map_lidar
+        finds.append(best.T_map_lidar @ lie.inverse(T_guest_source))
 
 
-def _pieces(guest: Joined) -> Iterator[Sequence[Keyframe]]:
-    """Keyframes in pieces of some length."""
-    numbers = np.array([keyframe.traveled_m for keyframe in guest.keyframes])
-    numbers = ((numbers - numbers[0]) // _PIECE_M).astype(np.int64)
-    for number in np.unique(numbers).tolist():
-        first, last = np.searchsorted(numbers, [number, number + 1]).tolist()
-        yield guest.keyframes[first:last]
+def _recognized(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[int, int, Pose]]:
+    """The same in space, by recognized places."""
+    old, keyframes, graph = len(world.keyframes), list(world.keyframes), graph_of(world)
+    closer = LoopCloser(config, world.dimension)
+    begin_m = closer.begin_in(keyframes, is_fixed=False)
+    closer.start_segment(old)
+    for keyframe in _after(guest.keyframes, old, begin_m):
+        keyframes.append(keyframe)
+        graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+        closures = closer.close(keyframes, graph)
+        if len(keyframes) == old + len(guest.keyframes):
+            closures += closer.finish(keyframes, graph)
+        for closure in closures:
+            if closure.verdict is Verdict.ACCEPTED:
+                T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
+                yield closure.target, closure.source - old, T_world_source
+
+
+def _paths(keyframes: Sequence[Keyframe]) -> list[range]:
+    """Numbers of the keyframes along overlapping paths of some length."""
+    traveled_m = np.array([keyframe.traveled_m for keyframe in keyframes]) - keyframes[0].traveled_m
+    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
+    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
+    ends = np.searchsorted(traveled_m, [begin_m, begin_m + length_m])
+    return [range(first, end) for first, end in np.unique(ends, axis=1).T.tolist() if first < end]
 
 
 class _Closing:
     """Closures between a world and a guest whose pose in it is known but for a standard deviation."""
 
     def __init__(
-        self, world: Joined, guest: Joined, found: Closure, T_world_guest: Pose, config: Config, held: int
+        self, world: Joined, guest: Joined, target: int, T_world_guest: Pose, config: Config, held: int
     ) -> None:
         self.world, self.config, self.held = world, config, held
         self.guest = guest.placed(T_world_guest @ guest.poses)
-        self.found = found
+        self.target = target  # keyframe of the world near the guest
         self.closer = LoopCloser(config, world.dimension)
         self.keyframes = list(world.keyframes)
         self.graph = graph_of(world)
@@ -256,7 +302,7 @@ class _Closing:
     def _add(self, keyframe: Keyframe, edges: Edges) -> None:
         """Add a keyframe with its edges to older ones; where it has none, one to the last, for the time being."""
         old = len(self.world.keyframes)
-        last = self.keyframes[-1] if keyframe.index > old else self.keyframes[self.found.target]
+        last = self.keyframes[-1] if keyframe.index > old else self.keyframes[self.target]
         self.keyframes.append(keyframe)
         self.graph.add_pose(lie.normalize(self.T_world_odom @ keyframe.T_odom_lidar), keyframe.stamp_ns)
         self.graph.add_edges(edges.pairs + old, edges.measurements, edges.information, edges.is_loop)
@@ -313,38 +359,101 @@ def _after(keyframes: Sequence[Keyframe], index: int, begin_m: float) -> Iterato
 def _is_joined(joined: Joined, old: int) -> bool:
     """True if enough closures in force join the keyframes before ``old`` to the others, and free space agrees."""
     tried = len({closure.source for closure in joined.closures if closure.source >= old})
-    if _joining(joined, old) < max(_MIN_CLOSURES, _MIN_SHARE * tried):
+    if len(_joining(joined, old)) < max(_MIN_CLOSURES, _MIN_SHARE * tried):
         return False
     return contradiction(joined.keyframes[:old], joined.keyframes[old:]) <= _MAX_CONTRADICTION
 
 
 def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
     """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
-    d = some[0].T_odom_lidar.shape[0] - 1
+    agreeing, contradicting = _compared(some, others) + _compared(others, some)
+    return float(contradicting / max(agreeing + contradicting, 1))
+
+
+def changed(joined: Joined) -> dict[int, float]:
+    """Contradiction of maps with those they joined, by number, where it is far more than within them."""
+    parts = {
+        number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
+    }
+    agreeing, contradicting = sum((_compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
+    least = max(_MIN_CHANGE, _TIMES_WITHIN * contradicting / max(agreeing + contradicting, 1))
+    found: dict[int, float] = {}
+    for number in joined.maps[1:]:
+        others = [k for other, part in parts.items() if other != number for k in part]
+        share = contradiction(others, parts[number])
+        if share > least:
+            found[number] = share
+    return found
+
+
+def _compared(
+    viewers: Sequence[Keyframe], viewed: Sequence[Keyframe], min_path_m: float = 0.0
+) -> NDArray[np.int64]:
+    """Numbers of points (2,), of the viewed keyframe nearest to each viewer, that agree and that contradict.
+
+    min_path_m : least path between the two
+    """
+    d = viewers[0].T_odom_lidar.shape[0] - 1
     ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
-    agreeing = contradicting = 0
-    for viewers, viewed in ((some, others), (others, some)):
-        near = KDTree([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
-        for viewer in viewers:
-            away_m, index = near.query(viewer.T_odom_lidar[:d, d])
-            other = viewed[int(index)]
-            if away_m <= _NEAR_M[d]:
-                nearest_ranges(lie.lift_points(viewer.points), ranges_m)
-                T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
-                margin_m = _MARGIN_M[d] * viewer.scale
-                yes, no = compare_ranges(
-                    lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
-                )
-                agreeing, contradicting = agreeing + yes, contradicting + no
-    return contradicting / max(agreeing + contradicting, 1)
+    positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
+    traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
+    counts = np.zeros(2, np.int64)
+    for viewer in viewers:
+        away_m = np.linalg.norm(positions - viewer.T_odom_lidar[:d, d], axis=1)
+        away_m[np.abs(traveled_m - viewer.traveled_m) < min_path_m] = np.inf
+        nearest = int(away_m.argmin())
+        if away_m[nearest] <= _NEAR_M[d]:
+            other = viewed[nearest]
+            nearest_ranges(lie.lift_points(viewer.points), ranges_m)
+            T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
+            margin_m = _MARGIN_M[d] * viewer.scale
+            counts += compare_ranges(
+                lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
+            )
+    return counts
 
 
-def _joining(joined: Joined, old: int) -> int:
-    """Number of keyframes from ``old`` on that a closure in force joins to those before."""
+def look_alike(joined: Joined, old: int, config: Config) -> str:
+    """Reason why the keyframes from ``old`` on may agree with those of a look-alike, empty if there is none.
+
+    Where paths that agree fit elsewhere in one of both maps, too, the place repeats itself, maybe beyond the maps.
+    """
+    guest, agreeing = joined.keyframes[old:], _joining(joined, old) - old
+    searches = [
+        PlanarMapSearch(part, np.array([each.T_odom_lidar for each in part]), config.local_map.voxel_size_m)
+        for part in (joined.keyframes[:old], guest)
+    ]
+    paths = [path for path in _paths(guest) if np.isin(path, agreeing).mean() >= _MIN_SHARE]
+    repeated = 0
+    for path in paths:
+        members = [guest[index] for index in path]
+        fits = [fit for search in searches if (fit := search.likely(members)) is not None]
+        repeated += any(
+            fit.is_ambiguous or not _agree(fit.T_map_lidar, members[len(members) // 2].T_odom_lidar)
+            for fit in fits
+        )
+    if repeated > _MAX_REPEATED * len(paths):
+        return f"{repeated} of {counted(len(paths), 'path')} that agree look like other places, too"
+    return "" if len(paths) >= _MIN_PATHS else "they agree along a short path only"
+
+
+def _joining(joined: Joined, old: int) -> NDArray[np.int64]:
+    """Keyframes from ``old`` on that a closure in force joins to those before."""
     pairs = joined.edges.pairs
-    return len(np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1]))
+    return np.unique(pairs[(pairs[:, 0] < old) & (pairs[:, 1] >= old) & (joined.edges.weight > _IN_FORCE), 1])
+
+
+def _overlap(joined: Joined, world: Joined) -> float:
+    """Share of the keyframes that joined a world that closures in force join to it."""
+    old = len(world.keyframes)
+    return len(_joining(joined, old)) / (len(joined.keyframes) - old)
 
 
 def _same(T_a: Pose, T_b: Pose) -> bool:
     away_m, away_rad = lie.apart(T_a, T_b)
     return away_m < _SAME_M and away_rad < _SAME_RAD
+
+
+def _agree(T_a: Pose, T_b: Pose) -> bool:
+    away_m, away_rad = lie.apart(T_a, T_b)
+    return away_m < _AGREE_M and away_rad < _AGREE_RAD

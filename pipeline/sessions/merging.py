@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
@@ -19,7 +20,7 @@ from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.sessions.joining import Joined, graph_of, join_all
+from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import Override, dump, load_settings
 from scanchain.whole_file import write_whole
@@ -68,6 +69,22 @@ class SessionMetrics(msgspec.Struct, frozen=True):
     removed_points: int = 0
 
 
+class UncertainJoin(msgspec.Struct, frozen=True):
+    """A session that might lie in the frame of another one, but stays apart.
+
+    Attributes
+    ----------
+    position_m, yaw_deg : of its first keyframe there
+    reason : why it is not certain
+    """
+
+    session: str
+    frame: str
+    position_m: tuple[float, ...]
+    yaw_deg: float
+    reason: str
+
+
 class MergeMetrics(msgspec.Struct, frozen=True):
     """Contents of metrics.json of a merge.
 
@@ -79,6 +96,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     chi2, degrees_of_freedom, certified, certificate : of the pose graph
     map_points, moving_points_removed : of map.ply
     updated : whether the map follows its newest session
+    uncertain : joins without enough evidence
     run_s : wall time, without compilation
     """
 
@@ -99,6 +117,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     compile_s: float
     warnings: tuple[str, ...]
     updated: bool = False
+    uncertain: tuple[UncertainJoin, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,18 +145,21 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
     names = session_names(maps, order)
     provenance = describe_start(job.command, [saved.folder for saved in maps], settings.source)
     with directory, announcing_compilation(progress.say), Hashing([saved.folder for saved in maps]) as hashing:
-        groups = join_all(maps, order, config, held, progress.say)
-        joined = _chosen(groups, held, [saved.folder.parent for saved in maps])
+        groups, doubts = join_all(maps, order, config, held, progress.say)
+        uncertain = tuple(_uncertain(doubt, names) for doubt in doubts)
+        joined = _chosen(groups, held, [saved.folder.parent for saved in maps], uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
         first = min(joined.maps)
         merged = merged_map(joined, maps, names, config, first=first, held=held, update=job.update)
         final = final_closures(merged)
         write_merged(directory.path, merged, final, config)
         apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
-        warnings = (*(_apart_text(each) for each in apart), *merged.warnings)
+        different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
+        warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
         compile_s = compiled_s() - compiled_before_s
         run_s = working_s() - started
         metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings, updated=job.update)
+        metrics = msgspec.structs.replace(metrics, uncertain=uncertain)
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
         text = _summary(metrics, names[first, 0], settings.source, fixed=job.fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
@@ -197,7 +219,9 @@ def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
     return sorted(range(len(maps)), key=key)
 
 
-def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path]) -> Joined:
+def _chosen(
+    groups: Sequence[Joined], held: int, runs: Sequence[Path], uncertain: Sequence[UncertainJoin]
+) -> Joined:
     """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
     if held >= 0:
         chosen = next(group for group in groups if held in group.maps)
@@ -205,6 +229,8 @@ def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path]) -> Joined
         chosen = max(groups, key=lambda group: (len(group.maps), len(group.keyframes)))
     if len(chosen.maps) < 2:
         what = f"nothing belongs to {runs[held]}" if held >= 0 else "no two of the maps belong together"
+        if uncertain:
+            raise ScanchainError(f"{what} for certain: {'; '.join(map(_uncertain_text, uncertain))}")
         raise ScanchainError(
             f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
             "--loops.max_radius_m where they have drifted far"
@@ -212,13 +238,37 @@ def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path]) -> Joined
     return chosen
 
 
+def _uncertain(doubt: Doubt, names: dict[tuple[int, int], str]) -> UncertainJoin:
+    T, d = doubt.T_host_guest, len(doubt.T_host_guest) - 1
+    position_m, yaw_deg = np.round(T[:d, d], 2), np.round(np.degrees(np.arctan2(T[1, 0], T[0, 0])), 1)
+    session, frame = names[doubt.guest, 0], names[doubt.host, 0]
+    return UncertainJoin(session, frame, tuple(position_m.tolist()), float(yaw_deg), doubt.reason)
+
+
+def _uncertain_text(join: UncertainJoin) -> str:
+    position = ", ".join(f"{each:.1f}" for each in join.position_m)
+    return (
+        f"{join.session} might begin at ({position}) m, heading {join.yaw_deg:.0f} deg, in the frame of "
+        f"{join.frame}; not certain: {join.reason}"
+    )
+
+
 def _names(group: Joined, maps: Sequence[SavedMap], names: dict[tuple[int, int], str]) -> tuple[str, ...]:
     return tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
 
 
-def _apart_text(names: Sequence[str]) -> str:
+def _apart_text(names: Sequence[str], uncertain: Sequence[UncertainJoin]) -> str:
     together = "; they belong together: merge them on their own" if len(names) > 1 else ""
-    return f"{', '.join(names)}: not in this map, too few closures agree{together}"
+    doubts = [_uncertain_text(join) for join in uncertain if {join.session, join.frame} & set(names)]
+    reason = "; ".join(doubts) if doubts else "too few closures agree"
+    return f"{', '.join(names)}: not in this map; {reason}{together}"
+
+
+def _changed_text(name: str, share: float) -> str:
+    return (
+        f"{name}: {100.0 * share:.1f} % of what it and the others had in sight differs; much has changed, or "
+        "it is of another floor of the same plan; then leave it out"
+    )
 
 
 def _measured(
@@ -283,7 +333,7 @@ def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) ->
             for each in m.sessions
         ),
         *(f"apart          {warning}" for warning in m.warnings[: len(m.apart)]),
-        *(f"update         {warning}" for warning in m.warnings[len(m.apart) :]),
+        *(f"warning        {warning}" for warning in m.warnings[len(m.apart) :]),
         f"configuration  {configuration}",
         f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
         f"pose graph     {m.fit}",

@@ -4,7 +4,8 @@ Intel is run whole, and in four parts of a quarter of its time, which are merged
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
 ATE over all scans of both after rigid alignment. CSAIL is added to the parts of Intel. Eight parts of Intel of
 2,000 scans each are merged; their time is that of their runs together. Runs stay in the cache; what is there is
-not run again, its time is that of then. Prints a Markdown table.
+not run again, its time is that of then. Six parts of a walk through identical corridors are merged pair by pair.
+Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ import argparse
 import os
 import tempfile
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 import scanchain as sc
+from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.runs.metrics import Metrics
@@ -92,6 +95,23 @@ def town(cache: Path, folder: Path) -> None:
     show("town, two sessions", parts, merged, f"ATE {error:.4f} m")
 
 
+def look_alikes(cache: Path, folder: Path) -> None:
+    log = cache / "identical.mcap"
+    truth = read_tum(log.with_suffix(".tum")) if log.exists() else sc.simulate("identical", log)
+    true = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
+    parts = [run(cache, f"identical-{k + 1}", log, 50.0 * k, 50.0 * (k + 1)) for k in range(6)]
+    right = wrong = uncertain = 0
+    for pair_of in combinations(parts, 2):
+        try:
+            merged = sc.merge(pair_of, folder / "-".join(part.name for part in pair_of))
+        except sc.ScanchainError as error:
+            uncertain += "not certain" in str(error)
+            continue
+        is_right = absolute_error(pair(trajectory(merged), true)).translation_m.rmse < 0.5
+        right, wrong = right + is_right, wrong + (not is_right)
+    print(f"\nidentical corridors, 15 pairs: {wrong} joined wrongly, {right} rightly, {uncertain} named uncertain")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, help="folder of the runs")
@@ -101,7 +121,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         runs = cache or Path(folder) / "runs"
         runs.mkdir(parents=True, exist_ok=True)
-        for part in (intel, eight, town):
+        for part in (intel, eight, town, look_alikes):
             part(runs, Path(folder))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.maps import Edges, open_saved_map, read_ply
 from scanchain.runs.job import Unwatched
-from scanchain.sessions.joining import Joined, contradiction, graph_of
+from scanchain.sessions.joining import Joined, changed, contradiction, graph_of, look_alike
 from scanchain.sessions.merging import MergeJob, merge
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.run import draw_run
@@ -335,3 +336,78 @@ def _room(dimension, half_m):
             return points
 
     return Keyframe(0, 0, 0, Points(), lie.identity(dimension), 0.0)
+
+
+def test_a_map_that_differs_from_those_it_joined_by_more_than_they_do_in_themselves_is_told():
+    def joined_with(half_m):
+        keyframes = [
+            replace(_room(2, wide_m), index=k, traveled_m=100.0 * k)
+            for k, wide_m in enumerate((4.0, 4.0, *half_m))
+        ]
+        return Joined((0, 1), tuple(keyframes), np.array([0, 0, 1, 1]), None)
+
+    assert changed(joined_with((4.0, 4.0))) == {}
+    assert changed(joined_with((9.0, 9.0)))[1] > 0.3
+
+
+def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs, call, tmp_path, monkeypatch):
+    folder, truth = runs
+    evening = list(PARTS).index("evening")
+
+    def doubt(joined, old, config):
+        return "a reason" if evening in joined.maps else ""
+
+    monkeypatch.setattr("scanchain.sessions.joining.look_alike", doubt)
+    code, _, said = call("merge", *(folder / name for name in PARTS), "--out", tmp_path / "out")
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert code == 0
+    assert metrics["apart"] == [["evening"]]
+    (join,) = (each for each in metrics["uncertain"] if each["session"] == "noon")
+    assert (join["frame"], join["reason"]) == ("evening", "a reason")
+    true = [
+        truth.poses[np.searchsorted(truth.stamps_ns, open_saved_map(folder / name).keyframes[0].stamp_ns)]
+        for name in ("evening", "noon")
+    ]
+    assert np.linalg.norm(lie.between(*true)[:2, 2] - join["position_m"]) < 0.1
+    assert "noon might begin at" in said + (tmp_path / "out" / "summary.txt").read_text()
+    assert "noon might begin at" in (tmp_path / "out" / "report.html").read_text()
+    monkeypatch.setattr("scanchain.sessions.joining.look_alike", lambda joined, old, config: "a reason")
+    code, _, said = call("merge", folder / "noon", folder / "evening", "--out", tmp_path / "two")
+    assert code == 1
+    assert "no two of the maps belong together for certain: noon might begin at" in said
+    assert not (tmp_path / "two").exists()
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(repeats):
+    depths_m = np.random.default_rng(4).uniform(1.0, 3.0, 60)
+    if repeats:
+        depths_m = np.tile(depths_m[:5], 12)
+    path = [_corridor(float(x_m), index, depths_m) for index, x_m in enumerate(np.arange(20.0, 38.0, 0.5))]
+    count = len(path)
+    pairs = np.column_stack([np.arange(count), np.arange(count, 2 * count)])
+    eyes = np.tile(np.eye(3), (count, 1, 1))
+    edges = Edges(pairs, eyes, eyes, np.ones(count, np.bool_), np.ones(count))
+    joined = Joined((0, 1), (*path, *path), np.repeat([0, 1], count), edges)
+    config = sc.load_settings(2).config
+    doubt = look_alike(joined, count, config)
+    assert ("look like other places" in doubt) == bool(doubt) == repeats
+    few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
+    assert "short path" in look_alike(few, count, config)
+
+
+def _corridor(x_m, index, depths_m):
+    """A keyframe in a corridor, one wall of which is as far away as said for every meter along it."""
+    angles = np.arange(-np.pi, np.pi, 0.01)
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    ranges_m = np.arange(0.0, 10.0, 0.02)
+    along, across = x_m + ranges_m * directions[:, :1], ranges_m * directions[:, 1:]
+    is_wall = (across < -1.0) | (across > depths_m[np.clip(along, 0.0, 59.9).astype(int)])
+    seen = is_wall.any(axis=1)
+    points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
+
+    class Points:
+        def read(self):
+            return points
+
+    return Keyframe(index, index, index, Points(), lie.pose_2d(x_m, 0.0, 0.0), x_m)

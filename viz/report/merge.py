@@ -111,8 +111,8 @@ def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
         for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
     )
     apart = tuple(
-        Row(name, (Cell("not in this map: too few closures agree", is_wide=True, is_bad=True),))
-        for group in metrics.apart
+        Row(name, (Cell(warning.partition(": ")[2], is_wide=True, is_bad=True),))
+        for group, warning in zip(metrics.apart, metrics.warnings, strict=False)  # of the map come last
         for name in group
     )
     return Section("Sessions", grid=Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows + apart))
