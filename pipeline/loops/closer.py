@@ -62,11 +62,11 @@ class LoopCloser:
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        components = self.segments.components(graph)
-        connected = components == components[-1]
         if self.map_search is not None and self.map_search.has_just_matched(keyframes):
             self.places.skip(keyframes)
             return ()
+        components = self.segments.components(graph)
+        connected = components == components[-1]
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
@@ -78,10 +78,23 @@ class LoopCloser:
             closures += self.map_search.close(keyframes, graph, components)
         return closures + self.places.close(keyframes, graph, connected)
 
+    @property
+    def is_searching(self) -> bool:
+        """True while a search of the map goes on, which every scan does a part of."""
+        return self.map_search is not None and self.map_search.search is not None
+
+    def go_on(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures of the search of the map, in a scan that is no keyframe."""
+        assert self.map_search is not None
+        return self.map_search.go_on(keyframes, graph, self.segments.components(graph))
+
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the submaps that the end of the log leaves incomplete."""
+        """Closures of the search and of the submaps that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        return self.places.close(keyframes, graph, components == components[-1], finish=True)
+        closures = self.places.close(keyframes, graph, components == components[-1], finish=True)
+        if self.map_search is not None:
+            closures += self.map_search.go_on(keyframes, graph, components, finish=True)
+        return closures
 
 
 class ProximityCloser:
