@@ -28,7 +28,7 @@ _COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, a
 _REFINED_RAD = 0.15  # half width of the window in heading around what it found
 _MIN_COLUMNS = 30  # number of columns, below which there is too little to see
 _MAX_CELLS = 1 << 21  # of the coarse grid of a map; a larger one has coarser cells
-_STEPS = 200_000  # windows of the coarse search that are split in one scan
+_STEPS = 150_000  # windows of the coarse search that are split in one scan
 _VERIFIED = 50_000  # windows that are split in the time in which one pose is verified
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
 _RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
@@ -192,7 +192,6 @@ class MapSearch:
             return np.empty((0, 4)), 0
         if self.grid is None:
             self.grid = self._drawn()
-            yield
         coarse_m = self.grid.surfaces.resolution_m
         anywhere = Window(math.inf, math.pi, _APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
         search = PlaceSearch(self.grid, evenly(columns, _COARSE_COLUMNS), anywhere)

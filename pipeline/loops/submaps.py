@@ -96,6 +96,7 @@ class VoxelSubmaps:
             chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
             build = self._build_at_once if is_of_map and self.dimension == 3 else self._build
             submap = build(keyframes[anchor], [keyframes[index] for index in chosen])
+            submap.compact()
         self.cached[anchor, last] = submap
         if len(self.cached) > _MAX_CACHED:
             self.cached.popitem(last=False)

@@ -77,4 +77,4 @@ class PlaceSearch:
         found = self.found[: self.held[FOUND]]
         xy = self.grid.surfaces.origin_m + self.grid.surfaces.resolution_m * (found[:, 2:] + 0.5)
         yaw = (found[:, 1] - len(self.offsets) // 2) * self.turn_rad
-        return np.column_stack([xy, yaw, found[:, 0] / self.most])
+        return np.column_stack([xy, yaw, found[:, 0] / self.most]).astype(np.float64)
