@@ -153,9 +153,8 @@ class Slam:
         keyframe = self._keyframe(located)
         closures: tuple[Closure, ...] = ()
         state = None
-        if self.config.loops.enabled and (keyframe >= 0 or self.closer.is_searching):
-            close = self.closer.close if keyframe >= 0 else self.closer.go_on
-            closures = self._close_loops(close(self.keyframes, self.graph))
+        if self.config.loops.enabled:
+            closures = self._close_loops(keyframe >= 0)
             state = self._optimize_when_due()
         timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
@@ -265,8 +264,10 @@ class Slam:
         self.keyframes.append(keyframe)
         return keyframe.index
 
-    def _close_loops(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
-        closures = self._take(closures)
+    def _close_loops(self, is_keyframe: bool) -> tuple[Closure, ...]:
+        closures = self._take(self.closer.advance(self.keyframes, self.graph))
+        if is_keyframe:
+            closures += self._take(self.closer.close(self.keyframes, self.graph))
         for closure in closures if self.first else ():
             is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
             if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):

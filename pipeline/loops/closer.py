@@ -49,6 +49,8 @@ class LoopCloser:
         if is_fixed:
             self.near.of_map = len(keyframes)
             self.near.submaps.begin_in(keyframes)
+            if self.relocalizer is not None and self.config.loops.enabled:
+                self.relocalizer.begin_in(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
         if folder is not None and self.relocalizer is None and self.config.loops.enabled:
             self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
         return self.places.begin_in(keyframes, are_added=self.map_search is None)
@@ -56,6 +58,12 @@ class LoopCloser:
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
+
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures by a search of the whole map, which goes on with every scan, in slices of equal work."""
+        if self.map_search is not None:
+            return self.map_search.advance(keyframes, graph)
+        return () if self.relocalizer is None else self.relocalizer.advance(keyframes, graph)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.
@@ -78,22 +86,13 @@ class LoopCloser:
             closures += self.map_search.close(keyframes, graph, components)
         return closures + self.places.close(keyframes, graph, connected)
 
-    @property
-    def is_searching(self) -> bool:
-        """True while a search of the map goes on, which every scan does a part of."""
-        return self.map_search is not None and self.map_search.search is not None
-
-    def go_on(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the search of the map, in a scan that is no keyframe."""
-        assert self.map_search is not None
-        return self.map_search.go_on(keyframes, graph, self.segments.components(graph))
-
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures of the search and of the submaps that the end of the log leaves incomplete."""
+        """Closures of the submaps and searches that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        closures = self.places.close(keyframes, graph, components == components[-1], finish=True)
+        closures = () if self.relocalizer is None else self.relocalizer.finish(keyframes, graph)
+        closures += self.places.close(keyframes, graph, components == components[-1], finish=True)
         if self.map_search is not None:
-            closures += self.map_search.go_on(keyframes, graph, components, finish=True)
+            closures += self.map_search.finish(keyframes, graph, components)
         return closures
 
 

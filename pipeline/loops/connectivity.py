@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
@@ -37,12 +35,15 @@ class Segments:
     def components(self, graph: PoseGraph) -> NDArray[np.int64]:
         """Number of the connected component of each keyframe (K,): segments that loops join have the same one."""
         segment = self.of(np.arange(len(graph)))
+        if len(self.starts) == 1:
+            return segment
         ends = segment[graph.edges[graph.is_loop & (graph.weight > _MIN_WEIGHT)]]
         count = len(self.starts)
-        if count == 1:
-            return segment
-        links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-        return connected_components(links, directed=False)[1].astype(np.int64)[segment]
+        number = np.arange(count)
+        for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
+            i, j = divmod(pair, count)
+            number[number == number[j]] = number[i]
+        return np.unique(number, return_inverse=True)[1].astype(np.int64)[segment]
 
 
 class Drift:

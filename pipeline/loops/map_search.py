@@ -66,6 +66,7 @@ class MapSearch:
         self.size_m, self.columns = outline.size_m, outline.columns
         self.grid: PlaceGrid | None = None  # drawn when first searched
         self.search: Generator[None, None, Closure | None] | None = None  # the one that is under way
+        self.has_advanced = False  # in the present scan
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with the map
         self.finds: list[Closure] = []
@@ -102,28 +103,34 @@ class MapSearch:
             self.next_m = newest.traveled_m + max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M)
             members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
             self.search = self._found(members, keyframes)
-        return self.go_on(keyframes, graph, components)
+        return () if self.has_advanced else self._go_on(keyframes, graph, components)
 
-    def go_on(
-        self,
-        keyframes: Sequence[Keyframe],
-        graph: PoseGraph,
-        components: NDArray[np.int64],
-        *,
-        finish: bool = False,
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures, as of ``close``, of the search that is under way, which does its part of a new scan."""
+        self.has_advanced = self.search is not None
+        if self.search is None:
+            return ()
+        return self._go_on(keyframes, graph, self.segments.components(graph))
+
+    def finish(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
     ) -> tuple[Closure, ...]:
-        """Go on with the search that is under way, if any; its closures as of ``close`` once it is over.
-
-        finish : go on to its end
-        """
+        """Complete the search that is under way, if any."""
+        closures: tuple[Closure, ...] = ()
         while self.search is not None:
-            try:
-                next(self.search)
-            except StopIteration as over:
-                self.search = None
-                return self._judged(over.value, keyframes, graph, components)
-            if not finish:
-                break
+            closures = self._go_on(keyframes, graph, components)
+        return closures
+
+    def _go_on(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
+    ) -> tuple[Closure, ...]:
+        if self.search is None:
+            return ()
+        try:
+            next(self.search)
+        except StopIteration as over:
+            self.search = None
+            return self._judged(over.value, keyframes, graph, components)
         return ()
 
     def _begun_m(self, keyframes: Sequence[Keyframe], components: NDArray[np.int64]) -> float:

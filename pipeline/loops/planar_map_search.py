@@ -14,11 +14,21 @@ from scanchain import lie
 from scanchain.config import MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose
 from scanchain.kernels.search.branch_and_bound import fill_pyramid
-from scanchain.kernels.search.whole_map import SURFACE, climb, score_cells, search_map
+from scanchain.kernels.search.whole_map import (
+    SURFACE,
+    best_poses,
+    climb,
+    find_room,
+    interleave,
+    score_cells,
+    score_windows,
+    turned,
+)
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
 
-_TOP = 5  # levels of the pyramid above the grid itself; windows start with 2⁵ cells
+_TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones rule out nothing
+_ADDITIONS = 400_000_000  # of scores in one slice of a search, 20 to 40 ms
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and below minus which it is free
 _POINTS, _MORE_POINTS = 200, 800  # number of points that poses are searched with and compared with
@@ -65,33 +75,73 @@ class PlanarMapSearch:
         self.pyramid = np.zeros((_TOP + 1, *log_odds.shape), np.int8)
         score_cells(log_odds, _CERTAIN, self.pyramid[0])
         fill_pyramid(self.pyramid)
+        self.blocks = interleave(self.pyramid[_TOP], _TOP)
+        self.spans = np.empty((self.blocks.shape[2], 2), np.int64)
+        self.has_room = find_room(self.pyramid[0], _TOP, self.spans)
 
     def best(self, points: Points, least: float) -> Hypothesis | None:
         """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share."""
-        points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
-        few, many = points[:_POINTS].copy(), points[:_MORE_POINTS].copy()
-        if not len(few):
-            return None
-        range_m = max(float(np.median(np.hypot(few[:, 0], few[:, 1]))), _MIN_RANGE_M)
-        turns = math.ceil(2.0 * math.pi * range_m / self.resolution_m)
-        found = search_map(
-            self.pyramid, few, self.resolution_m, turns, least * SURFACE * len(few), _RIVAL, _APART_M, _ANSWERS
-        )
-        if not len(found):
-            return None
-        poses = np.empty((len(found), 3))
-        poses[:, :2] = self.origin_m + (found[:, :2] + 0.5) * self.resolution_m
-        poses[:, 2] = 2.0 * math.pi / turns * found[:, 2]
-        shares = np.array([self._climbed(many, pose, math.pi / turns) for pose in poses])
-        best = int(np.argmax(shares))
-        rival = float(shares[_is_apart(poses, poses[best])].max(initial=0.0))
-        x_m, y_m, yaw_rad = poses[best].tolist()
-        return Hypothesis(lie.pose_2d(x_m, y_m, yaw_rad), float(shares[best]), rival, len(points))
+        search = WholeSearch(self, points, least)
+        while not search.is_done:
+            search.advance()
+        return search.best()
 
-    def _climbed(self, points: Points, pose: NDArray[np.float64], step_rad: float) -> float:
+    def climbed(self, points: Points, pose: NDArray[np.float64], step_rad: float) -> float:
         """Share of the points at a pose (3,), which moves to the best one near by."""
         score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
         return float(score) / SURFACE
+
+
+class WholeSearch:
+    """Search of a whole map for points, in slices of equal work, so that no scan of a live stream waits long."""
+
+    def __init__(self, target: PlanarMapSearch, points: Points, least: float) -> None:
+        """Begin to search for points (N, 2), lidar frame; least : share of the highest score that counts."""
+        points = np.random.default_rng(0).permutation(downsample(points, target.resolution_m))
+        self.target = target
+        self.count = len(points)
+        self.points = points[:_MORE_POINTS].copy()
+        few = points[:_POINTS].copy()
+        range_m = max(float(np.median(np.hypot(few[:, 0], few[:, 1]))), _MIN_RANGE_M) if len(few) else 0.0
+        self.cells = turned(few, target.resolution_m, math.ceil(2.0 * math.pi * range_m / target.resolution_m))
+        self.least = least * SURFACE * len(few)
+        additions = max(int(np.maximum(np.diff(target.spans), 0).sum()) * len(few), 1)
+        self.headings = max(_ADDITIONS // additions, 1)
+        self.turn = 0
+        self.windows: list[NDArray[np.int64]] = []
+
+    @property
+    def is_done(self) -> bool:
+        """True once all headings were searched."""
+        return self.turn >= len(self.cells)
+
+    def advance(self) -> None:
+        """Search the next headings."""
+        target, cells = self.target, self.cells[self.turn : self.turn + self.headings]
+        self.windows.append(
+            score_windows(target.blocks, _TOP, target.has_room, target.spans, cells, self.turn, self.least)
+        )
+        self.turn += len(cells)
+
+    def best(self) -> Hypothesis | None:
+        """The pose that the points fit best; None where none has the least share."""
+        target, turns = self.target, len(self.cells)
+        if not self.count:
+            return None
+        found = best_poses(
+            target.pyramid, self.cells, np.vstack(self.windows), target.resolution_m, self.least, _RIVAL, _APART_M,
+            _ANSWERS,
+        )  # fmt: skip
+        if not len(found):
+            return None
+        poses = np.empty((len(found), 3))
+        poses[:, :2] = target.origin_m + (found[:, :2] + 0.5) * target.resolution_m
+        poses[:, 2] = 2.0 * math.pi / turns * found[:, 2]
+        shares = np.array([target.climbed(self.points, pose, math.pi / turns) for pose in poses])
+        best = int(np.argmax(shares))
+        rival = float(shares[_is_apart(poses, poses[best])].max(initial=0.0))
+        x_m, y_m, yaw_rad = poses[best].tolist()
+        return Hypothesis(lie.pose_2d(x_m, y_m, yaw_rad), float(shares[best]), rival, self.count)
 
 
 def _is_apart(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
@@ -112,7 +112,7 @@ class Relocalizer:
 
     All points of its path so far are searched for in the whole map, again and again as it travels. A pose is
     taken once it fits better than chance, no pose elsewhere fits nearly as well, an earlier search found the same
-    one, and scans align there.
+    one, and scans align there. A search in a large map goes on over several scans.
     """
 
     def __init__(self, submaps: VoxelSubmaps, verifier: ScanVerifier, segments: Segments) -> None:
@@ -124,6 +124,18 @@ class Relocalizer:
         self.found: list[Find] = []
         self.searched: PlanarMapSearch | None = None
         self.searched_poses = np.empty((0, 3, 3))
+        self.underway: Search | None = None
+
+    def begin_in(self, keyframes: Sequence[Keyframe], T_map_lidar: Matrix) -> None:
+        """Draw a map, with keyframes at their poses (K, 3, 3), before its first search."""
+        self._draw(keyframes, T_map_lidar)
+
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Go on with the search that is under way, for a scan; closures once it is done, as of ``close``."""
+        if self.underway is None:
+            return ()
+        self.underway.search.advance()
+        return self._found(keyframes, graph.poses) if self.underway.search.is_done else ()
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
@@ -132,26 +144,37 @@ class Relocalizer:
 
         components : (K,) of ``Segments.components``
         """
-        start, newest = self.segments.starts[-1], len(keyframes) - 1
-        traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
+        start = self.segments.starts[-1]
         unknown = np.flatnonzero(components != components[-1])
-        is_due = traveled_m >= _FIRST_M and keyframes[-1].traveled_m >= self.next_m
-        if not len(unknown) or not is_due:
+        if not len(unknown) or (self.underway is not None and self.underway.source < start):
+            self.underway = None
+        if not len(unknown) or self.underway is not None or not self._is_due(start, keyframes):
             return ()
-        self.next_m = keyframes[-1].traveled_m + max(_BACKOFF * traveled_m, _APART_M)
-        self.found = [find for find in self.found if find.source >= start]
-        old = self._next_component(unknown, components)
-        first = newest
-        while first > start and keyframes[newest].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
-            first -= 1
-        find = self._search(keyframes[first:], old, keyframes, graph.poses)
+        self._begin(start, self._next_component(unknown, components), keyframes, graph.poses)
+        return self.advance(keyframes, graph)
+
+    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures by the search that the end of the log left under way."""
+        closures: tuple[Closure, ...] = ()
+        while self.underway is not None:
+            closures = self.advance(keyframes, graph)
+        return closures
+
+    def _found(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
+        """Closures by the search that is done, where it agrees with another one of the newest segment."""
+        assert self.underway is not None
+        old, find = self.underway.old, self.underway.find()
+        self.underway = None
         if find is None:
             return ()
+        start = self.segments.starts[-1]
+        self.found = [each for each in self.found if each.source >= start]
         agreeing = any(_agree(other, find, keyframes) for other in self.found)
         self.found.append(find)
         if not agreeing:
             return ()
-        closures = self._verified(find, np.arange(first, newest + 1), old, keyframes, graph.poses)
+        path = np.arange(_path_begin(keyframes, start), len(keyframes))
+        closures = self._verified(find, path, old, keyframes, T_world)
         if any(closure.verdict is Verdict.ACCEPTED for closure in closures):
             self.found = []
         return closures
@@ -162,24 +185,28 @@ class Relocalizer:
         self.turn += 1
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
 
-    def _search(
-        self, path: Sequence[Keyframe], old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix
-    ) -> Find | None:
-        """The pose of the last keyframe of a path among older ones; None where there is none, or no clear one."""
-        if self.searched is None or not np.array_equal(self.searched_poses, T_world[old]):
-            voxel_size_m = self.submaps.config.voxel_size_m
-            self.searched_poses = T_world[old]
-            self.searched = PlanarMapSearch(
-                [keyframes[k] for k in old.tolist()], self.searched_poses, voxel_size_m
-            )
+    def _is_due(self, start: int, keyframes: Sequence[Keyframe]) -> bool:
+        """True if the newest segment has gone far enough for the next search, which sets the distance after it."""
+        traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
+        if traveled_m < _FIRST_M or keyframes[-1].traveled_m < self.next_m:
+            return False
+        self.next_m = keyframes[-1].traveled_m + max(_BACKOFF * traveled_m, _APART_M)
+        return True
+
+    def _begin(self, start: int, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> None:
+        """Begin a search for the end of the newest segment among older keyframes."""
+        path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
-        best = self.searched.best(points, _LEAST_SHARE)
-        if best is None or best.rival > _RIVAL * best.share:
-            return None
-        if best.share < _LEAST_SHARE + _CHANCE / math.sqrt(best.points):
-            return None
-        return Find(path[-1].index, int(old[0]), best.T_map_lidar)
+        target = self._draw([keyframes[k] for k in old.tolist()], T_world[old])
+        self.underway = Search(path[-1].index, old, WholeSearch(target, points, _LEAST_SHARE))
+
+    def _draw(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> PlanarMapSearch:
+        """The map of keyframes at their poses; the last one where these are the same."""
+        if self.searched is None or not np.array_equal(self.searched_poses, T_world):
+            self.searched = PlanarMapSearch(keyframes, T_world, self.submaps.config.voxel_size_m)
+            self.searched_poses = T_world
+        return self.searched
 
     def _verified(
         self,
@@ -224,6 +251,24 @@ class Relocalizer:
 
 
 @dataclass(frozen=True, slots=True)
+class Search:
+    """A search under way, for keyframe ``source`` among the older keyframes ``old``."""
+
+    source: int
+    old: NDArray[np.int64]
+    search: WholeSearch
+
+    def find(self) -> Find | None:
+        """What was found; None where there is nothing, or nothing clear."""
+        best = self.search.best()
+        if best is None or best.rival > _RIVAL * best.share:
+            return None
+        if best.share < _LEAST_SHARE + _CHANCE / math.sqrt(best.points):
+            return None
+        return Find(self.source, int(self.old[0]), best.T_map_lidar)
+
+
+@dataclass(frozen=True, slots=True)
 class Find:
     """The pose of keyframe ``source`` among older keyframes, by a search; ``target`` is the first of them."""
 
@@ -253,6 +298,14 @@ def _best(anchors: Sequence[int], seeds: Sequence[Seed], T_world: Matrix) -> Fou
     if rival >= _AMBIGUOUS * shares[best]:
         return None
     return Found(anchors[best], seeds[best].T_target_source)
+
+
+def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:
+    """The first keyframe, from ``start`` on, of the path whose points are searched for."""
+    first = len(keyframes) - 1
+    while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
+        first -= 1
+    return first
 
 
 def _agree(a: Find, b: Find, keyframes: Sequence[Keyframe]) -> bool:

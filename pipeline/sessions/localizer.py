@@ -112,6 +112,7 @@ class Localizer:
         self.traveled_m: list[float] = []
         self.start_m = self.slam.traveled_m
         self.is_in_map = False
+        self.by_map: tuple[Closure | None, Matrix] = None, np.empty((0, 0))
 
     def track(
         self,
@@ -181,7 +182,8 @@ class Localizer:
         drift = lie.by_component(k, config.drift * since_m, _TURN * config.drift * since_m)
         if by_map is None:
             return np.diag(lie.by_component(k, *INITIAL_SIGMAS) ** 2 + drift**2)
-        information = loop_information(by_map, config)
+        if self.by_map[0] is not by_map:
+            self.by_map = by_map, np.asarray(np.linalg.inv(loop_information(by_map, config)), np.float64)
         T_source_lidar = lie.between(slam.keyframes[by_map.source].T_odom_lidar, T_odom_lidar)
         Ad = lie.adjoint(lie.inverse(T_source_lidar))
-        return Ad @ np.linalg.inv(information) @ Ad.T + np.diag(drift**2)
+        return Ad @ self.by_map[1] @ Ad.T + np.diag(drift**2)

@@ -315,8 +315,8 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
     closer.begin_in(mapped, tmp_path)
     closer.start_segment(len(mapped))
     found, scans = closer.close(keyframes, graph_of(keyframes)), 1
-    while closer.is_searching:
-        found, scans = closer.go_on(keyframes, graph_of(keyframes)), scans + 1
+    while closer.map_search.search is not None:
+        found, scans = closer.advance(keyframes, graph_of(keyframes)), scans + 1
     assert scans > 3 and [each.target for each in found] == [each.target for each in at_once]
     np.testing.assert_array_equal(found[0].match.T_target_source, at_once[0].match.T_target_source)
 
@@ -328,8 +328,8 @@ def test_a_search_that_the_end_of_the_log_interrupts_is_completed(tmp_path, monk
     keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
     closer.begin_in(mapped, tmp_path)
     closer.start_segment(len(mapped))
-    assert not closer.close(keyframes, graph_of(keyframes)) and closer.is_searching
-    assert closer.finish(keyframes, graph_of(keyframes)) and not closer.is_searching
+    assert not closer.close(keyframes, graph_of(keyframes)) and closer.map_search.search is not None
+    assert closer.finish(keyframes, graph_of(keyframes)) and closer.map_search.search is None
 
 
 def test_a_log_of_elsewhere_is_found_nowhere_in_a_map(tmp_path):

@@ -6,8 +6,19 @@ import pytest
 from scanchain import lie
 from scanchain.data import Keyframe
 from scanchain.kernels.search.branch_and_bound import fill_pyramid
-from scanchain.kernels.search.whole_map import FREE, NEAR, SURFACE, score_cells, search_map
-from scanchain.loops.planar_map_search import PlanarMapSearch
+from scanchain.kernels.search.whole_map import (
+    FREE,
+    NEAR,
+    SURFACE,
+    best_poses,
+    find_room,
+    interleave,
+    score_cells,
+    score_windows,
+    turned,
+)
+from scanchain.loops import planar_map_search
+from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from tests.support.scenes import stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
@@ -54,6 +65,22 @@ def test_two_identical_rooms_rival_each_other():
     assert best.rival > 0.95 * best.share
 
 
+def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
+    target, points = rooms([True, False]), seen(with_pillar=True)
+    at_once = WholeSearch(target, points, 0.3)
+    at_once.advance()
+    assert at_once.is_done
+    monkeypatch.setattr(planar_map_search, "_ADDITIONS", 20_000_000)
+    sliced = WholeSearch(target, points, 0.3)
+    sliced.advance()
+    assert not sliced.is_done
+    while not sliced.is_done:
+        sliced.advance()
+    one, other = at_once.best(), sliced.best()
+    assert (one.T_map_lidar == other.T_map_lidar).all()
+    assert (one.share, one.rival, one.points) == (other.share, other.rival, other.points)
+
+
 def test_a_room_of_another_shape_is_nowhere():
     circle = np.stack([np.cos(a := np.linspace(-np.pi, np.pi, 720)), np.sin(a)], axis=1)
     assert rooms([True, False]).best(1.7 * circle, 0.3) is None
@@ -69,7 +96,11 @@ def test_the_search_finds_the_best_of_all_poses_with_the_lidar_in_free_space():
     pyramid[0] = cells
     fill_pyramid(pyramid)
     points, turns = rng.uniform(-1.0, 1.0, (40, 2)), 12
-    found = search_map(pyramid, points, 0.1, turns, 0.0, 0.9, 0.5, 1)
+    spans = np.empty((15, 2), np.int64)
+    has_room = find_room(cells, 2, spans)
+    of_points, blocks = turned(points, 0.1, turns), interleave(pyramid[2], 2)
+    windows = [score_windows(blocks, 2, has_room, spans, of_points[k : k + 5], k, 0.0) for k in range(0, turns, 5)]
+    found = best_poses(pyramid, of_points, np.vstack(windows), 0.1, 0.0, 0.9, 0.5, 1)
     scores = {}
     for turn in range(turns):
         c, s = np.cos(2.0 * np.pi * turn / turns), np.sin(2.0 * np.pi * turn / turns)

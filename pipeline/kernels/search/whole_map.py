@@ -33,27 +33,100 @@ def score_cells(log_odds, limit: float, cells):
 
 
 @njit(cache=True, nogil=True)
-def search_map(
-    pyramid, points, resolution_m: float, turns: int, least: float, rival: float, apart_m: float, answers: int
+def interleave(layer, level: int):
+    """Cells (2ˡ, 2ˡ, rows, columns) of a layer at level l, by their place in its 2ˡ × 2ˡ blocks.
+
+    Points of one scan in neighboring windows then lie side by side, and many windows are scored at once.
+    """
+    size = 1 << level
+    rows, columns = (layer.shape[0] + size - 1) // size, (layer.shape[1] + size - 1) // size
+    blocks = np.zeros((size, size, rows, columns), layer.dtype)
+    for row in range(layer.shape[0]):
+        for column in range(layer.shape[1]):
+            blocks[row % size, column % size, row // size, column // size] = layer[row, column]
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def find_room(cells, level: int, spans):
+    """Windows (rows, columns) of 2ˡ × 2ˡ cells with room for the lidar; spans (rows, 2): first, past the last."""
+    size = 1 << level
+    rows, columns = spans.shape[0], (cells.shape[1] + size - 1) // size
+    has_room = np.zeros((rows, columns), np.bool_)
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            if _is_room(cells[row, column]):
+                has_room[row // size, column // size] = True
+    for row in range(rows):
+        spans[row, 0], spans[row, 1] = columns, 0
+        for column in range(columns):
+            if has_room[row, column]:
+                spans[row, 0], spans[row, 1] = min(spans[row, 0], column), column + 1
+    return has_room
+
+
+@njit(cache=True, nogil=True)
+def score_windows(blocks, level: int, has_room, spans, cells, first: int, least: float):
+    """Windows with room that score at least so much under some headings: (K, 5) −bound, level, turn, column, row.
+
+    blocks : of ``interleave``; has_room, spans : of ``find_room``
+    cells : (turns, N, 2) of ``turned``, the headings from ``first`` on
+    """
+    size, rows = 1 << level, blocks.shape[2]
+    scores = np.empty(blocks.shape[2:], np.int16)
+    windows = [(0, 0, 0, 0, 0) for _ in range(0)]
+    for turn in range(cells.shape[0]):
+        _score_heading(blocks, level, spans, cells[turn], scores)
+        for row in range(rows):
+            for column in range(spans[row, 0], spans[row, 1]):
+                if has_room[row, column] and scores[row, column] >= least:
+                    bound = int(scores[row, column])
+                    windows.append((-bound, level, first + turn, column * size, row * size))
+    result = np.empty((len(windows), 5), np.int64)
+    for k, window in enumerate(windows):
+        for part, value in enumerate(window):
+            result[k, part] = value
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _score_heading(blocks, level: int, spans, cells, scores):
+    """Score of the points in every window, under one heading: cells (N, 2). The innermost loop is vectorized."""
+    size, rows, columns = 1 << level, blocks.shape[2], blocks.shape[3]
+    scores[:] = 0
+    for i in range(cells.shape[0]):
+        x, y = cells[i, 0] >> level, cells[i, 1] >> level
+        layer = blocks[cells[i, 1] & (size - 1), cells[i, 0] & (size - 1)]
+        for row in range(max(0, -y), min(rows, rows - y)):
+            left = max(spans[row, 0], -x)
+            count = min(spans[row, 1], columns - x) - left
+            of_row, added = scores[row, left : left + count], layer[row + y, left + x : left + x + count]
+            for column in range(count):
+                of_row[column] += added[column]
+
+
+@njit(cache=True, nogil=True)
+def best_poses(
+    pyramid, cells, windows, resolution_m: float, least: float, rival: float, apart_m: float, answers: int
 ):
     """The best-scoring poses with the lidar in a free cell, each apart from the others, the best first.
 
-    As ``branch_and_bound.search``, over all cells and headings. A window of 2ʰ × 2ʰ cells scores at most what its
-    points find in level h.
+    As ``branch_and_bound.search``, from windows (K, 5) of ``score_windows``. A window of 2ʰ × 2ʰ cells scores at
+    most what its points find in level h.
 
     pyramid : of ``fill_pyramid`` over ``score_cells``, whose border is unknown
-    points : (N, 2) meters, lidar frame, in random order: poor windows are given up after the first of them
+    cells : (turns, N, 2) of ``turned``, points in random order: poor windows are given up after the first of them
     least : score below which nothing counts; rival : share of the best score, likewise
-    Returns (A ≤ answers, 4): column, row, turn of 2π / turns, score.
+    Returns (A ≤ answers, 4): column, row, turn, score.
     """
-    cells = _turned(points, resolution_m, turns)
-    heap = _roots(pyramid, cells, least)
+    heap = [(w[0], w[1], w[2], w[3], w[4]) for w in windows]
+    heapq.heapify(heap)
     found, count, best = np.empty((answers, 4)), 0, 0
     while len(heap) and count < answers:
         negative, level, turn, x, y = heapq.heappop(heap)
         if -negative < rival * best:
             break
-        if _is_taken(found[:count], level, turn, x, y, resolution_m, turns, apart_m):
+        if _is_taken(found[:count], level, turn, x, y, resolution_m, cells.shape[0], apart_m):
             continue
         if level == 0:
             best = max(best, -negative)
@@ -62,24 +135,6 @@ def search_map(
         else:
             _split(heap, pyramid, cells[turn], level - 1, turn, x, y, max(least, rival * best))
     return found[:count]
-
-
-@njit(cache=True, nogil=True)
-def _roots(pyramid, cells, least: float):
-    """Heap of the largest windows with room for the lidar: (−bound, level, turn, first column, first row)."""
-    top, rows, columns = pyramid.shape[0] - 1, pyramid.shape[1], pyramid.shape[2]
-    size = 1 << top
-    heap = [(0, 0, 0, 0, 0) for _ in range(0)]
-    for y in range(0, rows, size):
-        for x in range(0, columns, size):
-            if not _has_room(pyramid[0, y : y + size, x : x + size]):
-                continue
-            for turn in range(cells.shape[0]):
-                bound = _score(pyramid[top], cells[turn], x, y, least)
-                if bound >= least:
-                    heap.append((-bound, top, turn, x, y))
-    heapq.heapify(heap)
-    return heap
 
 
 @njit(cache=True, nogil=True)
@@ -134,8 +189,8 @@ def _mean_score(cells, points, origin, resolution_m: float, x: float, y: float, 
 
 
 @njit(cache=True, nogil=True)
-def _turned(points, resolution_m: float, turns: int):
-    """Column and row (turns, N, 2) of every point from the lidar's cell under every heading."""
+def turned(points, resolution_m: float, turns: int):
+    """Column and row (turns, N, 2) of points (N, 2), m, from the lidar's cell under headings 2π / turns apart."""
     cells = np.empty((turns, points.shape[0], 2), np.int32)
     for turn in range(turns):
         angle = 2.0 * math.pi * turn / turns
@@ -150,15 +205,6 @@ def _turned(points, resolution_m: float, turns: int):
 def _is_room(cell: int) -> bool:
     """True for a cell that the lidar can be in."""
     return cell in (FREE, NEAR)
-
-
-@njit(cache=True, nogil=True)
-def _has_room(cells) -> bool:
-    for row in range(cells.shape[0]):
-        for column in range(cells.shape[1]):
-            if _is_room(cells[row, column]):
-                return True
-    return False
 
 
 @njit(cache=True, inline="always")
