@@ -4,8 +4,8 @@
 
 A town with so many kilometers of streets, each of which is driven once, is simulated with every so many sweeps of
 a lidar, and mapped by ``run``; on another day, with other parked cars, it is driven the other way round. Memory
-is the peak of the resident memory of ``run`` and of ``localize`` with that log, each a process of its own, and what
-is written at the end included. ``starts``: the log begins at scans spread evenly over it, and goes on until it is
+is the peak of the resident memory of ``run`` and of ``localize`` with that log, each a process of its own, with
+what is written at the end. ``starts``: the log begins at scans spread evenly over it, and goes on until it is
 found, or for 60 m: path and scans until then, the longest scan and the mean in CPU time, the first three left out.
 With ``copies``, the map stands there so many times side by side, every other one mirrored, later pairs longer.
 """
