@@ -61,6 +61,8 @@ class LoopCloser:
 
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures by a search of the whole map, which goes on with every scan, in slices of equal work."""
+        if self.map_search is not None:
+            return self.map_search.advance(keyframes, graph)
         return () if self.relocalizer is None else self.relocalizer.advance(keyframes, graph)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
@@ -68,11 +70,11 @@ class LoopCloser:
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        components = self.segments.components(graph)
-        connected = components == components[-1]
         if self.map_search is not None and self.map_search.has_just_matched(keyframes):
             self.places.skip(keyframes)
             return ()
+        components = self.segments.components(graph)
+        connected = components == components[-1]
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
@@ -87,8 +89,11 @@ class LoopCloser:
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the submaps and searches that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        searched = () if self.relocalizer is None else self.relocalizer.finish(keyframes, graph)
-        return searched + self.places.close(keyframes, graph, components == components[-1], finish=True)
+        closures = () if self.relocalizer is None else self.relocalizer.finish(keyframes, graph)
+        closures += self.places.close(keyframes, graph, components == components[-1], finish=True)
+        if self.map_search is not None:
+            closures += self.map_search.finish(keyframes, graph, components)
+        return closures
 
 
 class ProximityCloser:

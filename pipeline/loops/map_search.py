@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.loops.outline import outline_of
 from scanchain.loops.submaps import Submap
 from scanchain.loops.verification import SubmapVerifier
-from scanchain.registration import ScoreGrid, Window, evenly, upright_columns
+from scanchain.registration import PlaceGrid, PlaceSearch, ScoreGrid, Window, evenly, upright_columns
 
 _MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
@@ -27,7 +27,9 @@ _COLUMNS = 150  # number of columns that are scored, evenly spread
 _COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, and numbers of the first search
 _REFINED_RAD = 0.15  # half width of the window in heading around what it found
 _MIN_COLUMNS = 30  # number of columns, below which there is too little to see
-_MAX_CELLS = 1 << 23  # of the grid of a map; a larger one has coarser cells
+_MAX_CELLS = 1 << 21  # of the coarse grid of a map; a larger one has coarser cells
+_STEPS = 150_000  # windows of the coarse search that are split in one scan
+_VERIFIED = 50_000  # windows that are split in the time in which one pose is verified
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
 _RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
 _SEEDS = 4  # largest number of poses that are verified
@@ -45,7 +47,11 @@ _DRIFT = 0.1  # largest distance from the prediction, as a share of the path sin
 
 
 class MapSearch:
-    """Search for the newest keyframes in a map, as long as no closure joins them or none has for a while."""
+    """Search for the newest keyframes in a map, as long as no closure joins them or none has for a while.
+
+    In a large map a search goes on over several scans: each does a bounded part of it, by counts and not by the
+    clock, so that a live log is not held up and results are the same on any machine.
+    """
 
     def __init__(self, config: Config, segments: Segments, keyframes: Sequence[Keyframe], folder: Path) -> None:
         """Take the keyframes of a map; the outline is kept in its folder."""
@@ -57,10 +63,10 @@ class MapSearch:
         outline = outline_of(folder, keyframes, config.local_map)
         poses = np.array([each.T_odom_lidar for each in keyframes])
         self.T_level_keyframes = lie.inverse(outline.T_map_level) @ poses
-        extent_m = np.ptp(outline.columns, axis=0) if len(outline.columns) else np.zeros(2)
-        self.size_m = max(outline.size_m, math.sqrt(float(extent_m.prod()) / _MAX_CELLS))
-        self.columns = outline.columns
-        self.grids: tuple[ScoreGrid, ...] = ()  # coarse and fine, drawn when first searched
+        self.size_m, self.columns = outline.size_m, outline.columns
+        self.grid: PlaceGrid | None = None  # drawn when first searched
+        self.search: Generator[None, None, Closure | None] | None = None  # the one that is under way
+        self.has_advanced = False  # in the present scan
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with the map
         self.finds: list[Closure] = []
@@ -72,9 +78,10 @@ class MapSearch:
         return since_m < _MATCH_M * newest.scale and self.segments.starts[-1] != newest.index
 
     def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
-        """Remember whether the newest keyframe, of these closures, matches the map."""
+        """Remember whether the newest keyframe, of these closures, matches the map; then no search goes on."""
         if any(each.verdict is Verdict.ACCEPTED and each.target < self.of_map for each in closures):
             self.matched_m = keyframes[-1].traveled_m
+            self.search = None
 
     def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
         """True while the last match with the map lies little behind the newest keyframe."""
@@ -88,31 +95,85 @@ class MapSearch:
         components : (K,) of ``Segments.components``
         """
         newest, start = keyframes[-1], self.segments.starts[-1]
-        if newest.traveled_m < self.next_m and newest.index != start:
+        if newest.index == start:
+            self.search = None  # of keyframes that the newest is not joined to
+        is_due = newest.traveled_m >= self.next_m or newest.index == start
+        if self.search is None and is_due:
+            begun_m = self._begun_m(keyframes, components)
+            self.next_m = newest.traveled_m + max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M)
+            members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
+            self.search = self._found(members, keyframes)
+        return () if self.has_advanced else self._go_on(keyframes, graph, components)
+
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Closures, as of ``close``, of the search that is under way, which does its part of a new scan."""
+        self.has_advanced = self.search is not None
+        if self.search is None:
             return ()
-        is_joined = bool(components[-1] == components[0])
-        begun_m = self.matched_m if is_joined else keyframes[start].traveled_m
-        self.next_m = newest.traveled_m + max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M)
-        members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
-        closure = self._found(members, keyframes)
+        return self._go_on(keyframes, graph, self.segments.components(graph))
+
+    def finish(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
+    ) -> tuple[Closure, ...]:
+        """Complete the search that is under way, if any."""
+        closures: tuple[Closure, ...] = ()
+        while self.search is not None:
+            closures = self._go_on(keyframes, graph, components)
+        return closures
+
+    def _go_on(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
+    ) -> tuple[Closure, ...]:
+        if self.search is None:
+            return ()
+        try:
+            next(self.search)
+        except StopIteration as over:
+            self.search = None
+            return self._judged(over.value, keyframes, graph, components)
+        return ()
+
+    def _begun_m(self, keyframes: Sequence[Keyframe], components: NDArray[np.int64]) -> float:
+        """Path up to where the search began: the last match with the map, or the begin of the segment."""
+        is_joined = components[-1] == components[0]
+        return self.matched_m if is_joined else keyframes[self.segments.starts[-1]].traveled_m
+
+    def _judged(
+        self,
+        closure: Closure | None,
+        keyframes: Sequence[Keyframe],
+        graph: PoseGraph,
+        components: NDArray[np.int64],
+    ) -> tuple[Closure, ...]:
+        """What follows from what a search has found."""
         if closure is None or closure.verdict is Verdict.REJECTED:
             return () if closure is None else (closure,)
-        self.next_m = newest.traveled_m + _STEP_M
-        if is_joined:
-            problem = self._contradiction(closure, keyframes, graph.poses, newest.traveled_m - begun_m)
+        self.next_m = keyframes[-1].traveled_m + _STEP_M
+        if components[-1] == components[0]:
+            gone_m = keyframes[closure.source].traveled_m - self.matched_m
+            problem = self._contradiction(closure, keyframes, graph.poses, gone_m)
             if problem:
                 return (replace(closure, verdict=Verdict.REJECTED, reason=problem),)
         return self._confirmed(closure, keyframes)
 
-    def _found(self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> Closure | None:
-        """The closure of the newest of the members with the map, verified or not; None where nothing is alike."""
+    def _found(
+        self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]
+    ) -> Generator[None, None, Closure | None]:
+        """The closure of the newest of the members with the map, verified or not; None where nothing is alike.
+
+        Yields where the work of one scan is done.
+        """
         newest = members[-1]
         T_newest_level = level_frame(newest, self.config.local_map)
-        seeds = self._seeds(_together(members, lie.inverse(T_newest_level)))
+        seeds, spent = yield from self._seeds(_together(members, lie.inverse(T_newest_level)))
         source = Submap(newest, members, self.radius_m)
         tried: list[Closure] = []
         for x_m, y_m, yaw_rad, _ in seeds.tolist():
             for target in self._stories(np.array([x_m, y_m])):
+                if spent + _VERIFIED > _STEPS:
+                    yield
+                    spent = 0
+                spent += _VERIFIED
                 T_level_source = self._on_ground(keyframes[target], x_m, y_m, yaw_rad) @ lie.inverse(
                     T_newest_level
                 )
@@ -127,26 +188,42 @@ class MapSearch:
             return best
         return replace(best, verdict=Verdict.REJECTED, reason="another place of the map is as similar")
 
-    def _seeds(self, points: Points) -> Matrix:
-        """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined."""
+    def _seeds(self, points: Points) -> Generator[None, None, tuple[Matrix, int]]:
+        """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined.
+
+        And what that took of the work of the present scan.
+        """
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
-            return np.empty((0, 4))
-        if not self.grids:
-            self.grids = tuple(ScoreGrid(self.columns, cells * self.size_m) for cells in (_COARSE, 1.0))
-        coarse, fine = self.grids
-        low, high = self.columns.min(axis=0), self.columns.max(axis=0)
-        middle = lie.pose_2d(*(0.5 * (low + high)).tolist(), yaw_rad=0.0)
-        apart_m = _COARSE * _APART * self.size_m
-        anywhere = Window(0.5 * float((high - low).max()), math.pi, apart_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
-        around = Window(_COARSE * self.size_m, _REFINED_RAD, apart_m, 1.0, 1, _MIN_SHARE)
-        found = coarse.search(evenly(columns, _COARSE_COLUMNS), middle, anywhere)
-        seeds = np.vstack(
-            [np.empty((0, 4)), *(fine.search(columns, lie.pose_2d(x, y, yaw), around) for x, y, yaw, _ in found)]
-        )
+            return np.empty((0, 4)), 0
+        if self.grid is None:
+            self.grid = self._drawn()
+        coarse_m = self.grid.surfaces.resolution_m
+        anywhere = Window(math.inf, math.pi, _APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
+        search = PlaceSearch(self.grid, evenly(columns, _COARSE_COLUMNS), anywhere)
+        spent = search.go_on(_STEPS)
+        while not search.is_done:
+            yield
+            spent = search.go_on(_STEPS)
+        around = Window(coarse_m, _REFINED_RAD, _APART * coarse_m, 1.0, 1, _MIN_SHARE)
+        reach_m = 2.0 * _RADIUS * self.radius_m + coarse_m
+        seeds = np.empty((0, 4))
+        for x_m, y_m, yaw_rad, _ in search.poses().tolist():
+            surfaces = self.columns[np.abs(self.columns - (x_m, y_m)).max(axis=1) < reach_m]
+            found = ScoreGrid(surfaces, self.size_m).search(columns, lie.pose_2d(x_m, y_m, yaw_rad), around)
+            seeds = np.vstack([seeds, found])
         best_first = seeds[np.argsort(-seeds[:, 3], kind="stable")][:_SEEDS]
-        return best_first[best_first[:, 3] >= _RIVAL * best_first[:1, 3]]
+        return best_first[best_first[:, 3] >= _RIVAL * best_first[:1, 3]], spent
+
+    def _drawn(self) -> PlaceGrid:
+        """The coarse grid of the map; poses that it finds may be a cell farther off than those verified."""
+        positions = np.ascontiguousarray(self.T_level_keyframes[:, :2, 3])
+        reach_m = _REACH * self.radius_m + _COARSE * self.size_m
+        range_m = math.sqrt(2.0) * _RADIUS * self.radius_m
+        extent_m = np.ptp(np.vstack([self.columns, positions]), axis=0) + 2.0 * (reach_m + range_m)
+        cells_m = max(_COARSE * self.size_m, math.sqrt(float(extent_m.prod()) / _MAX_CELLS))
+        return PlaceGrid(self.columns, positions, cells_m, reach_m=reach_m, range_m=range_m)
 
     def _stories(self, place: NDArray[np.float64]) -> list[int]:
         """Keyframes of the map nearest to a place (2,), one on each story."""

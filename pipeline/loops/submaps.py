@@ -94,7 +94,9 @@ class VoxelSubmaps:
         submap = self.cached.pop((anchor, last), None)
         if submap is None:
             chosen = self._nearest(keyframes[anchor]) if is_of_map else range(first, last + 1)
-            submap = self._build(keyframes[anchor], [keyframes[index] for index in chosen])
+            build = self._build_at_once if is_of_map and self.dimension == 3 else self._build
+            submap = build(keyframes[anchor], [keyframes[index] for index in chosen])
+            submap.compact()
         self.cached[anchor, last] = submap
         if len(self.cached) > _MAX_CACHED:
             self.cached.popitem(last=False)
@@ -109,4 +111,12 @@ class VoxelSubmaps:
         T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
         for keyframe in members:
             submap.insert(keyframe.points, T_anchor_odom @ keyframe.T_odom_lidar)
+        return submap
+
+    def _build_at_once(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
+        """The submap of all points together: every voxel is fitted once, and all of them are equally old."""
+        submap = VoxelMap(self.dimension, self.config, anchor.scale)
+        T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
+        points = [lie.transform(T_anchor_odom @ each.T_odom_lidar, each.points) for each in members[::_OF_MAP]]
+        submap.insert(np.vstack(points), lie.identity(self.dimension))
         return submap

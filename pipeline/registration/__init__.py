@@ -4,6 +4,7 @@ from scanchain.registration.align import AMBIGUOUS, align, as_ambiguous, with_so
 from scanchain.registration.birds_eye import BirdsEye, upright_columns
 from scanchain.registration.correlative import CorrelativeMap, ScoreGrid, Seed, Window, evenly
 from scanchain.registration.matcher import Matcher, create_matcher
+from scanchain.registration.place_grid import PlaceGrid, PlaceSearch
 from scanchain.registration.plicp import PointToShapeMatcher
 from scanchain.registration.svd import DegeneratePairsError, rigid_transform
 from scanchain.registration.svd_icp import SvdMatcher
@@ -15,6 +16,8 @@ __all__ = [
     "CorrelativeMap",
     "DegeneratePairsError",
     "Matcher",
+    "PlaceGrid",
+    "PlaceSearch",
     "PointToShapeMatcher",
     "ScoreGrid",
     "Seed",

@@ -63,10 +63,14 @@ class ScoreGrid:
     A point of the scan scores fully in a cell that holds one of these points and half in one beside it.
     """
 
-    def __init__(self, points: Points, resolution_m: float) -> None:
-        """Draw points (V, 2) into cells of that edge length."""
+    def __init__(self, points: Points, resolution_m: float, extent: Points | None = None) -> None:
+        """Draw points (V, 2) into cells of that edge length.
+
+        extent : (E, 2) what the grid reaches over; the points alone where left out
+        """
         self.resolution_m = resolution_m
-        corners = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
+        reached = points if extent is None else extent
+        corners = (reached.min(axis=0), reached.max(axis=0)) if len(reached) else (np.zeros(2), np.zeros(2))
         self.origin_m = corners[0] - resolution_m * (2**_TOP + 1)
         columns, rows = np.ceil((corners[1] - self.origin_m) / resolution_m).astype(int) + 2
         self.pyramid = np.zeros((_TOP + 1, rows, columns), np.uint8)

@@ -53,6 +53,13 @@ class VoxelMap:
         """The mean of every voxel, (V, d), map frame."""
         return self.voxels.cells[: len(self), : self.dimension].copy()
 
+    def compact(self) -> None:
+        """Free the memory that is there for further points."""
+        if _capacity(len(self)) < len(self.voxels.cells):
+            kept = _empty(len(self), self.voxels.size_m)
+            keep(self.voxels, kept, 0.0, 0.0, 0.0, np.inf, 0)
+            self.voxels = kept
+
     def _rebuild(self, room: int, T_map_lidar: Pose, radius_m: float) -> None:
         kept = _empty(max(room, len(self)), self.voxels.size_m)
         x, y, z = lie.lift(T_map_lidar)[:3, 3]
@@ -62,7 +69,7 @@ class VoxelMap:
 
 
 def _empty(room: int, voxel_size_m: float) -> Voxels:
-    capacity = 1 << max(12, int(np.ceil(np.log2(room))))
+    capacity = _capacity(room)
     return Voxels(
         rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),
         keys=np.zeros(capacity, np.int64),
@@ -72,3 +79,7 @@ def _empty(room: int, voxel_size_m: float) -> Voxels:
         used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )
+
+
+def _capacity(room: int) -> int:
+    return 1 << max(12, int(np.ceil(np.log2(max(room, 1)))))

@@ -162,7 +162,7 @@ class Localizer:
 
     def _placed(self, step: Step) -> Placed:
         slam = self.slam
-        if step.keyframe >= 0 or step.closures:
+        if step.closures or step.graph is not None or step.starts_segment or not self.states:
             self.is_in_map = slam.is_in_map
         if not self.is_in_map:
             return Placed(MapState.SEARCHING, None, None, step)

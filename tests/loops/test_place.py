@@ -19,6 +19,7 @@ from scanchain.loops.descriptor_recognizer import DescriptorDatabase
 from scanchain.loops.outline import PLACES_FILE
 from scanchain.loops.submaps import VoxelSubmaps, submap_around
 from scanchain.loops.verification import SubmapVerifier, free_space_agreement
+from scanchain.registration import VoxelMap
 from scanchain.simulation import plan
 from scanchain.simulation.sensors import take_sweep
 from tests.support import naive_loops
@@ -203,6 +204,22 @@ def test_a_submap_has_the_voxels_that_odometry_used_there(scale):
     assert submap.voxels.size_m == scale * configured(3).local_map.voxel_size_m
 
 
+def test_a_submap_of_a_map_takes_no_more_memory_than_its_voxels():
+    keyframes = passage(street())
+    submaps = VoxelSubmaps(3, 5, configured(3).local_map, Segments())
+    submaps.begin_in(keyframes)
+    submap = submaps.around(5, keyframes, 10)
+    assert len(submap) <= len(submap.voxels.cells) < max(2 * len(submap), 4097)
+    loose = VoxelMap(3, configured(3).local_map)
+    for keyframe in keyframes[:3]:
+        loose.insert(keyframe.points, keyframe.T_odom_lidar)
+    before, rows = loose.voxels, len(loose)
+    loose.compact()
+    assert len(loose.voxels.cells) < len(before.cells)
+    for name in ("keys", "moments", "cells", "history"):
+        np.testing.assert_array_equal(getattr(loose.voxels, name)[:rows], getattr(before, name)[:rows])
+
+
 @cache
 def there_and_back(lost_m=0.0):
     """Keyframes of a street, and of it again the other way after a detour, odometry so far off."""
@@ -287,6 +304,32 @@ def test_a_log_is_found_in_a_map_by_the_second_keyframe_that_says_the_same(tmp_p
     for closure in closures[1]:
         true = lie.inverse(truth[closure.target]) @ truth[closure.source]
         assert np.linalg.norm((lie.inverse(true) @ closure.match.T_target_source)[:3, 3]) < 0.2
+
+
+def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path, monkeypatch):
+    mapped, log = passage(street()), passage(street(4.0, True)[4:5])
+    (at_once,), _ = sought(mapped, log, tmp_path)
+    monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
+    closer, moved = LoopCloser(configured(3), 3), replace(log[0], index=len(mapped), traveled_m=10_000.0)
+    keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
+    closer.begin_in(mapped, tmp_path)
+    closer.start_segment(len(mapped))
+    found, scans = closer.close(keyframes, graph_of(keyframes)), 1
+    while closer.map_search.search is not None:
+        found, scans = closer.advance(keyframes, graph_of(keyframes)), scans + 1
+    assert scans > 3 and [each.target for each in found] == [each.target for each in at_once]
+    np.testing.assert_array_equal(found[0].match.T_target_source, at_once[0].match.T_target_source)
+
+
+def test_a_search_that_the_end_of_the_log_interrupts_is_completed(tmp_path, monkeypatch):
+    monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
+    mapped, log = passage(street()), passage(street(4.0, True)[4:5])
+    closer, moved = LoopCloser(configured(3), 3), replace(log[0], index=len(mapped), traveled_m=10_000.0)
+    keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
+    closer.begin_in(mapped, tmp_path)
+    closer.start_segment(len(mapped))
+    assert not closer.close(keyframes, graph_of(keyframes)) and closer.map_search.search is not None
+    assert closer.finish(keyframes, graph_of(keyframes)) and closer.map_search.search is None
 
 
 def test_a_log_of_elsewhere_is_found_nowhere_in_a_map(tmp_path):

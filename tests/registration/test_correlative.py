@@ -6,7 +6,7 @@ import pytest
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.search.branch_and_bound import draw_hits, fill_pyramid, search
-from scanchain.registration import BirdsEye, CorrelativeMap, VoxelMap
+from scanchain.registration import BirdsEye, CorrelativeMap, PlaceGrid, PlaceSearch, VoxelMap, Window
 from scanchain.registration.birds_eye import upright_columns
 from tests.support import naive_search
 
@@ -89,6 +89,39 @@ def test_below_the_least_share_nothing_is_found():
     found = search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best - 1e-6, 1.0, 1.0, 1)
     assert found[0, 3] == pytest.approx(best)
     assert not len(search(pyramid, origin, 0.25, points, np.eye(3), 4, 2, 0.05, best + 1e-6, 1.0, 1.0, 1))
+
+
+def searched(grid, points, steps, rival=0.5):
+    search = PlaceSearch(grid, points, Window(np.inf, np.pi, 2.0, rival, 4, 0.3))
+    rounds = 0
+    while not search.is_done:
+        assert search.go_on(steps) <= steps
+        rounds += 1
+    return search.poses(), rounds
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_pose_near_a_place_is_found_however_few_steps_are_taken_at_once(seed):
+    rng = np.random.default_rng(seed)
+    means, places, size_m = walls(rng, 12, 20.0), rng.uniform(3.0, 17.0, (3, 2)), 0.5
+    T = lie.pose_2d(*places[1], rng.uniform(-3.0, 3.0))
+    seen = means[np.linalg.norm(means - places[1], axis=1) < 8.0]
+    points = lie.transform(lie.inverse(T), seen)
+    grid = PlaceGrid(means, places, size_m, reach_m=1.0, range_m=8.0)
+    at_once, rounds = searched(grid, points, 10**6)
+    bit_by_bit, more_rounds = searched(grid, points, 7)
+    assert rounds == 1 and more_rounds > 10 and np.array_equal(at_once, bit_by_bit)
+    best = 0.0
+    near = np.linalg.norm(at_once[0, :2] - places, axis=1).min()
+    turns = len(PlaceSearch(grid, points, Window(np.inf, np.pi, 2.0, 0.5, 4)).offsets) // 2
+    turn_rad = size_m / np.median(np.hypot(*points.T))
+    for x, y in grid.surfaces.origin_m + size_m * (np.argwhere(grid.places[0].T) + 0.5):
+        first = lie.pose_2d(x, y, 0.0)
+        every = naive_search.scores(
+            grid.surfaces.pyramid[0], grid.surfaces.origin_m, size_m, points, first, 0, turns, turn_rad
+        )
+        best = max(best, *every.values())
+    assert at_once[0, 3] == pytest.approx(best) and near <= 1.0
 
 
 def map_of(points):

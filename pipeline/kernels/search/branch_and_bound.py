@@ -64,7 +64,7 @@ def search(
     Returns (A ≤ answers, 4), the best first: x, y (m), yaw, share of the highest score possible.
     """
     full = HIT * points.shape[0]
-    cells = _cells(points, T, origin, resolution_m, turns, turn_rad)
+    cells = turned_cells(points, T, origin, resolution_m, turns, turn_rad)
     heap = _roots(pyramid, cells, shifts, least * full)
     found, count = np.empty((answers, 4)), 0
     taken = np.empty((answers, 3), np.int64)
@@ -73,7 +73,7 @@ def search(
         negative, level, turn, dx, dy = heapq.heappop(heap)
         if -negative < rival * best:
             break
-        if _is_taken(taken[:count], level, turn, dx, dy, resolution_m, turn_rad, apart_m):
+        if is_taken(taken[:count], level, turn, dx, dy, resolution_m, turn_rad, apart_m):
             continue
         if level > 0:
             _split(heap, pyramid[level - 1], cells[turn], level - 1, turn, dx, dy, shifts, least * full)
@@ -88,7 +88,7 @@ def search(
 
 
 @njit(cache=True, inline="always")
-def _is_taken(
+def is_taken(
     taken, level: int, turn: int, dx: int, dy: int, resolution_m: float, turn_rad: float, apart_m: float
 ) -> bool:
     """True if a window lies near one of the (A, 3) turns and shifts that were found."""
@@ -102,7 +102,7 @@ def _is_taken(
 
 
 @njit(cache=True, nogil=True)
-def _cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
+def turned_cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
     """Column and row (2·turns + 1, N, 2) of every point under every turn of T."""
     yaw = math.atan2(T[1, 0], T[0, 0])
     cells = np.empty((2 * turns + 1, points.shape[0], 2), np.int32)
@@ -125,7 +125,7 @@ def _roots(pyramid, cells, shifts: int, least: float):
     for turn in range(cells.shape[0]):
         for dx in range(-shifts, shifts + 1, 1 << top):
             for dy in range(-shifts, shifts + 1, 1 << top):
-                bound = _score(pyramid[top], cells[turn], dx, dy)
+                bound = score(pyramid[top], cells[turn], dx, dy)
                 if bound >= least:
                     heap.append((-bound, top, turn, dx, dy))
     heapq.heapify(heap)
@@ -140,13 +140,13 @@ def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: 
         for y in (dy, dy + half):
             if x > shifts or y > shifts:
                 continue
-            bound = _score(layer, cells, x, y)
+            bound = score(layer, cells, x, y)
             if bound >= least:
                 heapq.heappush(heap, (-bound, level, turn, x, y))
 
 
 @njit(cache=True, inline="always")
-def _score(layer, cells, dx: int, dy: int) -> int:
+def score(layer, cells, dx: int, dy: int) -> int:
     """Score of the points, shifted by so many cells, in a layer; 0 for cells outside."""
     total = 0
     for i in range(cells.shape[0]):

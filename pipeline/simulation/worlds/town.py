@@ -6,6 +6,7 @@ direction and lane.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -51,20 +52,27 @@ _LEGS = (
 )  # fmt: skip
 
 
-def town(rng: np.random.Generator, parked: float = 0.55) -> Solids:
+def town(
+    rng: np.random.Generator,
+    parked: float = 0.55,
+    *,
+    streets_x_m: Sequence[float] = _STREETS_X_M,
+    streets_y_m: Sequence[float] = _STREETS_Y_M,
+) -> Solids:
     """The town; streets and blocks stand where they stand, everything else is drawn from ``rng``.
 
     parked : share of the places at the kerb that have a car on them
+    streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
     scenery = Scenery(_relief(rng))
-    for west, east in pairwise(_STREETS_X_M):
-        for south, north in pairwise(_STREETS_Y_M):
+    for west, east in pairwise(streets_x_m):
+        for south, north in pairwise(streets_y_m):
             _block(scenery, west, east, south, north, rng)
-    for y in _STREETS_Y_M:
-        for west, east in pairwise(_STREETS_X_M):
+    for y in streets_y_m:
+        for west, east in pairwise(streets_x_m):
             _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
-    for x in _STREETS_X_M:
-        for south, north in pairwise(_STREETS_Y_M):
+    for x in streets_x_m:
+        for south, north in pairwise(streets_y_m):
             _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
 
