@@ -80,8 +80,9 @@ class Slam:
         *,
         dimension: int | None = None,
         prior: SavedMap | None = None,
+        is_live: bool = False,
     ) -> None:
-        """Arguments as in ``Odometry``.
+        """Arguments as in ``Odometry``, and ``is_live`` as in ``LoopCloser``.
 
         points_file : where points go, which stay out of memory; without one, into a temporary file
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
@@ -93,7 +94,7 @@ class Slam:
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
         self.front_end = FrontEnd(config, T_base_lidar)
-        self.closer = LoopCloser(config, self.dimension)
+        self.closer = LoopCloser(config, self.dimension, is_live=is_live)
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
         self.closures: list[Closure] = []

@@ -26,9 +26,15 @@ _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans ar
 class LoopCloser:
     """Searches from each new keyframe for older ones that it revisits and verifies them."""
 
-    def __init__(self, config: Config, dimension: int) -> None:
-        """Raises InputError for a recognizer that cannot be loaded."""
+    def __init__(self, config: Config, dimension: int, *, is_live: bool = False) -> None:
+        """Begin without keyframes.
+
+        is_live : whether a search of the whole map goes on over several scans, so that none of them waits for it;
+            else it is completed at once, which finds a location sooner
+        Raises InputError for a recognizer that cannot be loaded.
+        """
         self.config = config
+        self.is_live = is_live
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = ScanVerifier(config, submaps)
@@ -60,7 +66,7 @@ class LoopCloser:
         self.segments.start(keyframe)
 
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures by a search of the whole map, which goes on with every scan, in slices of equal work."""
+        """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
         if self.map_search is not None:
             return self.map_search.advance(keyframes, graph)
         return () if self.relocalizer is None else self.relocalizer.advance(keyframes, graph)
@@ -78,12 +84,16 @@ class LoopCloser:
         closures = self.near.close(keyframes, graph, connected)
         if self.relocalizer is not None:
             closures += self.relocalizer.close(keyframes, graph, components)
+            if not self.is_live:
+                closures += self.relocalizer.finish(keyframes, graph)
         if self.map_search is not None:
             self.map_search.take(keyframes, closures)
             if self.map_search.is_tracking(keyframes):
                 self.places.skip(keyframes)
                 return closures
             closures += self.map_search.close(keyframes, graph, components)
+            if not self.is_live:
+                closures += self.map_search.finish(keyframes, graph, components)
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:

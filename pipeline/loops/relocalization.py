@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from scanchain import lie
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
+from scanchain.loops.planar_map_search import LEAST_SHARE, PlanarMapSearch, WholeSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 from scanchain.registration import CorrelativeMap, Seed, VoxelMap
@@ -32,9 +31,6 @@ _FIRST_M = 1.0  # distance traveled in a new segment before the first search of 
 _BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
 _APART_M = 0.5  # least distance traveled between two searches
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
-_LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
-_CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
-_RIVAL = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
 _SOURCES, _SUBMAPS = (
     4,
@@ -199,7 +195,7 @@ class Relocalizer:
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
         target = self._draw([keyframes[k] for k in old.tolist()], T_world[old])
-        self.underway = Search(path[-1].index, old, WholeSearch(target, points, _LEAST_SHARE))
+        self.underway = Search(path[-1].index, old, WholeSearch(target, points, LEAST_SHARE))
 
     def _draw(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> PlanarMapSearch:
         """The map of keyframes at their poses; the last one where these are the same."""
@@ -261,9 +257,7 @@ class Search:
     def find(self) -> Find | None:
         """What was found; None where there is nothing, or nothing clear."""
         best = self.search.best()
-        if best is None or best.rival > _RIVAL * best.share:
-            return None
-        if best.share < _LEAST_SHARE + _CHANCE / math.sqrt(best.points):
+        if best is None or best.is_ambiguous or not best.is_likely:
             return None
         return Find(self.source, int(self.old[0]), best.T_map_lidar)
 

@@ -153,7 +153,12 @@ def localize(
                     initial = None if job.initial is None else job.initial(scan.stamp_ns, prior)
                     points_file = directory.path / POINTS_FILE
                     localizer = Localizer(
-                        prior, settings.config, log.T_base_lidar, initial=initial, points_file=points_file
+                        prior,
+                        settings.config,
+                        log.T_base_lidar,
+                        initial=initial,
+                        points_file=points_file,
+                        is_live=False,
                     )
                 localizer.process(scan)
         if localizer is None:

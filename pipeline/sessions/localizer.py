@@ -94,17 +94,20 @@ class Localizer:
         *,
         initial: Pose | None = None,
         points_file: Path | None = None,
+        is_live: bool = True,
     ) -> None:
         """Begin in a map.
 
         prior : the map, or the run directory that holds it
         config, T_base_lidar, points_file : as in ``Slam``
+        is_live : whether a search of a large map goes on over several scans, so that none of them waits for it;
+            else it is completed at once, which finds the log after a shorter path
         initial : T_map_lidar of the first scan where it is known, to a few meters and 20°
         Raises InputError for a map that cannot be read.
         """
         self.map = prior if isinstance(prior, SavedMap) else open_saved_map(checks.path(prior, "prior"))
         dimension = self.map.dimension
-        self.slam = Slam(config, T_base_lidar, points_file, dimension=dimension, prior=self.map)
+        self.slam = Slam(config, T_base_lidar, points_file, dimension=dimension, prior=self.map, is_live=is_live)
         self.initial = None if initial is None else checks.pose(initial, "initial", dimension)
         self.states: list[MapState] = []
         self.live: list[Pose] = []
