@@ -34,6 +34,7 @@ from scanchain.loops import LoopCloser, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
+from scanchain.preprocess import Prepared
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
@@ -140,7 +141,7 @@ class Slam:
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
-    def process(self, scan: Scan) -> Step:
+    def process(self, scan: Scan | Prepared) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
         self._check_unfinished()
         return self.place(self.front_end.locate(scan))

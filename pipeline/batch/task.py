@@ -20,6 +20,7 @@ from scanchain.runs.metrics import Metrics
 from scanchain.runs.provenance import package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
+from scanchain.threads import VARIABLE
 from scanchain.verdict import Verdict
 
 ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
@@ -148,7 +149,7 @@ def key_of(sha256: str, config_file: Path | None, overrides: Sequence[Override])
 _LOOK_S = 0.1
 _SYSTEM_KILL = -9
 _LAST_CHARACTERS = 300  # of the output of a process that crashed
-_THREADS = tuple(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON"))
+_THREADS = (VARIABLE, *(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON")))
 
 
 def attempt(task: Task, stop: Event | None = None) -> Row:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import OnceCommand
+from scanchain.commands.options import OnceCommand, threads_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ _ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
     metavar="METERS",
     help="Least length of a change; what is smaller is unknown.",
 )
+@threads_option
 @click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 def changes(

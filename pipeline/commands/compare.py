@@ -15,6 +15,7 @@ from scanchain.commands.options import (
     overrides,
     part_of,
     part_options,
+    threads_option,
 )
 from scanchain.errors import ScanchainError
 from scanchain.source import Source
@@ -46,6 +47,7 @@ _PATH = click.Path(path_type=Path)
 )
 @limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
 @part_options()
+@threads_option
 @click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
 @click.pass_context

@@ -18,6 +18,7 @@ from scanchain.commands.options import (
     overrides,
     part_of,
     part_options,
+    threads_option,
 )
 from scanchain.errors import InputError
 from scanchain.source import Source
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @part_options()
 @matcher_options
+@threads_option
 @click.option("--force", is_flag=True, help="Replace an existing directory once the new one is complete.")
 @click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import OverrideCommand, overrides
+from scanchain.commands.options import OverrideCommand, overrides, threads_option
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
@@ -16,6 +16,7 @@ from scanchain.commands.options import OverrideCommand, overrides
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
+@threads_option
 @click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run or merge.")
 @click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context

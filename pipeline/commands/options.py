@@ -15,6 +15,7 @@ from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
+from scanchain.threads import use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
 
@@ -133,6 +134,21 @@ def part_options(log: str = "the log", *, topic: str = "the only one that fits")
 def part_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
     """The keys that ``part_options`` set."""
     return tuple(each for name, _, key, _ in _PART for each in alias(key, options[name], f"--{name}"))
+
+
+def _use(context: click.Context, parameter: click.Parameter, count: int | None) -> None:
+    if count is not None:
+        use_threads(count)
+
+
+threads_option = click.option(
+    "--threads",
+    type=click.IntRange(1),
+    metavar="N",
+    callback=_use,
+    expose_value=False,
+    help="Threads to compute with; the results are the same. [default: SCANCHAIN_THREADS, or one for each core]",
+)
 
 
 def matcher_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -19,6 +19,7 @@ from scanchain.commands.options import (
     overrides,
     part_of,
     part_options,
+    threads_option,
 )
 from scanchain.errors import InputError, ScanchainError
 from scanchain.source import Source
@@ -50,6 +51,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
 )
 @max_gap_option
+@threads_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(

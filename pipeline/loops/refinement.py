@@ -17,9 +17,9 @@ from scanchain.kernels.registration.icp import refine
 from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
+from scanchain.threads import threads
 
 _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # step below which another iteration would change little
-_THREADS = 2
 _MAX_SCANS = 2048  # largest number of scans of a thread in memory
 
 
@@ -64,9 +64,10 @@ def refined(
         starts = np.append(0, np.cumsum(spans[part, 1]))
         refine(surfaces.voxels, points, starts, result[part], prior, least_share, settings)
 
-    with ThreadPoolExecutor(_THREADS) as pool:  # no scan depends on another, and kernels let others run
-        for first in range(0, len(poses), _THREADS * _MAX_SCANS):
-            parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(_THREADS)]
+    count = threads()
+    with ThreadPoolExecutor(count) as pool:  # no scan depends on another, and kernels let others run
+        for first in range(0, len(poses), count * _MAX_SCANS):
+            parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(count)]
             clouds = [_points_of(spans[part], store) for part in parts]
             list(pool.map(refine_part, parts, clouds))
     return result

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Points, Pose
 from scanchain.kernels.raycast.free_space import nearest_ranges, weigh_points
+from scanchain.threads import threads
 
-_THREADS = 2
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
 _REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
 _CUBES_TO_REACH = 8.0  # cubes that points are sorted by, along the reach
@@ -71,7 +71,8 @@ def sightings(
     index = _Cells(lie.lift_points(voxels), reach_of(voxel_size_m))
     seen, seen_through = np.zeros((2, len(voxels)), np.int32)
     ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
-    with ThreadPoolExecutor(_THREADS) as pool:  # no point depends on another, and kernels let others run
+    count = threads()
+    with ThreadPoolExecutor(count) as pool:  # no point depends on another, and kernels let others run
         for view in views:
             nearest_ranges(lie.lift_points(view.points), ranges_m)
             T_world_lidar = lie.lift(view.T_world_lidar)
@@ -82,10 +83,10 @@ def sightings(
             ])  # fmt: skip
             parts = [
                 pool.submit(
-                    weigh_points, index.points, np.ascontiguousarray(spans[k::_THREADS]), T_lidar_world, ranges_m,
+                    weigh_points, index.points, np.ascontiguousarray(spans[k::count]), T_lidar_world, ranges_m,
                     limits, enough, seen, seen_through,
                 )
-                for k in range(_THREADS)
+                for k in range(count)
             ]  # fmt: skip
             for part in parts:
                 part.result()

@@ -11,6 +11,7 @@ from scanchain.config import Config
 from scanchain.data import LEAST_FIT, Matrix, Points, Pose, Scan, State
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
+from scanchain.preprocess import Prepared
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ class FrontEnd:
         self.since_keyframe = 0
         self.scans = 0
 
-    def locate(self, scan: Scan) -> Located:
+    def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
         tracked = self.odometry.process(scan)
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)

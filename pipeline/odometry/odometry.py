@@ -29,7 +29,7 @@ from scanchain.odometry.tracked import (
     seen_from,
     spread,
 )
-from scanchain.preprocess import Resolution, Sweep
+from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
 
@@ -102,16 +102,20 @@ class Odometry:
         scan = Scan.of(points, stamp_s, times_s, index=self.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
-    def process(self, scan: Scan) -> Tracked:
+    def process(self, scan: Scan | Prepared) -> Tracked:
         """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""
-        self._check_dimension(scan)
+        self._check_dimension(scan.scan if isinstance(scan, Prepared) else scan)
+        return self._process(scan if isinstance(scan, Prepared) else prepare(scan, self.resolution))
+
+    def _process(self, prepared: Prepared) -> Tracked:
         self.scans += 1
-        started = working_s()
-        sweep, sparse = map(self.elevation.corrected, self.resolution.downsampled(scan))
+        started, scan = working_s(), prepared.scan
+        self.resolution = prepared.after
+        sweep, sparse = map(self.elevation.corrected, (prepared.sweep, prepared.sparse))
         self.map.resize(self.resolution.scale)
         if not len(self.local_map):
             self._check_range(scan, sparse)
-        prepared = working_s()
+        began = working_s()
         prediction = self.predictor.predict(scan)
         registered = self._register(sweep, sparse, prediction)
         aligned = working_s()
@@ -129,8 +133,8 @@ class Odometry:
             state=_reported(registered),
             reason=match.reason,
             prior=prediction.prior,
-            preprocess_s=prepared - started,
-            match_s=aligned - prepared,
+            preprocess_s=prepared.seconds + began - started,
+            match_s=aligned - began,
             map_s=working_s() - aligned,
             elsewhere_m=registered.elsewhere_m,
         )

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 
+from scanchain.clock import working_s
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.preprocess.sweep import Sweep, sweep_of
@@ -14,6 +20,7 @@ _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median 
 _HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
 _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
+_AHEAD = 2  # scans that are prepared before they are asked for
 _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
 
 
@@ -67,3 +74,43 @@ class Resolution:
         if abs(target - math.log2(self.scale)) <= _HYSTERESIS:
             return self.scale
         return min(max(2.0 ** round(target), self.config.min_scale), 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A scan, downsampled for the map (``sweep``) and for matching (``sparse``), before anything moves it.
+
+    ``after`` holds the sizes for the next scan; ``seconds`` is the time that this one took.
+    """
+
+    scan: Scan
+    sweep: Sweep
+    sparse: Sweep
+    after: Resolution
+    seconds: float
+
+
+def prepare(scan: Scan, resolution: Resolution) -> Prepared:
+    """A scan, downsampled at a resolution, which stays as it is."""
+    started, after = working_s(), copy(resolution)
+    sweep, sparse = after.downsampled(scan)
+    return Prepared(scan, sweep, sparse, after, working_s() - started)
+
+
+def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Prepared]:
+    """Scans prepared one after the other, in a thread of its own: none depends on a pose."""
+
+    def following(scan: Scan) -> Prepared:
+        nonlocal resolution
+        prepared = prepare(scan, resolution)
+        resolution = prepared.after
+        return prepared
+
+    waiting: deque[Future[Prepared]] = deque()
+    with ThreadPoolExecutor(1, thread_name_prefix="scanchain-prepare") as pool:
+        for scan in scans:
+            waiting.append(pool.submit(following, scan))
+            if len(waiting) > _AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.logs import Log
+from scanchain.preprocess import Prepared, prepare_ahead
 from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
@@ -27,6 +28,7 @@ from scanchain.runs.resume.resuming import Left, after, resume_recording, set_as
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run
 from scanchain.slam import Slam, SlamResult
+from scanchain.threads import threads
 from scanchain.verdict import Judged, judge, worst_place
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
@@ -72,7 +74,7 @@ def process(
         if recording.web_address:
             progress.announce(f"viewer: {recording.web_address}")
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
-        for step in map(slam.process, progress.track(scans, log.scan_count - len(steps))):
+        for step in map(slam.process, _ahead(progress.track(scans, log.scan_count - len(steps)), slam)):
             recording.log(step)
             journal.append(steps.append(step))
             if checkpoints.are_due():
@@ -111,6 +113,14 @@ def _begin(
     set_aside(folder, checkpoint)
     checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
     return checkpoint.slam, scans, checkpoints
+
+
+def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
+    """The scans, clouds prepared in a thread beside; of laser scans that takes longer than to prepare them."""
+    if slam.dimension == 3 and threads() > 1:
+        yield from prepare_ahead(scans, slam.front_end.odometry.resolution)
+    else:
+        yield from scans
 
 
 def _record_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:

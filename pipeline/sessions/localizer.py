@@ -13,6 +13,7 @@ from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory
 from scanchain.maps import SavedMap, open_saved_map
+from scanchain.preprocess import Prepared
 from scanchain.slam import Slam, SlamResult, loop_information
 
 _RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
@@ -129,7 +130,7 @@ class Localizer:
         scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
         return self.slam.live_stamps.passed(scan, self.process)
 
-    def process(self, scan: Scan) -> Placed:
+    def process(self, scan: Scan | Prepared) -> Placed:
         """Place one scan of a log."""
         step = self.slam.process(scan)
         if self.initial is not None and len(self.states) == 0:

@@ -5,7 +5,7 @@ import pytest
 
 from scanchain.config import PreprocessConfig
 from scanchain.data import Scan
-from scanchain.preprocess import Resolution, downsample, sweep_of
+from scanchain.preprocess import Resolution, downsample, prepare_ahead, sweep_of
 from tests.support import naive
 from tests.support.scenes import configured
 
@@ -105,3 +105,16 @@ def test_a_scan_without_a_point_in_range_leaves_the_voxels_alone():
     assert len(sweep.points) == len(sparse.points) == 0
     resolution.downsampled(box_scan(2.5))
     assert resolution.scale == 0.25
+
+
+def test_scans_prepared_ahead_are_those_prepared_one_by_one():
+    scans = [box_scan(half_m, seed=k) for k, half_m in enumerate((6.0, 6.5, 12.0, 40.0, 3.0, 3.1))]
+    resolution = Resolution(PreprocessConfig(match_points=500), 1.0)
+    ahead = list(prepare_ahead(iter(scans), resolution))
+    assert resolution.tries > 0  # as before: whoever processes the scans takes it from them
+    for scan, prepared in zip(scans, ahead, strict=True):
+        sweep, sparse = resolution.downsampled(scan)
+        assert prepared.scan is scan
+        assert (prepared.sweep.points == sweep.points).all()
+        assert (prepared.sparse.points == sparse.points).all()
+        assert vars(prepared.after) == vars(resolution)

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, SHAPE, move
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, POINT, SHAPE, move
 
 _SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)
 
@@ -27,6 +27,8 @@ def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m:
         held fixed); 0 leaves it out
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
     """
+    if H.shape[0] == 6 and curvature == 0.0:
+        return _in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, b)
     H.fill(0.0)
     b.fill(0.0)
     cost = total_weight = squares = 0.0
@@ -51,6 +53,78 @@ def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m:
             _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
     _mirror(H)
     return cost, total_weight, squares
+
+
+@njit(cache=True, nogil=True)
+def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float, H, b):
+    """``normal_equations`` in space, without curvature: where a 3D scan spends most of its time.
+
+    The sums are tuples, which the compiler keeps in registers; in arrays, every addition waits until the one
+    before is stored.
+    """
+    cost = total_weight = squares = 0.0
+    s2 = scale_m * scale_m
+    upper, gradient = (0.0,) * 21, (0.0,) * 6
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        r2 *= weight[i]
+        ratio = s2 / (s2 + r2)
+        w = weight[i] * ratio * ratio
+        cost += 0.5 * r2 * ratio
+        total_weight += w
+        squares += ratio * ratio * r2
+        shape = cell[SHAPE]
+        if shape != PLANE:
+            upper, gradient = _plus_point(upper, gradient, w, px, py, pz, ex, ey, ez)
+            w, along = -w, 0.0
+        if shape != POINT:
+            nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+            upper, gradient = _plus_plane(upper, gradient, w, px, py, pz, nx, ny, nz, along)
+    k = 0
+    for row in range(6):
+        b[row] = gradient[row]
+        for column in range(row, 6):
+            H[row, column] = upper[k]
+            k += 1
+    _mirror(H)
+    return cost, total_weight, squares
+
+
+@njit(cache=True, inline="always")
+def _plus_plane(h, b, w, px, py, pz, nx, ny, nz, r):
+    """Upper triangle h (21), by rows, and gradient b (6) with ``_add_plane``."""
+    cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+    wx, wy, wz, wcx, wcy, wcz, wr = w * nx, w * ny, w * nz, w * cx, w * cy, w * cz, r * w
+    upper = (
+        h[0] + wx * nx, h[1] + wx * ny, h[2] + wx * nz, h[3] + wx * cx, h[4] + wx * cy, h[5] + wx * cz,
+        h[6] + wy * ny, h[7] + wy * nz, h[8] + wy * cx, h[9] + wy * cy, h[10] + wy * cz,
+        h[11] + wz * nz, h[12] + wz * cx, h[13] + wz * cy, h[14] + wz * cz,
+        h[15] + wcx * cx, h[16] + wcx * cy, h[17] + wcx * cz,
+        h[18] + wcy * cy, h[19] + wcy * cz,
+        h[20] + wcz * cz,
+    )  # fmt: skip
+    return upper, (b[0] + wr * nx, b[1] + wr * ny, b[2] + wr * nz, b[3] + wr * cx, b[4] + wr * cy, b[5] + wr * cz)
+
+
+@njit(cache=True, inline="always")
+def _plus_point(h, b, w, px, py, pz, ex, ey, ez):
+    """Upper triangle h (21), by rows, and gradient b (6) with ``_add_point`` of a point shape."""
+    upper = (
+        h[0] + w, h[1], h[2], h[3], h[4] + w * pz, h[5] - w * py,
+        h[6] + w, h[7], h[8] - w * pz, h[9], h[10] + w * px,
+        h[11] + w, h[12] + w * py, h[13] - w * px, h[14],
+        h[15] + w * (py * py + pz * pz), h[16] - w * px * py, h[17] - w * px * pz,
+        h[18] + w * (px * px + pz * pz), h[19] - w * py * pz,
+        h[20] + w * (px * px + py * py),
+    )  # fmt: skip
+    turn = w * (py * ez - pz * ey), w * (pz * ex - px * ez), w * (px * ey - py * ex)
+    return upper, (b[0] + w * ex, b[1] + w * ey, b[2] + w * ez, b[3] + turn[0], b[4] + turn[1], b[5] + turn[2])
 
 
 @njit(cache=True, nogil=True)

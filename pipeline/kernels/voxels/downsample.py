@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from scanchain.kernels.geometry.twist import perturb
-from scanchain.kernels.voxels.hashing import EMPTY, find, pack
+from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
 
 _BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
 
@@ -20,24 +20,28 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
     slots = 1024
     while slots < 2 * n:
         slots *= 2
-    keys = np.full(slots, EMPTY)
-    block = np.empty(_BLOCK, np.int64)
+    table = np.full(slots, EMPTY)
+    keys, held, rows = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int32)
     count = 0
     last = EMPTY
     for start in range(0, n, _BLOCK):
         part = points[start : start + _BLOCK]
-        _keys(part, 1.0 / voxel_m, min_range_m * min_range_m, max_range_m * max_range_m, block)
+        _keys(part, 1.0 / voxel_m, min_range_m * min_range_m, max_range_m * max_range_m, keys)
+        tried = 0
         for i in range(part.shape[0]):
-            key = block[i]
-            if key == last:
-                continue
+            key = keys[i]
+            keys[tried], rows[tried] = key, start + i
+            tried += (key != last) & (key != EMPTY)
             last = key
-            if key == EMPTY:
+        for k in range(tried):  # without a branch on what was read: the processor waits for many slots at once
+            held[k] = table[first_slot(slots, keys[k])]
+        for k in range(tried):
+            if held[k] == keys[k]:
                 continue
-            slot = find(keys, key)
+            slot = find(table, keys[k])
             if slot < 0:
-                keys[~slot] = key
-                chosen[count] = start + i
+                table[~slot] = keys[k]
+                chosen[count] = rows[k]
                 count += 1
     return count
 

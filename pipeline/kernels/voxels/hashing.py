@@ -29,7 +29,7 @@ def unpack(key: int):
 @njit(cache=True, inline="always")
 def find(keys, key: int):
     """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs."""
-    slot = _first_slot(keys.size, key)
+    slot = first_slot(keys.size, key)
     while True:
         held = keys[slot]
         if held == key:
@@ -45,7 +45,7 @@ def find_row(rows, keys, key: int) -> int:
 
     rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for fast probing
     """
-    slot = _first_slot(rows.size, key)
+    slot = first_slot(rows.size, key)
     while True:
         row = int(rows[slot])
         if row < 0:
@@ -56,7 +56,7 @@ def find_row(rows, keys, key: int) -> int:
 
 
 @njit(cache=True, inline="always")
-def _first_slot(slots: int, key: int) -> int:
+def first_slot(slots: int, key: int) -> int:
     """The multiplicative hash of Knuth (1973, . 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return int(np.int64((mixed >> np.uint64(32)) & np.uint64(slots - 1)))

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
-from scanchain.kernels.voxels.hashing import find_row, key_of, pack, unpack
+from scanchain.kernels.voxels.hashing import find_row, first_slot, key_of, pack, unpack
 
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
 MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
@@ -24,6 +24,7 @@ CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
 _GROWN = 1.3  # factor by which the points of a voxel grow until it is fitted again
 _BROAD = 0.125  # least width, in voxels, of a plane that is fitted to a voxel's own points
+_BLOCK = 256  # points whose voxels are looked up together
 MANY = 30.0  # number of points beyond which more add no information, as their poses share errors
 
 
@@ -52,21 +53,42 @@ def insert(voxels, points, T, tick: int, alone: float):
     """
     touched = np.empty(points.shape[0], np.int32)
     sums = np.empty(10)
-    touches = 0
-    scale = 1.0 / voxels.size_m
-    for i in range(points.shape[0]):
-        x, y, z = move(T, points, i)
-        voxel = _voxel_at(voxels, key_of(x, y, z, scale), tick)
-        if voxels.history[voxel, SEEN] != tick:
-            voxels.history[voxel, SEEN] = tick
-            touched[touches] = voxel
-            touches += 1
-        _accumulate(voxels, voxel, x, y, z)
+    moved, keys, rows = np.empty((_BLOCK, 3)), np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64)
+    touches, voxel = 0, -1
+    for start in range(0, points.shape[0], _BLOCK):
+        part = points[start : start + _BLOCK]
+        _locate(voxels, part, T, moved, keys, rows)
+        for i in range(part.shape[0]):
+            if i == 0 or keys[i] != keys[i - 1]:
+                voxel = rows[i] if rows[i] >= 0 else _voxel_at(voxels, keys[i], tick)
+                if voxels.history[voxel, SEEN] != tick:
+                    voxels.history[voxel, SEEN] = tick
+                    touched[touches] = voxel
+                    touches += 1
+            _accumulate(voxels, voxel, moved[i, 0], moved[i, 1], moved[i, 2])
     for k in range(touches):
         voxel = touched[k]
         if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
             _fit(voxels, voxel, points.shape[1], alone, sums)
             voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
+
+
+@njit(cache=True, nogil=True)
+def _locate(voxels, points, T, moved, keys, rows):
+    """Points moved by T, keys of their voxels, and rows of those found in the first slot of the table, else −1.
+
+    Without a branch on what was read, the processor waits for many slots at once.
+    """
+    scale = 1.0 / voxels.size_m
+    for i in range(points.shape[0]):
+        x, y, z = move(T, points, i)
+        moved[i, 0], moved[i, 1], moved[i, 2] = x, y, z
+        keys[i] = key_of(x, y, z, scale)
+    for i in range(points.shape[0]):
+        rows[i] = voxels.rows[first_slot(voxels.rows.size, keys[i])]
+    for i in range(points.shape[0]):
+        if voxels.keys[max(rows[i], 0)] != keys[i]:
+            rows[i] = -1
 
 
 @njit(cache=True, inline="always")

@@ -16,9 +16,9 @@ from scanchain.logs.mcap.blocks import DamagedBlockError, read_block, release
 from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message
 from scanchain.logs.mcap.selection import EVERYTHING, Span, messages_of
 from scanchain.logs.messages.cdr import MalformedMessageError
+from scanchain.threads import threads
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
-_THREADS = 2
 _BLOCKS_AHEAD = 4  # that wait decoded, at most
 _MOST_BYTES_AHEAD = 256_000_000
 
@@ -89,7 +89,7 @@ def _ahead(
     """Contents in the order of the blocks, decoded by threads that end when the iterator is closed."""
     running: deque[tuple[Block, Future[tuple[list[Decoded], str]]]] = deque()
     size = 0
-    pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="scanchain-read")
+    pool = ThreadPoolExecutor(threads(), thread_name_prefix="scanchain-read")
     try:
         for block in blocks:
             running.append((block, pool.submit(decode, block)))
