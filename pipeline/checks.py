@@ -21,6 +21,7 @@ from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _MOST_VOXELS = float((1 << 20) - 64)  # largest distance from the origin, beyond which keys of voxels repeat
+_MOST_WHOLE = 1 << 63  # whole numbers from which on 64 bits do not hold them
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
 SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
 LARGEST = 1e50  # largest number in points, weights or a graph: products of a few are still finite
@@ -143,13 +144,15 @@ def one_of(value: object, choices: tuple[str, ...], name: str) -> None:
 
 def integer(value: object, name: str, wanted: str, *, least: int | None = None) -> int:
     """A whole number, not below ``least``; floats are refused, also those without a fraction."""
+    if type(value) is int and -_MOST_WHOLE < value < _MOST_WHOLE and (least is None or value >= least):
+        return value
     if isinstance(value, bool):
         raise InputError(f"{name} is {value}; wanted {wanted}")
     try:
         whole = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         raise InputError(f"{name} is {shown(value)}; wanted {wanted}") from None
-    if abs(whole) >= 1 << 63:
+    if abs(whole) >= _MOST_WHOLE:
         raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
     if least is not None and whole < least:
         raise InputError(f"{name} is {whole}; wanted {wanted}")

@@ -53,7 +53,8 @@ def compiled_s() -> float:
 
 def working_s() -> float:
     """Seconds as ``perf_counter`` has them, less those of compiling; only differences have a meaning."""
-    return perf_counter() - compiled_s()
+    now_s = perf_counter()
+    return (_compilation.began_s if _compilation.depth else now_s) - _compilation.ended_s
 
 
 @contextmanager

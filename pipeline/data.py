@@ -22,6 +22,8 @@ Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
+_set = object.__setattr__  # of a record that checks itself
+
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
 
 _WHOLE = (
@@ -64,13 +66,13 @@ class Scan:
         from scanchain import checks  # compiled: whoever reads --help makes no scan
 
         for name, wanted, least in _WHOLE:
-            object.__setattr__(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
+            _set(self, name, checks.integer(getattr(self, name), name, wanted, least=least))
         d = checks.dimension_of(self.points, "points")
         points = checks.points(self.points, "points", d, dtype=np.float32)
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
+        _set(self, "points", points)
+        _set(self, "times_s", checks.point_times(self.times_s, "times_s", len(points)))
         if self.T_odom_base is not None:
-            object.__setattr__(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
+            _set(self, "T_odom_base", checks.pose(self.T_odom_base, "T_odom_base", d))
 
     @classmethod
     def of(

@@ -15,35 +15,45 @@ from numpy.typing import NDArray
 from scanchain.errors import InputError
 
 _NUMBER = np.dtype("<f4")  # as lidars give them
+_MOST_WAITING = 1 << 18  # bytes that are gathered before they are written together
 
 
 class PointStore:
-    """Grows by one scan after the other; what is in it is handed to the system at once and never changes.
+    """Grows by one scan after the other; what is in it never changes.
 
     Attributes
     ----------
     dimension : 2 or 3, of the points
     rows : points that are in it
+    waiting : bytes of the last of them, which are not in the file yet
     """
 
     def __init__(self, dimension: int, path: Path | None = None) -> None:
         """Path : of the file; without one it has no name and goes with the process."""
         self.dimension = dimension
         self.rows = 0
+        self.waiting = bytearray()
         self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
-        """Write points (N, d), meters. Raises OSError where the disk is full."""
+        """Take points (N, d), meters. Raises OSError where the disk is full."""
         stored = StoredPoints(self, self.rows, len(points))
-        data = memoryview(np.ascontiguousarray(points, _NUMBER).tobytes())
-        self.file.seek(self.rows * self._row_bytes)
-        while data:
-            data = data[self.file.write(data) :]
+        self.waiting += points.astype(_NUMBER).tobytes()
         self.rows += len(points)
+        if len(self.waiting) >= _MOST_WAITING:
+            self.flush()
         return stored
+
+    def flush(self) -> None:
+        """Write the points that wait. Raises OSError where the disk is full."""
+        if self.waiting:
+            self.file.seek(self.rows * self._row_bytes - len(self.waiting))
+        while self.waiting:
+            del self.waiting[: self.file.write(self.waiting)]
 
     def read(self, first: int, count: int) -> NDArray[np.float32]:
         """(count, d) points from one row on. Raises InputError where the file has lost them."""
+        self.flush()
         self.file.seek(first * self._row_bytes)
         result = np.empty((count, self.dimension), _NUMBER)
         rest = result.reshape(-1).view(np.uint8).data
@@ -64,7 +74,10 @@ class PointStore:
 
     def close(self) -> None:
         """Close the file; nothing can be read any more."""
-        self.file.close()
+        try:
+            self.flush()
+        finally:
+            self.file.close()
 
     def _take(self, file: FileIO) -> None:
         """Use a file, which is closed when the store is garbage-collected."""

@@ -100,7 +100,8 @@ class Slam:
         self.keyframes: list[Keyframe] = []
         self.closures: list[Closure] = []
         self.stamps_ns: list[int] = []
-        self.odometry_poses: list[Pose] = []
+        self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
+        self.T_odom_last = lie.identity(self.dimension)
         self.T_world_odom = lie.identity(self.dimension)
         self.traveled_m = 0.0
         self.waiting_closures = 0
@@ -182,7 +183,7 @@ class Slam:
         Raises InputError without a scan, and when called again.
         """
         self._check_unfinished()
-        if not self.odometry_poses:
+        if not len(self.odometry_poses):
             raise InputError("no scan was processed: give Slam.process at least one before Slam.finish")
         self.is_finished = True
         if self.config.loops.enabled:
@@ -191,7 +192,7 @@ class Slam:
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
-        odometry = np.array(self.odometry_poses).reshape(-1, self.dimension + 1, self.dimension + 1)
+        odometry = self.odometry_poses.rows.copy()
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
         corrected = spread(state.poses[self.first :], numbers, odometry)
         if self.keeps_scans:
@@ -218,11 +219,13 @@ class Slam:
     def _keyframe(self, located: Located) -> int:
         """Make a keyframe of a scan that moved far enough; its index, or −1."""
         tracked = located.tracked
-        if self.odometry_poses:
-            self.traveled_m += lie.apart(self.odometry_poses[-1], tracked.T_odom_lidar)[0]
+        if len(self.odometry_poses):
+            self.traveled_m += lie.apart(self.T_odom_last, tracked.T_odom_lidar)[0]
+        self.T_odom_last = tracked.T_odom_lidar
         self.stamps_ns.append(tracked.scan.stamp_ns)
-        self.odometry_poses.append(tracked.T_odom_lidar)
-        if len(self.odometry_poses) == 2:  # only now is the motion known that distorted the first scan
+        if (
+            self.odometry_poses.append(tracked.T_odom_lidar) == 1
+        ):  # only now is the motion known that distorted the first scan
             stored = self.points.add(located.first_points)
             self.keyframes[self.first] = replace(self.keyframes[self.first], stored=stored)
         self.lost_scans += tracked.state is State.LOST
@@ -299,6 +302,8 @@ class Slam:
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
+        if not closures:
+            return ()
         taken = tuple(
             self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
         )

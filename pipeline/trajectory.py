@@ -15,6 +15,7 @@ from scanchain.errors import InputError, remedy_of
 from scanchain.words import counted
 
 _NS_PER_S = 1_000_000_000
+_TUM_ROW, _KITTI_ROW = 7 * " %.9f" + "\n", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
 _UNIT = 0.01  # largest deviation from 1 of the length of a quaternion, which may be written with two digits
@@ -69,11 +70,10 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     path = checks.path(path, "path")
     checks.instance(trajectory, Trajectory, "trajectory", "Trajectory(stamps_ns, poses), or read_tum(path)")
     poses = lie.lift(trajectory.poses)
-    quaternions = lie.to_quaternion(poses[:, :3, :3])
+    rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])]).tolist()
     with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
-        for stamp_ns, pose, quat_xyzw in zip(trajectory.stamps_ns.tolist(), poses, quaternions, strict=True):
-            values = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw))
-            file.write(f"{format_stamp(stamp_ns)} {values}\n")
+        for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
+            file.write(f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}")
 
 
 def read_kitti(path: Path | str) -> Trajectory:
@@ -101,7 +101,8 @@ def read_kitti(path: Path | str) -> Trajectory:
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
     """Write a KITTI file: the poses without their stamps."""
     rows = lie.lift(trajectory.poses)[:, :3].reshape(-1, 12)
-    np.savetxt(path, rows, fmt="%.9e", encoding="utf-8")
+    with Path(path).open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(_KITTI_ROW % tuple(row) for row in rows.tolist())
 
 
 def format_stamp(stamp_ns: int) -> str:

@@ -69,6 +69,7 @@ def test_a_file_that_lost_points_is_refused(tmp_path):
     path = tmp_path / "points"
     store = PointStore(3, path)
     stored = store.add(cloud(10))
+    store.flush()
     path.write_bytes(path.read_bytes()[:50])
     with pytest.raises(InputError, match="ends before point 10"):
         stored.read()

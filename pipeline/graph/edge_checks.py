@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.graph.semidefinite import find_semidefinite
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
@@ -18,6 +19,11 @@ _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may ha
 
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
     """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers."""
+    is_sound = positive_semidefinite(information)
+    largest = max(largest_magnitude(each.reshape(-1, each.shape[-1])) for each in (measurements, information))
+    is_known = edges.min(initial=0) >= 0 and edges.max(initial=-1) < pose_count
+    if is_known and is_sound.all() and largest <= LARGEST and (edges[:, 0] != edges[:, 1]).all():
+        return
     lowest, highest = edges.min(axis=1, initial=0), edges.max(axis=1, initial=-1)
     for index in np.flatnonzero((lowest < 0) | (highest >= pose_count))[:1]:
         i, j = edges[index]
@@ -33,7 +39,7 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
                 f"edge {i}-{j}: {what} of {largest[index]:g}, over {LARGEST:g}; give meters and radians, "
                 "and an inverse covariance of these"
             )
-    for index in np.flatnonzero(~positive_semidefinite(information))[:1]:
+    for index in np.flatnonzero(~is_sound)[:1]:
         i, j = edges[index]
         raise InputError(
             f"edge {i}-{j}: information matrix is not symmetric positive semidefinite; give an inverse covariance"
@@ -63,6 +69,8 @@ def ranks(information: Matrix) -> NDArray[np.int64]:
     is_full = np.empty(len(information), np.bool_)
     find_semidefinite(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
     result = np.full(len(information), k, np.int64)
+    if is_full.all():
+        return result
     result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
     return result
 

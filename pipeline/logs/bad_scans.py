@@ -37,25 +37,27 @@ def check_count(bad: int, scans: int, config: LogConfig, complaint: str) -> None
         )
 
 
-def defect(message: Decoded, where: str, preprocess: PreprocessConfig | None) -> str:
-    """Defect that makes a scan unusable, empty where it is usable; ``where`` names the scan."""
+def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
+    """Defect that makes a scan unusable, to follow its name; empty where it is usable."""
     returns = message.value
     if not isinstance(returns, Returns):
-        return f"{where} is malformed: {returns}"
+        return f"is malformed: {returns}"
     if message.log_time_ns >= 1 << 63:
-        return f"{where} has the log time {message.log_time_ns} ns, which no clock shows"
-    farthest_s = float(np.abs(returns.times_s).max(initial=0.0))
+        return f"has the log time {message.log_time_ns} ns, which no clock shows"
+    farthest_s = float(np.abs(returns.times_s).max()) if len(returns.times_s) else 0.0
     if farthest_s > LONGEST_SWEEP_S:
-        return f"{where} has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
+        return f"has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
     if not len(returns.points):
-        return f"{where} has no valid point ({returns.why})"
+        return f"has no valid point ({returns.why})"
     outside = "" if preprocess is None else _none_retained(returns.points, preprocess)
-    return outside and f"{where} has {outside}"
+    return outside and f"has {outside}"
 
 
 def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     """Reason for which preprocessing retains none of the points (N, d); empty where it retains one."""
     low_m, high_m = config.min_range_m, config.max_range_m
+    if low_m * low_m <= math.fsum(x * x for x in points[len(points) // 2].tolist()) <= high_m * high_m:
+        return ""
     squares = np.empty(0)
     for part in (points[::_SAMPLE], points):
         squares = np.einsum("ij,ij->i", part, part, dtype=np.float64)

@@ -203,9 +203,10 @@ class Log:
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
-                where = f"{self.indexes[message.channel.key[0]].path}: scan {count - 1} of {self.topic}"
-                complaint = defect(message, where, preprocess)
-                if complaint:
+                unusable = defect(message, preprocess)
+                if unusable:
+                    path = self.indexes[message.channel.key[0]].path
+                    complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue

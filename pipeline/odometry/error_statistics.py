@@ -23,6 +23,7 @@ class ErrorStatistics:
         self.least = lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2
         self.squares = np.zeros(len(first_sigma))
         self.count = 0
+        self.variances = first_sigma**2  # (k,) of the next prediction, rather too large than too small
 
     def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
         """Take the error (k,) of a prediction against a match of this variance (k,), which is subtracted."""
@@ -30,10 +31,6 @@ class ErrorStatistics:
         gain = max(1.0 - _MEMORY, 1.0 / self.count)
         square = np.maximum(error * error - variance, 0.0)
         self.squares = np.maximum(self.squares + gain * (square - self.squares), _SUDDEN * square)
-
-    @property
-    def variances(self) -> NDArray[np.float64]:
-        """(k,) of the next prediction, rather too large than too small."""
-        if self.count < _KNOWN:
-            return self.first_sigma**2
-        return np.minimum(np.maximum(_CAUTION**2 * self.squares, self.least), self.first_sigma**2)
+        if self.count >= _KNOWN:
+            usual = np.maximum(_CAUTION**2 * self.squares, self.least)
+            self.variances = np.minimum(usual, self.first_sigma**2)

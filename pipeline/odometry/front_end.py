@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,13 +14,27 @@ from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
 from scanchain.preprocess import Prepared
 
+_MOST_MOTIONS = 64  # largest number of scans whose motions are gathered before they are summed up
+
+
+class Motion(NamedTuple):
+    """The pose of a scan and what is known of its motion: prior and match; ``doubt`` (k, k), None in the plane."""
+
+    T_odom_lidar: Pose
+    covariance: Matrix
+    is_measured: bool
+    information: Matrix
+    is_lost: bool
+    doubt: Matrix | None
+
 
 @dataclass(frozen=True, slots=True)
 class Located:
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
-    ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame;
+    ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
+    ``is_keyframe``;
     ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
     """
 
@@ -45,13 +60,17 @@ class FrontEnd:
         self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0
+        self.no_points = np.empty((0, self.odometry.dimension))
+        self.motions: list[Motion] = []  # of the last scans, not summed up yet
+        self.since = self.at_keyframe  # information of the motion since the keyframe, but for those
 
     def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
         tracked = self.odometry.process(scan)
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
-        information = self._add_motion(tracked)
+        self._take(tracked)
+        information = self.information() if is_keyframe else self.at_keyframe
         if is_keyframe:
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.at_keyframe, 0
@@ -61,33 +80,54 @@ class FrontEnd:
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=local_map.scale,
-            local_map=local_map.points() if is_keyframe else np.empty((0, local_map.dimension)),
+            local_map=local_map.points() if is_keyframe else self.no_points,
             information=information,
             first_points=self.odometry.first_points,
         )
 
-    def _add_motion(self, tracked: Tracked) -> Matrix:
-        """Information of the motion since the last keyframe: of the match, and of all predictions since.
+    def information(self) -> Matrix:
+        """Information (k, k) of the motion of the last scan since the last keyframe."""
+        for motion in self.motions:
+            self.since = self._since(motion)
+        self.motions = []
+        return self.since
+
+    def _take(self, tracked: Tracked) -> None:
+        """Gather a motion: the sum is for keyframes alone, and quicker at once than one scan at a time."""
+        is_lost, prior, information = tracked.state is State.LOST, tracked.prior, tracked.match.information
+        doubt = _doubt_of(tracked) if self.odometry.dimension == 3 else None
+        self.motions.append(
+            Motion(tracked.T_odom_lidar, prior.covariance, prior.is_measured, information, is_lost, doubt)
+        )
+        if len(self.motions) >= _MOST_MOTIONS:
+            self.information()
+
+    def _since(self, motion: Motion) -> Matrix:
+        """Information of a motion since the last keyframe: of the match, and of all predictions since.
 
         The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances; so
         do those of scans between that have no reading. Without wheels the match is all there is.
         """
         self.since_keyframe += 1
-        self.has_wheels |= tracked.prior.is_measured
-        n, T_last_current = self.since_keyframe, lie.between(self.T_odom_last, tracked.T_odom_lidar)
-        self.T_odom_last = tracked.T_odom_lidar
-        Ad = lie.adjoint(lie.inverse(T_last_current))
-        self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
+        self.has_wheels |= motion.is_measured
         if not self.has_wheels:
             self.covariance = None
+        T_last, self.T_odom_last = self.T_odom_last, motion.T_odom_lidar
+        if self.covariance is None and motion.doubt is None:
+            return motion.information
+        n = self.since_keyframe
+        Ad = lie.adjoint(lie.inverse(lie.between(T_last, motion.T_odom_lidar)))
+        if motion.doubt is not None:
+            self.doubt = Ad @ self.doubt @ Ad.T + motion.doubt
         if self.covariance is None:
-            return self._doubted(tracked.match.information)
-        predicted = n * tracked.prior.covariance
+            return self._doubted(motion.information)
+        predicted = n * motion.covariance
         if n > 1:
             predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
-        matched = np.zeros_like(predicted) if tracked.state is State.LOST else tracked.match.information
-        information = np.linalg.inv(predicted) + matched
-        self.covariance = np.linalg.inv(information).astype(np.float64, copy=False)
+        information = np.linalg.inv(predicted)
+        if not motion.is_lost:
+            information += motion.information
+        self.covariance = np.asarray(np.linalg.inv(information), np.float64)
         return self._doubted(information)
 
     def _doubted(self, information: Matrix) -> Matrix:
@@ -108,11 +148,11 @@ def _doubt_of(tracked: Tracked) -> Matrix:
     """Covariance (k, k) that a scan adds to the motion where its correspondences contradict the pose.
 
     Such a pose is known no better than predicted, which it is off by the innovation. The map that the next scans
-    are aligned to holds this one, so that they inherit its error. In the plane most of the poses that so few
-    correspondences contradict are right, and doubt would let drift gather there.
+    are aligned to holds this one, so that they inherit its error. In the plane, where most of the poses that so
+    few correspondences contradict are right, doubt would let drift gather: there is none.
     """
     prior, match = tracked.prior, tracked.match
-    if len(prior.covariance) == 3 or tracked.state is State.LOST or match.fit >= LEAST_FIT:
+    if tracked.state is State.LOST or match.fit >= LEAST_FIT:
         return np.zeros_like(prior.covariance)
     innovation = lie.log(lie.between(prior.T_target_source, match.T_target_source))
     return prior.covariance + np.outer(innovation, innovation)

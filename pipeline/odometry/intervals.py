@@ -22,7 +22,7 @@ class Intervals:
         """Remember a scan."""
         if self.last_scan is not None:
             self.last_s = self.to(scan)
-            if not self.has_gap_before(scan):
+            if not self.is_gap(self.last_s):
                 gain = 1.0 - _MEMORY if self.usual_s else 1.0
                 self.usual_s += gain * (self.last_s - self.usual_s)
         self.last_scan = scan
@@ -49,7 +49,11 @@ class Intervals:
 
     def has_gap_before(self, scan: Scan) -> bool:
         """True if scans are missing before this one."""
-        return self.usual_s > 0.0 and self.to(scan) > _GAP * self.usual_s
+        return self.is_gap(self.to(scan))
+
+    def is_gap(self, interval_s: float) -> bool:
+        """True of an interval in which scans are missing."""
+        return interval_s > _GAP * self.usual_s > 0.0
 
 
 def _since(last: Scan, scan: Scan) -> tuple[float, float]:

@@ -111,13 +111,11 @@ class Odometry:
         self.scans += 1
         started, scan = working_s(), prepared.scan
         self.resolution = prepared.after
-        sweep, sparse = map(self.elevation.corrected, (prepared.sweep, prepared.sparse))
+        sweep, sparse = self.elevation.corrected(prepared.sweep), self.elevation.corrected(prepared.sparse)
         self.map.resize(self.resolution.scale)
-        if not len(self.local_map):
-            self._check_range(scan, sparse)
         began = working_s()
         prediction = self.predictor.predict(scan)
-        registered = self._register(sweep, sparse, prediction)
+        registered = self._register(scan, sweep, sparse, prediction)
         aligned = working_s()
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
         points = sweep.from_middle(self.predictor.velocity)
@@ -140,13 +138,16 @@ class Odometry:
         )
         return self._at_stamp(tracked, sweep, prediction)
 
-    def _register(self, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
+    def _register(self, scan: Scan, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
         """The match of a scan: aligned as predicted, deskewed by the motion that was found, and aligned again."""
+        is_first = not len(self.map.surfaces)
+        if is_first:
+            self._check_range(scan, sparse)
         points = sparse.from_middle(prediction.velocity)
         if not len(points):
             match = nothing_to_match(prediction, self.config.preprocess)
             return _Registered(points, match, State.LOST, prediction)
-        if not len(self.local_map):
+        if is_first:
             match = first_match(prediction.T_odom_last, points, self.config.matching)
             self.first_sweep, self.first_points = sweep, sweep.points
             return _Registered(points, match, State.OK, prediction)

@@ -35,6 +35,7 @@ class Prediction:
     is_guess : whether scans are missing before this one, so that the pose may be far off
     velocity : (k,) twist per second at the last scan, lidar frame
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
+    motion_before : (k,) that motion as a twist
     interval_s, last_s, usual_s : since the last scan, before that one, and as a rule; 0 where unknown
     silence_s : since the last scan by stamps that the log confirms, else 0
     lost_s : for how long scans have been lost
@@ -47,6 +48,7 @@ class Prediction:
     velocity: NDArray[np.float64]
     T_odom_last: Pose
     T_previous_current: Pose
+    motion_before: NDArray[np.float64]
     interval_s: float
     last_s: float
     usual_s: float
@@ -109,13 +111,17 @@ class Prediction:
         return T @ self.T_previous_current, *stretched, T
 
     def velocity_at(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
-        """Twist (k,) per second at a scan of this pose, in its own frame; the last one where stamps stand still.
+        """Twist (k,) per second at a scan of this pose, in its own frame; the last one if stamps stand still."""
+        return self.velocity_by(lie.log(lie.between(self.T_odom_last, T_odom_lidar)))
+
+    def velocity_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist (k,) per second, as above, at a scan after this motion (k,) from the last one.
 
         The mean since the last scan, carried on by half an interval with the acceleration between the last two.
         """
         if self.interval_s <= 0.0:
             return self.velocity
-        mean = self._mean_velocity(T_odom_lidar)
+        mean = motion / self.interval_s
         if not 0.0 < self.interval_s < _EVEN * self.last_s < _EVEN**2 * self.interval_s:
             return mean
         return mean + self.interval_s / (self.interval_s + self.last_s) * (mean - self._velocity_before())
@@ -128,20 +134,18 @@ class Prediction:
         """
         if self.interval_s <= 0.0 or self.is_second:
             return np.zeros(len(self.velocity))
-        mean = self._mean_velocity(T_odom_lidar)
+        mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.interval_s
         return (mean - self._velocity_before()) / self.interval_s * duration_s**2 / 24.0
-
-    def _mean_velocity(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
-        """Mean twist (k,) per second since the last scan."""
-        return lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.interval_s
 
     def _velocity_before(self) -> NDArray[np.float64]:
         """Mean twist (k,) per second between the last two scans."""
-        return lie.log(self.T_previous_current) / self.last_s
+        return self.motion_before / self.last_s
 
 
 class Predictor:
     """The last pose, the last motion and the last wheel reading, with their uncertainties.
+
+    ``motion`` (k,) is the twist of ``T_previous_current``.
 
     Without wheels the motion goes on as it was, by a filter whose noise is that of the errors of its predictions.
     Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.
@@ -153,7 +157,7 @@ class Predictor:
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
-        self.velocity = np.zeros(k)
+        self.motion = self.velocity = np.zeros(k)
         self.by_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
         self.by_wheels = ErrorStatistics(lie.by_component(k, config.wheel_sigma_m, config.wheel_sigma_rad))
         self.filter = MotionFilter(np.diag(self.by_velocity.first_sigma**2))
@@ -168,7 +172,7 @@ class Predictor:
         if wheel is not None:
             motion, statistics = wheel, self.by_wheels
             covariance = np.diag(self.by_wheels.variances)
-        elif times.has_gap_before(scan):
+        elif times.is_gap(interval_s):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
         else:
@@ -182,6 +186,7 @@ class Predictor:
             velocity=self.velocity,
             T_odom_last=self.T_odom_lidar,
             T_previous_current=self.T_previous_current,
+            motion_before=self.motion,
             interval_s=interval_s,
             last_s=times.last_s,
             usual_s=times.usual_s,
@@ -195,8 +200,9 @@ class Predictor:
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
-            self.velocity = prediction.velocity_at(T_odom_lidar)
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
+            self.motion = lie.log(self.T_previous_current)
+            self.velocity = prediction.velocity_by(self.motion)
             self._update(prediction, match, state)
         self.intervals.take(scan)
         self.T_odom_lidar = T_odom_lidar
@@ -207,7 +213,7 @@ class Predictor:
             self.filter.begin(self.T_previous_current)
         elif prediction.is_guess:
             share = self.intervals.usual_s / prediction.interval_s
-            self.filter.begin(lie.exp(share * lie.log(self.T_previous_current)))
+            self.filter.begin(lie.exp(share * self.motion))
         else:
             innovation = lie.log(lie.between(prediction.T_odom_lidar, match.T_target_source))
             if prediction.statistics is self.by_velocity:

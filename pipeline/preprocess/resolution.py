@@ -92,7 +92,7 @@ class Prepared:
 
 def prepare(scan: Scan, resolution: Resolution) -> Prepared:
     """A scan, downsampled at a resolution, which stays as it is."""
-    started, after = working_s(), copy(resolution)
+    started, after = working_s(), resolution if resolution.is_fixed else copy(resolution)
     sweep, sparse = after.downsampled(scan)
     return Prepared(scan, sweep, sparse, after, working_s() - started)
 

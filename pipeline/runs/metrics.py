@@ -196,7 +196,7 @@ def measure(
     matches = [row.match for row in steps.rows]
     residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
     states = steps.states()
-    stage_s = np.array([[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in steps.rows])
+    stage_s = steps.seconds_by_stage()
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
     rejected = Counter(item.rejected_by for item in final)

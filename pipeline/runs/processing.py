@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from time import perf_counter
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import Config
-from scanchain.data import Scan, Trajectory
+from scanchain.data import Scan, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
 from scanchain.logs import Log
-from scanchain.preprocess import Prepared, prepare_ahead
+from scanchain.preprocess import Prepared, Resolution, prepare, prepare_ahead
 from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
@@ -30,6 +34,9 @@ from scanchain.runs.vouching import evidence_of_run
 from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
 from scanchain.verdict import Judged, judge, worst_place
+
+_TOGETHER = 16  # largest number of scans that are read, and of steps that are entered, together
+_WAIT_S = 0.05  # longest time for which steps are gathered
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 
@@ -74,11 +81,12 @@ def process(
         if recording.web_address:
             progress.announce(f"viewer: {recording.web_address}")
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
-        for step in map(slam.process, _ahead(progress.track(scans, log.scan_count - len(steps)), slam)):
-            recording.log(step)
-            journal.append(steps.append(step))
-            if checkpoints.are_due():
-                checkpoints.write(slam, recording.secure())
+        with _Taking(recording, journal, steps) as taking:
+            for step in map(slam.process, _ahead(progress.track(scans, log.scan_count - len(steps)), slam)):
+                taking.take(step)
+                if checkpoints.are_due():
+                    taking.complete()
+                    checkpoints.write(slam, recording.secure())
         checkpoints.write(slam, recording.secure())  # an interruption from here on loses no scan
         result = slam.finish(progress.say)
         final = final_verdicts(result.closures, result.state)
@@ -100,6 +108,43 @@ def process(
     return Processed(result, results.cloud, final, judged, (*notes, *recording.warnings), held_s)
 
 
+class _Taking:
+    """Records steps and enters them into table and journal, a few at once: that is quicker. A context."""
+
+    def __init__(self, recording: Recorder, journal: Journal, steps: StepTable) -> None:
+        self.recording = recording
+        self.journal = journal
+        self.steps = steps
+        self.waiting: deque[Step] = deque()
+        self.since_s = perf_counter()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.complete()
+
+    def take(self, step: Step) -> None:
+        """Take a step, to be entered by now or soon."""
+        self.waiting.append(step)
+        if len(self.waiting) >= _TOGETHER or perf_counter() - self.since_s >= _WAIT_S:
+            self._enter()
+
+    def complete(self) -> None:
+        """Enter the steps that wait, and write the journal."""
+        self._enter()
+        self.journal.flush()
+
+    def _enter(self) -> None:
+        while self.waiting:
+            step = self.waiting.popleft()
+            self.journal.append(self.steps.append(step))
+            self.recording.log(step)
+        self.since_s = perf_counter()
+
+
 def _begin(
     job: Job, log: Log, config: Config, folder: Path, left: Left | None
 ) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
@@ -116,11 +161,28 @@ def _begin(
 
 
 def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
-    """The scans, clouds prepared in a thread beside; of laser scans that takes longer than to prepare them."""
+    """The scans, clouds prepared in a thread beside; laser scans a few at once, which is quicker than either."""
+    resolution = slam.front_end.odometry.resolution
     if slam.dimension == 3 and threads() > 1:
-        yield from prepare_ahead(scans, slam.front_end.odometry.resolution)
+        yield from prepare_ahead(scans, resolution)
+    elif resolution.is_fixed:
+        yield from _few_at_once(scans, resolution)
     else:
         yield from scans
+
+
+def _few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
+    """Scans, a few read and prepared together; those before an error come before it."""
+    while True:
+        some: list[Prepared] = []
+        try:
+            some.extend(prepare(scan, resolution) for scan in islice(scans, _TOGETHER))
+        except InputError:
+            yield from some
+            raise
+        if not some:
+            return
+        yield from some
 
 
 def _record_truth(true_poses: TruePoses, gap_s: float | None, result: SlamResult, recording: Recorder) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,6 +96,11 @@ class StepTable:
         flat = _covariances(np.array([row.match.information for row in self.rows]))
         return [None if each is None else np.array(each).reshape(k, k) for each in flat]
 
+    def seconds_by_stage(self) -> Matrix:
+        """(N, 5) of every step, in the order of ``STAGES``."""
+        of_stages = attrgetter(*(f"{stage}_s" for stage in STAGES))
+        return np.array([of_stages(row.timing) for row in self.rows], np.float64).reshape(-1, len(STAGES))
+
     def states(self) -> Counter[State]:
         """Number of steps in each state."""
         return Counter(row.state for row in self.rows)
@@ -111,7 +117,6 @@ class StepTable:
         import pyarrow.parquet as pq
 
         rows, matches = self.rows, [row.match for row in self.rows]
-        timings = [row.timing for row in rows]
         k = len(matches[0].information) if matches else 0
         columns: dict[str, object] = {
             "index": [row.index for row in rows],
@@ -142,7 +147,7 @@ class StepTable:
             "reason": pa.array([row.reason for row in rows]).dictionary_encode(),
             "starts_segment": [row.starts_segment for row in rows],
             "keyframe": [row.keyframe for row in rows],
-            **{f"{stage}_s": [getattr(timing, f"{stage}_s") for timing in timings] for stage in STAGES},
+            **{f"{stage}_s": column for stage, column in zip(STAGES, self.seconds_by_stage().T, strict=True)},
         }
         table = pa.table(columns).replace_schema_metadata(_NOTES)
         pq.write_table(table, path, compression="zstd")
@@ -185,12 +190,12 @@ _NOTES = {
 }
 
 
-def pose_columns(poses: Matrix) -> dict[str, list[float]]:
+def pose_columns(poses: Matrix) -> dict[str, NDArray[np.float64]]:
     """Columns x, y, z, qx, qy, qz, qw of poses (N, d+1, d+1)."""
     lifted = lie.lift(poses)
     values = np.hstack([lifted[:, :3, 3], lie.to_quaternion(lifted[:, :3, :3])])
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    return {name: column.tolist() for name, column in zip(names, values.T, strict=True)}
+    return {name: np.ascontiguousarray(column) for name, column in zip(names, values.T, strict=True)}
 
 
 def _wheel_columns(poses: Matrix) -> dict[str, object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
@@ -125,10 +126,12 @@ def check_overlap(inlier_share: Floats) -> Floats:
     than the map says, or something stands close before it.
     """
     n = len(inlier_share)
-    usual = [np.median(inlier_share[max(scan - _BEFORE, 0) : scan]) for scan in range(_FEWEST, n)]
-    ratio = np.full(n, np.nan)
-    ratio[_FEWEST:] = inlier_share[_FEWEST:] / np.maximum(usual, _LEAST_USUAL)
-    return ratio
+    usual = np.full(n, np.nan)
+    for scan in range(_FEWEST, min(_BEFORE, n)):
+        usual[scan] = np.median(inlier_share[:scan])
+    if n > _BEFORE:
+        usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
+    return inlier_share / np.maximum(usual, _LEAST_USUAL)
 
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:

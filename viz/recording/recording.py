@@ -67,7 +67,7 @@ class Recording:
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher(dimension)
         self.graph = KeyframeGraph()
-        self.now = Times.at(0, 0)
+        self.last = (0, 0)  # scan and stamp of the last step
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
@@ -100,7 +100,7 @@ class Recording:
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
-        self.now = Times.at(rows[-1].index, rows[-1].stamp_ns)
+        self.last = rows[-1].index, rows[-1].stamp_ns
         self._guard(lambda: self.batcher.restore(rows, self.graph.restore(rows, closures, graph)))
         if before is not None:
             for sink in self.sinks:
@@ -117,7 +117,15 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        if self.sinks:
+        if not self.sinks:
+            return
+        self.last = step.scan.index, step.scan.stamp_ns
+        try:
+            self.batcher.add(step, self.graph.add(step))
+        except Exception as error:
+            self._note(error)
+        has_news = self.graph.has_grown or self._draws_map_of(step)
+        if has_news or self.batcher.is_due:
             self._send(lambda: self._step(step))
 
     def log_trajectory(
@@ -191,11 +199,19 @@ class Recording:
             return ""
         return viewer.grpc_address(self.port)
 
+    @property
+    def now(self) -> Times:
+        """The instant of the last step."""
+        return Times.at(*self.last)
+
+    def _draws_map_of(self, step: Step) -> bool:
+        """True for every so many keyframes."""
+        return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
+
     def _step(self, step: Step) -> list[Message]:
-        self.now = Times.at(step.scan.index, step.scan.stamp_ns)
-        self.batcher.add(step, self.graph.add(step))
+        """What a step that was gathered makes due."""
         messages = self.graph.draw(self.now) if self.graph.has_grown else []
-        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+        if self._draws_map_of(step):
             points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
             columns = rr.Points3D.columns(positions=points).partition([len(points)])
             messages.append(Message(entities.LOCAL_MAP, columns, self.now))
@@ -252,6 +268,9 @@ class Recording:
             with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
                 act()
         except Exception as error:
-            problem = f"the recording lacks something: {type(error).__name__}: {error}"
-            if problem not in self.problems:
-                self.problems.append(problem)
+            self._note(error)
+
+    def _note(self, error: Exception) -> None:
+        problem = f"the recording lacks something: {type(error).__name__}: {error}"
+        if problem not in self.problems:
+            self.problems.append(problem)

@@ -24,6 +24,7 @@ from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.error_statistics import ErrorStatistics
+from scanchain.odometry.front_end import Motion
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.motion_filter import MotionFilter
@@ -65,9 +66,9 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals, ErrorStatistics,
-        Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap, Voxels,
-        PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
+        Checkpoint, Slam, FrontEnd, Motion, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
+        ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
+        Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
         PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
@@ -80,6 +81,7 @@ _CLASSES = Classes(
         (Relocalizer, "searched"): lambda relocalizer: None,
         (PlaceCloser, "recognizer"): lambda closer: None,
         (PointStore, "file"): lambda store: None,
+        (PointStore, "waiting"): lambda store: bytearray(),
         (Odometry, "matcher"): lambda odometry: create_matcher(odometry.config.matching),
     },
     _version(),
@@ -105,6 +107,7 @@ class Checkpoints:
         """Write one. Raises OSError on a full disk; the last one stays."""
         started = perf_counter()
         run_s = working_s() - self.began_s
+        slam.points.flush()
         checkpoint = Checkpoint(len(slam.stamps_ns), run_s, self.process, recorded_bytes, slam)
         write_snapshot(self.path, checkpoint, _CLASSES)
         now = perf_counter()

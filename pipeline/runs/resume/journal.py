@@ -1,4 +1,4 @@
-"""steps.journal: every step of a run, on disk as soon as it is computed, for resuming after a crash."""
+"""steps.journal: every step of a run, on disk soon after it is computed, for resuming after a crash."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
+from time import perf_counter
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,10 +17,12 @@ from scanchain.runs.step_table import StepRow, StepTable
 
 JOURNAL_FILE = "steps.journal"
 _HEAD = struct.Struct("<II")  # bytes of the record that follows, and their CRC-32
+_ARRAYS = (np.ndarray, np.generic)
+_WAIT_S = 0.1  # longest time for which steps are gathered before they are written together
 
 
 class Journal:
-    """Appends a record a step; a context. Each is handed to the system before the next scan is placed.
+    """Appends a record a step; a context. Steps of a tenth of a second are handed to the system together.
 
     A record is its length and CRC-32 (both uint32, little-endian), then a StepRow in MessagePack.
     """
@@ -29,6 +32,8 @@ class Journal:
         self.file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         os.ftruncate(self.file, after_bytes)
         os.lseek(self.file, after_bytes, os.SEEK_SET)
+        self.waiting = bytearray()
+        self.written_s = perf_counter()
         self.encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
 
     def __enter__(self) -> Self:
@@ -37,14 +42,24 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        os.close(self.file)
+        try:
+            self.flush()
+        finally:
+            os.close(self.file)
 
     def append(self, row: StepRow) -> None:
-        """Write one step. Raises OSError where the disk is full."""
+        """Take one step, to be written by now or soon. Raises OSError where the disk is full."""
         body = self.encoder.encode(row)
-        record = _HEAD.pack(len(body), zlib.crc32(body)) + body
-        while record:
-            record = record[os.write(self.file, record) :]
+        self.waiting += _HEAD.pack(len(body), zlib.crc32(body))
+        self.waiting += body
+        if perf_counter() - self.written_s >= _WAIT_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the steps that wait. Raises OSError where the disk is full."""
+        while self.waiting:
+            del self.waiting[: os.write(self.file, self.waiting)]
+        self.written_s = perf_counter()
 
 
 def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int]:
@@ -68,7 +83,7 @@ def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, _ARRAYS):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} does not belong into a journal")
 
