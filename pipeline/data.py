@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -299,8 +300,7 @@ def fit_text(chi2: float, degrees_of_freedom: int, rejected: str, *, has_loops: 
     return f"χ² {shown} over {counted(degrees_of_freedom, *FREEDOM)}{left_out}"
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
+class Timing(msgspec.Struct, frozen=True):
     """Time of one scan by stage, seconds."""
 
     read_s: float

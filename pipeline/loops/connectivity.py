@@ -34,11 +34,11 @@ class Segments:
 
     def components(self, graph: PoseGraph) -> NDArray[np.int64]:
         """Number of the connected component of each keyframe (K,): segments that loops join have the same one."""
-        segment = self.of(np.arange(len(graph)))
-        if len(self.starts) == 1:
+        count = len(self.starts)
+        segment = np.repeat(np.arange(count), np.diff([*self.starts, len(graph)]))
+        if count == 1:
             return segment
         ends = segment[graph.edges[graph.is_loop & (graph.weight > _MIN_WEIGHT)]]
-        count = len(self.starts)
         number = np.arange(count)
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)

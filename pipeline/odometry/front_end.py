@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from scanchain import lie
@@ -28,8 +28,7 @@ class Motion(NamedTuple):
     doubt: Matrix | None
 
 
-@dataclass(frozen=True, slots=True)
-class Located:
+class Located(msgspec.Struct, frozen=True):
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
@@ -124,7 +123,7 @@ class FrontEnd:
         predicted = n * motion.covariance
         if n > 1:
             predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
-        information = np.linalg.inv(predicted)
+        information = np.asarray(np.linalg.inv(predicted), np.float64)
         if not motion.is_lost:
             information += motion.information
         self.covariance = np.asarray(np.linalg.inv(information), np.float64)

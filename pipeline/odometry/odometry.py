@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,8 +35,7 @@ from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
 
 
-@dataclass(frozen=True, slots=True)
-class _Registered:
+class _Registered(msgspec.Struct, frozen=True):
     """The match of a scan, the points (N, d) that were aligned, deskewed to the middle, and the prediction.
 
     ``elsewhere_m`` as in ``Tracked``, ``rival`` as in ``Aligned``; ``is_standing`` if the lidar did not move since
@@ -178,7 +178,7 @@ class Odometry:
             T_moved = self._restart(velocity)
             T_odom_middle = T_moved @ T_odom_middle
             prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
-            prediction = replace(prediction, T_odom_last=T_moved)
+            prediction = msgspec.structs.replace(prediction, T_odom_last=T_moved)
         points = sparse.from_middle(velocity)
         match = self.matcher.align(points, self.local_map, T_odom_middle, prior)
         error = prediction.deskewing_error(match.T_target_source, sparse.duration_s)

@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from scanchain.clock import working_s
@@ -76,8 +76,7 @@ class Resolution:
         return min(max(2.0 ** round(target), self.config.min_scale), 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Prepared:
+class Prepared(msgspec.Struct, frozen=True):
     """A scan, downsampled for the map (``sweep``) and for matching (``sparse``), before anything moves it.
 
     ``after`` holds the sizes for the next scan; ``seconds`` is the time that this one took.

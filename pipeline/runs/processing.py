@@ -85,7 +85,7 @@ def process(
             for step in map(slam.process, _ahead(progress.track(scans, log.scan_count - len(steps)), slam)):
                 taking.take(step)
                 if checkpoints.are_due():
-                    taking.complete()
+                    taking.enter()
                     checkpoints.write(slam, recording.secure())
         checkpoints.write(slam, recording.secure())  # an interruption from here on loses no scan
         result = slam.finish(progress.say)
@@ -124,24 +124,21 @@ class _Taking:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.complete()
+        self.enter()
 
     def take(self, step: Step) -> None:
         """Take a step, to be entered by now or soon."""
         self.waiting.append(step)
         if len(self.waiting) >= _TOGETHER or perf_counter() - self.since_s >= _WAIT_S:
-            self._enter()
+            self.enter()
 
-    def complete(self) -> None:
-        """Enter the steps that wait, and write the journal."""
-        self._enter()
-        self.journal.flush()
-
-    def _enter(self) -> None:
+    def enter(self) -> None:
+        """Enter the steps that wait, and write the journal. Raises OSError where the disk is full."""
         while self.waiting:
             step = self.waiting.popleft()
             self.journal.append(self.steps.append(step))
             self.recording.log(step)
+        self.journal.flush()
         self.since_s = perf_counter()
 
 

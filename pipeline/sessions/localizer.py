@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -136,11 +137,13 @@ class Localizer:
         if self.initial is not None and len(self.states) == 0:
             self.slam.begin_at(self.initial, INITIAL_SIGMAS)
         placed = self._placed(step)
-        unknown = np.full(step.T_odom_lidar.shape, np.nan)
         self.states.append(placed.state)
-        self.live.append(unknown if placed.T_map_lidar is None else placed.T_map_lidar)
-        covariance, d = placed.covariance, self.slam.dimension
-        self.sigma_m.append(np.nan if covariance is None else float(np.sqrt(np.trace(covariance[:d, :d]))))
+        if placed.T_map_lidar is None or placed.covariance is None:
+            self.live.append(np.full(step.T_odom_lidar.shape, np.nan))
+            self.sigma_m.append(np.nan)
+        else:
+            self.live.append(placed.T_map_lidar)
+            self.sigma_m.append(math.sqrt(sum(placed.covariance.diagonal()[: self.slam.dimension].tolist())))
         self.traveled_m.append(self.slam.traveled_m - self.start_m)
         return placed
 
@@ -190,4 +193,6 @@ class Localizer:
             self.by_map = by_map, np.asarray(np.linalg.inv(loop_information(by_map, config)), np.float64)
         T_source_lidar = lie.between(slam.keyframes[by_map.source].T_odom_lidar, T_odom_lidar)
         Ad = lie.adjoint(lie.inverse(T_source_lidar))
-        return Ad @ self.by_map[1] @ Ad.T + np.diag(drift**2)
+        covariance = Ad @ self.by_map[1] @ Ad.T
+        covariance.flat[:: k + 1] += drift * drift
+        return covariance

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -20,8 +20,7 @@ _GROWTH = 1.05  # factor of growth between two drawings: the recording stays lin
 _DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
-@dataclass(frozen=True, slots=True)
-class Verdicts:
+class Verdicts(msgspec.Struct, frozen=True):
     """Events of a step, one per closure with a new verdict, and the numbers accepted and rejected since."""
 
     events: Sequence[str]

@@ -6,7 +6,6 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from time import perf_counter
 from types import TracebackType
 from typing import Any, Self
 
@@ -18,11 +17,10 @@ from scanchain.runs.step_table import StepRow, StepTable
 JOURNAL_FILE = "steps.journal"
 _HEAD = struct.Struct("<II")  # bytes of the record that follows, and their CRC-32
 _ARRAYS = (np.ndarray, np.generic)
-_WAIT_S = 0.1  # longest time for which steps are gathered before they are written together
 
 
 class Journal:
-    """Appends a record a step; a context. Steps of a tenth of a second are handed to the system together.
+    """Appends a record a step; a context. ``flush`` hands those that wait to the system.
 
     A record is its length and CRC-32 (both uint32, little-endian), then a StepRow in MessagePack.
     """
@@ -33,7 +31,6 @@ class Journal:
         os.ftruncate(self.file, after_bytes)
         os.lseek(self.file, after_bytes, os.SEEK_SET)
         self.waiting = bytearray()
-        self.written_s = perf_counter()
         self.encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
 
     def __enter__(self) -> Self:
@@ -48,18 +45,15 @@ class Journal:
             os.close(self.file)
 
     def append(self, row: StepRow) -> None:
-        """Take one step, to be written by now or soon. Raises OSError where the disk is full."""
+        """Take one step, which waits to be written."""
         body = self.encoder.encode(row)
         self.waiting += _HEAD.pack(len(body), zlib.crc32(body))
         self.waiting += body
-        if perf_counter() - self.written_s >= _WAIT_S:
-            self.flush()
 
     def flush(self) -> None:
         """Write the steps that wait. Raises OSError where the disk is full."""
         while self.waiting:
             del self.waiting[: os.write(self.file, self.waiting)]
-        self.written_s = perf_counter()
 
 
 def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int]:
