@@ -1,13 +1,15 @@
 """Localization in a town of many kilometers: memory of ``localize`` and ``run``, and scans that a search holds up.
 
-    python -m tests.benchmarks.localize_far [--km 10] [--sensor vlp-16] [--every 2] [--starts 8] [--copies 1] [--at-once]
+    python -m tests.benchmarks.localize_far [--km 10] [--sensor vlp-16] [--every 2] [--starts 8] [--copies 1]
+        [--at-once]
 
 A town with so many kilometers of streets, each of which is driven once, is simulated with every so many sweeps of
 a lidar, and mapped by ``run``; on another day, with other parked cars, it is driven the other way round. Memory
 is the peak of the resident memory of ``run`` and of ``localize`` with that log, each a process of its own, with
 what is written at the end. ``starts``: the log begins at scans spread evenly over it, and goes on until it is
-found, or for 60 m: path and scans until then, the longest scan and the mean in CPU time, the first three left out.
-With ``at-once`` a search is completed in one scan, as the command ``localize`` does. With ``copies``, the map stands there so many times side by side, every other one mirrored, later pairs longer.
+found, or for 60 m: path and scans until then, the longest scan and the mean in CPU time, the first three left
+out. With ``at-once`` a search is completed in one scan, as the command ``localize`` does. With ``copies``, the
+map stands there so many times side by side, every other one mirrored, later pairs longer.
 """
 
 from __future__ import annotations
