@@ -140,7 +140,7 @@ def searched(log_path: Path, run: Path, starts: int, *, is_live: bool) -> None:
             spent_s.append(thread_time() - begun)
             if placed.state is not MapState.SEARCHING or localizer.traveled_m[-1] > GIVEN_UP_M:
                 break
-        warm = spent_s[WARM_UP:]
+        warm = spent_s[WARM_UP:] or spent_s
         where = "never" if placed.state is MapState.SEARCHING else f"{localizer.traveled_m[-1]:.1f}"
         if first:  # the first start compiles
             longest_ms, mean_ms = 1e3 * max(warm), 1e3 * np.mean(warm)
