@@ -135,6 +135,8 @@ def localize(
     """
     started = working_s()
     prior = open_saved_map(job.prior)
+    if job.out.resolve() in (job.prior.resolve(), prior.folder.resolve()):
+        raise InputError(f"{job.out}: is the map; choose another --out")
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     early = load_settings(file=job.config_file, overrides=job.overrides)
     log = open_log(job.logs, early.config.log)
