@@ -104,8 +104,8 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
 
 def test_a_localized_log_never_replaces_its_map(office, call):
     before = sorted(path.name for path in (office / "map").iterdir())
-    for run in (office / "map", office / "map" / "map"):
-        code, _, error = call("localize", office / "office.mcap", "--map", office / "map", "--out", run, "--force")
+    for out in (office / "map", office / "map" / "map"):
+        code, _, error = call("localize", office / "office.mcap", "--map", office / "map", "--out", out, "--force")
         assert code == 2 and "is the map; choose another --out" in error
     assert sorted(path.name for path in (office / "map").iterdir()) == before
 
