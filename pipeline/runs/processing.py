@@ -163,12 +163,12 @@ def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
     if slam.dimension == 3 and threads() > 1:
         yield from prepare_ahead(scans, resolution)
     elif resolution.is_fixed:
-        yield from _few_at_once(scans, resolution)
+        yield from few_at_once(scans, resolution)
     else:
         yield from scans
 
 
-def _few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
+def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
     """Scans, a few read and prepared together; those before an error come before it."""
     while True:
         some: list[Prepared] = []

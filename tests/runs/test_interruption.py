@@ -13,9 +13,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.logs import open_log
+from scanchain.preprocess import Resolution
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
+from scanchain.runs.processing import few_at_once
 from scanchain.runs.resume.checkpoint import _CLASSES, Checkpoints, read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
@@ -352,3 +355,18 @@ def test_arrays_come_back_with_their_order_their_type_and_their_bits(tmp_path):
         assert a.tobytes() == b.tobytes() and (a.dtype, a.shape) == (b.dtype, b.shape)
         assert a.flags.writeable == b.flags.writeable
     assert again[1].flags.f_contiguous and again[6] is again[0] and type(scalar) is np.float32
+
+
+def test_scans_that_were_read_before_an_error_are_processed():
+    config = configured(2)
+    nothing, points = np.empty(0, np.float32), np.ones((9, 2), np.float32)
+
+    def scans():
+        yield from (Scan(index, index, index, points, nothing, 0, None) for index in range(20))
+        raise InputError("too many bad scans")
+
+    seen = []
+    with pytest.raises(InputError, match="too many"):
+        for prepared in few_at_once(scans(), Resolution(config.preprocess, config.local_map.voxel_size_m)):
+            seen.append(prepared.scan.index)
+    assert seen == list(range(20))

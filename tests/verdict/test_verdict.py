@@ -316,6 +316,13 @@ def test_without_a_keyframe_near_it_an_overlay_has_the_nearest(tmp_path):
     assert len(overlay.before) == len(overlay.after) == 1
 
 
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 10, 11, 12, 60])
+def test_the_usual_overlap_is_the_median_of_up_to_ten_scans_before(count):
+    share = np.random.default_rng(count).random(count)
+    naive = [np.nan if k < 3 else share[k] / np.median(share[max(k - 10, 0) : k]) for k in range(count)]
+    assert np.array_equal(check_overlap(share), naive, equal_nan=True)
+
+
 def test_a_lidar_that_was_carried_elsewhere_is_named_though_the_wheels_agree():
     poses, _ = course()
     share = np.full(N, 0.98)
