@@ -174,7 +174,7 @@ def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepa
         some: list[Prepared] = []
         try:
             some.extend(prepare(scan, resolution) for scan in islice(scans, _TOGETHER))
-        except InputError:
+        except BaseException:  # of the log, or the user's wish to end
             yield from some
             raise
         if not some:
