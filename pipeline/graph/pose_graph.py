@@ -269,6 +269,30 @@ class PoseGraph:
             time_s=working_s() - begin,
         )
 
+    def copy(self) -> PoseGraph:
+        """The graph as it is, independent of what becomes of this one."""
+        result = PoseGraph(self.dimension, self._names)
+        result._poses.extend(self.poses)
+        result._stamps_ns.extend(self.stamps_ns)
+        result._is_point.extend(self.is_point)
+        result._edges.extend(self.edges)
+        result._measurements.extend(self._measurements.rows)
+        result._information.extend(self._information.rows)
+        result._rank.extend(self._rank.rows)
+        result._is_loop.extend(self.is_loop)
+        result._weight.extend(self.weight)
+        result._fixed, result._explanation = set(self._fixed), self._explanation
+        return result
+
+    def take_over(self, optimized: PoseGraph) -> None:
+        """Take what optimizing a ``copy`` led to; poses added since move along with the last one before them."""
+        count, edges = len(optimized), len(optimized.edges)
+        T_new_old = optimized.poses[-1] @ lie.inverse(self.poses[count - 1])
+        self._poses.replace(np.concatenate([optimized.poses, T_new_old @ self.poses[count:]]))
+        self._weight.replace(np.concatenate([optimized.weight, self.weight[edges:]]))
+        self._explanation = optimized._explanation
+        self._changed()
+
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
         return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
