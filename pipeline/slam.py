@@ -44,7 +44,6 @@ _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _LARGE = 2000  # number of keyframes of a log from which on its graph is optimized beside
 _TAKEN_AFTER = 0.01  # share by which the graph grows until such an optimization is taken over
-_MOVED_GROWTH = 0.02  # least growth between the beginnings of two of them, where the map moves
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -351,10 +350,8 @@ class Slam:
         is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
         enough = 0 if is_urgent else _OPTIMIZE_EVERY
         size = len(self.keyframes) - self.first
-        if not self.moves_map:
+        if not self.moves_map or (size >= _LARGE and not is_urgent):
             enough = max(enough, _GROWTH * size)
-        elif size >= _LARGE and not is_urgent:
-            enough = max(enough, _MOVED_GROWTH * size)
         if not self.waiting_closures or grown < enough or self.beside is not None:
             return None
         rejection: OutlierRejection = "edges" if self.moves_map else "gnc"

@@ -115,6 +115,17 @@ class PoseGraph:
         """Ω of every edge, (E, k, k), as ``measurements``."""
         return self._applied(self._explanation)[1]
 
+    def added_since(self, first: int) -> tuple[Matrix, Matrix]:
+        """``measurements`` and ``information`` of the edges from this one on, without the work for those before."""
+        explanation, new = self._explanation, slice(first, None)
+        before = int((~self.is_loop[:first]).sum())
+        if any(slip.edges.stop > before for slip in explanation.slips):
+            return self.measurements[new], self.information[new]
+        drift = Explanation(explanation.drift)
+        return drift.applied(
+            self.edges[new], self._measurements.rows[new], self._information.rows[new], self.is_loop[new]
+        )
+
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """True for every edge with a robust loss, (E,)."""

@@ -3,7 +3,7 @@
 A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
 Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
 thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
-so many scans more come in real time, ten a second: the longest that one of them took, by the clock.
+so many scans more come in real time, forty a second: the longest that one of them took, by the clock.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scanchain.settings import load_settings
 from scanchain.simulation import SENSORS, simulate
 from tests.support.back_and_forth import BackAndForth
 
-_LIVE_S = 0.1  # period of a live lidar
+_LIVE_S = 0.025  # period of a fast laser scanner
 
 
 def main() -> None:
