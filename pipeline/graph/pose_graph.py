@@ -116,7 +116,7 @@ class PoseGraph:
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
-        """``measurements`` and ``information`` of the edges from this one on, without the work for those before."""
+        """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
         explanation, new = self._explanation, slice(first, None)
         before = int((~self.is_loop[:first]).sum())
         if any(slip.edges.stop > before for slip in explanation.slips):
