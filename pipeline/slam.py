@@ -42,8 +42,8 @@ _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over o
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
-_LARGE = 2000  # number of keyframes of a log from which on its graph is optimized beside
-_TAKEN_AFTER = 0.01  # share by which the graph grows until such an optimization is taken over
+_LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
+_TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -89,6 +89,7 @@ class Slam:
         """Arguments as in ``Odometry``, and ``is_live`` as in ``LoopCloser``.
 
         points_file : where points go, which stay out of memory; without one, into a temporary file
+        is_live : also whether a large graph is optimized beside the scans
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
@@ -97,6 +98,7 @@ class Slam:
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
+        self.is_live = is_live
         self.front_end = FrontEnd(config, T_base_lidar)
         self.closer = LoopCloser(config, self.dimension, is_live=is_live)
         self.graph = PoseGraph(self.dimension)
@@ -141,7 +143,11 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does."""
+        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does.
+
+        From the first on, a large graph is optimized beside: no scan waits for it.
+        """
+        self.is_live = True
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
@@ -355,7 +361,7 @@ class Slam:
         if not self.waiting_closures or grown < enough or self.beside is not None:
             return None
         rejection: OutlierRejection = "edges" if self.moves_map else "gnc"
-        if size < _LARGE:
+        if size < _LARGE or not self.is_live:
             return self._optimize(rejection)
         due = len(self.keyframes) + int(_TAKEN_AFTER * len(self.keyframes))
         self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)

@@ -3,7 +3,7 @@
 A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
 Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
 thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
-so many scans more come in real time, forty a second: the longest that one of them took, by the clock.
+so many scans more come in real time, forty a second: the longest that ``Slam.track`` took of one, by the clock.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
     longest_s, optimizations, before = 0.0, 0, len(slam.keyframes)
     for scan in scans:
         started = perf_counter()
-        step = slam.process(scan)
+        step = slam.track(scan.points, 1e-9 * scan.stamp_ns, scan.times_s, T_odom_base=scan.T_odom_base)
         taken_s = perf_counter() - started
         longest_s, optimizations = max(longest_s, taken_s), optimizations + (step.graph is not None)
         sleep(max(_LIVE_S - taken_s, 0.0))

@@ -186,7 +186,8 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
     monkeypatch.setattr("scanchain.slam._TAKEN_AFTER", 0.2)
     log = open_log(office)
     config = configured(2, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0})
-    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE)
+    straight = Slam(config, log.T_base_lidar, is_live=True)
+    broken = Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE, is_live=True)
     breaks = 0
     for scan in log.scans():
         is_beside = broken.beside is not None
