@@ -44,7 +44,7 @@ class StepRow:
 
 
 class StepTable:
-    """Rows of all steps, in columns: an append takes microseconds, a row a quarter of the memory of its objects."""
+    """Rows of all steps, in columns: a row takes microseconds, and a quarter of the memory of its objects."""
 
     def __init__(self) -> None:
         self._recent: list[StepRow] = []
