@@ -27,6 +27,7 @@ from scanchain.data import (
     Verdict,
 )
 from scanchain.errors import InputError
+from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
@@ -41,6 +42,8 @@ _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over o
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
+_LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
+_TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -86,6 +89,7 @@ class Slam:
         """Arguments as in ``Odometry``, and ``is_live`` as in ``LoopCloser``.
 
         points_file : where points go, which stay out of memory; without one, into a temporary file
+        is_live : also whether a large graph is optimized beside the scans
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
@@ -94,6 +98,7 @@ class Slam:
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
+        self.is_live = is_live
         self.front_end = FrontEnd(config, T_base_lidar)
         self.closer = LoopCloser(config, self.dimension, is_live=is_live)
         self.graph = PoseGraph(self.dimension)
@@ -110,6 +115,7 @@ class Slam:
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
         self.lost_scans = 0
         self.optimized_at = 0
+        self.beside: BackgroundOptimization | None = None
         self.first = 0  # number of the first keyframe of this log
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
@@ -138,7 +144,11 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does."""
+        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does.
+
+        From the first on, a large graph is optimized beside: no scan waits for it.
+        """
+        self.is_live = True
         scan = Scan.of(points, stamp_s, times_s, index=self.front_end.scans, T_odom_base=T_odom_base)
         return self.live_stamps.passed(scan, self.process)
 
@@ -189,6 +199,8 @@ class Slam:
         if self.config.loops.enabled:
             progress("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
+        if self.beside is not None:
+            self._take_over(self.beside)
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
         stamps_ns = np.array(self.stamps_ns, np.int64)
@@ -332,6 +344,7 @@ class Slam:
     def _move_segment(self, closure: Closure) -> None:
         """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
         self.joined_start, self.joins_segment = self.closer.segments.starts[-1], True
+        self.beside = None  # it would put the segment back
         T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
         T_new_old = T_world_source @ lie.inverse(self.graph.poses[closure.source])
         self.graph.move(self.joined_start, lie.normalize(T_new_old))
@@ -343,20 +356,45 @@ class Slam:
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
         grown = len(self.keyframes) - self.optimized_at
+        if self.beside is not None and len(self.keyframes) >= self.beside.due:
+            return self._take_over(self.beside)
         is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
         enough = 0 if is_urgent else _OPTIMIZE_EVERY
-        if not self.moves_map:
-            enough = max(enough, _GROWTH * (len(self.keyframes) - self.first))
-        if not self.waiting_closures or grown < enough:
+        size = len(self.keyframes) - self.first
+        if not self.moves_map or (size >= _LARGE and not is_urgent):
+            enough = max(enough, _GROWTH * size)
+        if not self.waiting_closures or grown < enough or self.beside is not None:
             return None
-        return self._optimize("edges" if self.moves_map else "gnc")
+        rejection: OutlierRejection = "edges" if self.moves_map else "gnc"
+        if size < _LARGE or not self.is_live:
+            return self._optimize(rejection)
+        due = len(self.keyframes) + int(_TAKEN_AFTER * len(self.keyframes))
+        self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)
+        self._begin_waiting()
+        return None
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
+        self._begin_waiting()
+        return state
+
+    def _take_over(self, beside: BackgroundOptimization) -> GraphState:
+        """Take the result of an optimization beside, of the graph as it was when that began."""
+        self.beside = None
+        self.graph.take_over(beside.result())
+        self._follow_graph()
+        return self.graph.state()
+
+    def _begin_waiting(self) -> None:
+        """All closures so far are taken into account: wait for the next."""
         self.waiting_closures, self.moves_map, self.optimized_at = 0, False, len(self.keyframes)
         self.joins_segment = False
-        self.T_world_odom = lie.normalize(state.poses[-1] @ lie.inverse(self.keyframes[-1].T_odom_lidar))
-        return state
+        self._follow_graph()
+
+    def _follow_graph(self) -> None:
+        """Put the odometry frame where the graph has the newest keyframe."""
+        T_lidar_odom = lie.inverse(self.keyframes[-1].T_odom_lidar)
+        self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_lidar_odom)
 
 
 def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:

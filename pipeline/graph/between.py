@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,11 @@ class BetweenProblem:
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
-        self.cholesky = SparseCholesky(self.pattern, analyze(self.pattern))
+
+    @cached_property
+    def cholesky(self) -> SparseCholesky:
+        """The solver; analyzed when it is first needed."""
+        return SparseCholesky(self.pattern, analyze(self.pattern))
 
     def restricted(self, kept: NDArray[np.bool_]) -> BetweenProblem:
         """The problem of the same poses with some of its edges, kept (E,)."""

@@ -49,8 +49,28 @@ def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
 
 def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
     """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by k solves with the factor of H."""
-    moved = responses(problem, i, j)
-    return moved[j] - moved[i]
+    return difference_covariances(problem, np.array([[i, j]]))[0, 0]
+
+
+def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) -> Matrix:
+    """Cov(ξ_j − ξ_i, ξ_b − ξ_a), (P, P, k, k), at [(a, b), (i, j)], of the left twists of pairs (P, 2) of poses.
+
+    By P k solves with the factor of H, each as far as it concerns these poses.
+    """
+    k, count = problem.freedom, len(pairs)
+    ends = problem.variable[pairs]
+    variables = np.unique(ends[ends >= 0])
+    place = np.where(ends >= 0, np.searchsorted(variables, ends), len(variables))  # the last one: fixed poses
+    moves = np.zeros((len(variables) + 1, k, count, k))
+    for pair, (i, j) in enumerate(place.tolist()):
+        moves[j, :, pair] += np.eye(k)
+        moves[i, :, pair] -= np.eye(k)
+    kept = np.arange(k) < problem.pattern.sizes[variables, None]
+    packed = moves[:-1][kept].reshape(-1, count * k)
+    moves[...] = 0.0
+    moves[:-1][kept] = problem.cholesky.solve_part(packed, variables).reshape(-1, count, k)
+    moved = np.ascontiguousarray(moves.transpose(2, 0, 1, 3))
+    return moved[:, place[:, 1]] - moved[:, place[:, 0]]
 
 
 def inverse_blocks(problem: BetweenProblem) -> Matrix:

@@ -115,6 +115,17 @@ class PoseGraph:
         """Ω of every edge, (E, k, k), as ``measurements``."""
         return self._applied(self._explanation)[1]
 
+    def added_since(self, first: int) -> tuple[Matrix, Matrix]:
+        """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
+        explanation, new = self._explanation, slice(first, None)
+        before = int((~self.is_loop[:first]).sum())
+        if any(slip.edges.stop > before for slip in explanation.slips):
+            return self.measurements[new], self.information[new]
+        drift = Explanation(explanation.drift)
+        return drift.applied(
+            self.edges[new], self._measurements.rows[new], self._information.rows[new], self.is_loop[new]
+        )
+
     @property
     def is_loop(self) -> NDArray[np.bool_]:
         """True for every edge with a robust loss, (E,)."""
@@ -268,6 +279,30 @@ class PoseGraph:
             initialization=solved.initialization,
             time_s=working_s() - begin,
         )
+
+    def copy(self) -> PoseGraph:
+        """The graph as it is, independent of what becomes of this one."""
+        result = PoseGraph(self.dimension, self._names)
+        result._poses.extend(self.poses)
+        result._stamps_ns.extend(self.stamps_ns)
+        result._is_point.extend(self.is_point)
+        result._edges.extend(self.edges)
+        result._measurements.extend(self._measurements.rows)
+        result._information.extend(self._information.rows)
+        result._rank.extend(self._rank.rows)
+        result._is_loop.extend(self.is_loop)
+        result._weight.extend(self.weight)
+        result._fixed, result._explanation = set(self._fixed), self._explanation
+        return result
+
+    def take_over(self, optimized: PoseGraph) -> None:
+        """Take what optimizing a ``copy`` led to; poses added since move along with the last one before them."""
+        count, edges = len(optimized), len(optimized.edges)
+        T_new_old = optimized.poses[-1] @ lie.inverse(self.poses[count - 1])
+        self._poses.replace(np.concatenate([optimized.poses, T_new_old @ self.poses[count:]]))
+        self._weight.replace(np.concatenate([optimized.weight, self.weight[edges:]]))
+        self._explanation = optimized._explanation
+        self._changed()
 
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""

@@ -70,8 +70,9 @@ class Drift:
     def _measure_new_edges(self, graph: PoseGraph) -> None:
         new = slice(len(self.lengths), len(graph.edges))
         d = graph.dimension
-        translations_m = np.linalg.norm(graph.measurements[new][:, :d, d], axis=1)
-        covariances = np.linalg.inv(graph.information[new])
+        measurements, information = graph.added_since(len(self.lengths))
+        translations_m = np.linalg.norm(measurements[:, :d, d], axis=1)
+        covariances = np.linalg.inv(information)
         sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
         lengths = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.maximum(translations_m, sigmas_m / self.drift))
         self.lengths.extend(lengths)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from math import isfinite
 from pathlib import Path
 
 import msgspec
@@ -25,7 +24,7 @@ from scanchain.evaluation import (
 from scanchain.evaluation.absolute import far_off, path_length
 from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
 from scanchain.runs.results import Cloud
-from scanchain.runs.step_table import STAGES, StepTable
+from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
 from scanchain.words import counted
@@ -193,10 +192,9 @@ def measure(
     stopped: str = "",
 ) -> Metrics:
     """Metrics of a finished run."""
-    matches = [row.match for row in steps.rows]
-    residuals_m = [match.residual_m for match in matches if isfinite(match.residual_m)]
-    states = steps.states()
-    stage_s = steps.seconds_by_stage()
+    columns, states = steps.columns, steps.states()
+    residuals_m = columns["residual_m"][np.isfinite(columns["residual_m"])]
+    stage_s = columns["timing"]
     total_s = np.column_stack([stage_s, stage_s[:, 1:].sum(axis=1)])
     names = (*STAGES, "all_but_read")
     rejected = Counter(item.rejected_by for item in final)
@@ -209,8 +207,8 @@ def measure(
         scans_per_s=len(steps) / run_s,
         times_real_time=steps.span_s / run_s,
         traveled_m=float(path_length(result.trajectory.poses)[-1]),
-        scan_points=sum(row.points for row in steps.rows),
-        dropped_points=sum(row.dropped for row in steps.rows),
+        scan_points=int(columns["scan_points"].sum()),
+        dropped_points=int(columns["dropped"].sum()),
         ok=states[State.OK],
         contradicted=states[State.CONTRADICTED],
         degenerate=states[State.DEGENERATE],
@@ -227,9 +225,9 @@ def measure(
         degrees_of_freedom=result.state.degrees_of_freedom,
         median_ms=dict(zip(names, np.median(1e3 * total_s, axis=0).tolist(), strict=True)),
         p95_ms=dict(zip(names, np.percentile(1e3 * total_s, 95.0, axis=0).tolist(), strict=True)),
-        median_inlier_share=float(np.median([match.inlier_share for match in matches])),
-        median_residual_m=float(np.median(residuals_m)) if residuals_m else None,
-        median_iterations=float(np.median([match.iterations for match in matches])),
+        median_inlier_share=float(np.median(inlier_shares(columns))),
+        median_residual_m=float(np.median(residuals_m)) if len(residuals_m) else None,
+        median_iterations=float(np.median(columns["iterations"])),
         ground_truth=ground_truth,
         verdict=judged.verdict,
         verdict_reason=judged.reason,

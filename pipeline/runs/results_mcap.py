@@ -37,7 +37,8 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
     of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it.
     """
     moving = moving_frame(log.indexes, log.lidar, log.mounting, dimension=log.dimension)
-    first_ns, first_log_ns = steps.rows[0].stamp_ns, steps.rows[0].log_time_ns
+    first = next(steps.rows)
+    first_ns, first_log_ns = first.stamp_ns, first.log_time_ns
     with LogWriter(path) as writer:
         trajectory = result.trajectory
         places = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]

@@ -1,8 +1,9 @@
-"""Time and memory of SLAM along a long log: ``python -m tests.benchmarks.long_run [--scans N]``.
+"""Time and memory of SLAM along a long log: ``python -m tests.benchmarks.long_run [--scans N] [--live N]``.
 
-A laser scanner goes round the simulated office for hours. Every tenth of the way: the mean CPU time of
-``Slam.process`` a scan, loops and optimizations included, the memory of this process, and what it keeps
-in a file instead.
+A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
+Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
+thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
+so many scans more come in real time, forty a second: the longest that ``Slam.track`` took of one, by the clock.
 """
 
 from __future__ import annotations
@@ -10,49 +11,78 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from time import thread_time
+from time import perf_counter, process_time, sleep, thread_time
 
 from scanchain import Slam
-from scanchain.logs import open_log
-from scanchain.processes import resident_mib
+from scanchain.data import Scan
+from scanchain.logs import Log, open_log
+from scanchain.processes import peak_mib, resident_mib
 from scanchain.settings import load_settings
 from scanchain.simulation import SENSORS, simulate
+from tests.support.back_and_forth import BackAndForth
+
+_LIVE_S = 0.025  # period of a fast laser scanner
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--log", type=Path, help="take the scans of this log instead of simulating one")
+    parser.add_argument("--pass", type=int, dest="length", help="scans of the log that are played")
+    parser.add_argument("--live", type=int, default=0)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = arguments.log or Path(folder) / "office.mcap"
         if arguments.log is None:
             simulate("office", path, duration_s=arguments.scans * SENSORS["lms-270"].period_ns * 1e-9)
-        _follow(path, arguments.scans)
+        log = open_log(path)
+        slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)
+        scans = _scans(log, arguments.scans + arguments.live, arguments.log is None, arguments.length)
+        _follow(slam, islice(scans, arguments.scans), arguments.scans)
+        _follow_live(slam, scans)
 
 
-def _follow(path: Path, scans: int) -> None:
-    log = open_log(path)
-    slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)
-    tenth, spent_s, taken_s = max(scans // 10, 1), [], 0.0
-    for scan in log.scans():
-        started = thread_time()
+def _scans(log: Log, count: int, is_long: bool, length: int | None) -> Iterator[Scan]:
+    return log.scans() if is_long else BackAndForth(log, length).scans(count)
+
+
+def _follow(slam: Slam, scans: Iterator[Scan], count: int) -> None:
+    tenth, spent_s, taken_s, all_s = max(count // 10, 1), [], 0.0, 0.0
+    for number, scan in enumerate(scans, 1):
+        started, all_started = thread_time(), process_time()
         slam.process(scan)
-        taken_s += thread_time() - started
-        if (scan.index + 1) % tenth == 0:
+        taken_s, all_s = taken_s + thread_time() - started, all_s + process_time() - all_started
+        if number % tenth == 0:
             spent_s.append(taken_s)
-            taken_s = 0.0
             stored_mib = 4 * slam.dimension * slam.points.rows / 2**20
             print(
-                f"{scan.index + 1:6} scans {1e3 * spent_s[-1] / tenth:6.2f} ms a scan, "
-                f"{resident_mib(os.getpid()):6.1f} MiB, "
-                f"{stored_mib:5.1f} in a file; {len(slam.keyframes)} keyframes, "
-                f"{len(slam.closures)} closures tried",
+                f"{number:6} scans {1e3 * taken_s / tenth:6.2f} ms a scan "
+                f"({1e3 * all_s / tenth:.2f} with threads), "
+                f"{resident_mib(os.getpid()):6.1f} MiB (peak {peak_mib():.1f}), {stored_mib:5.1f} in a file; "
+                f"{len(slam.keyframes)} keyframes, {len(slam.closures)} closures tried",
                 flush=True,
             )
+            taken_s, all_s = 0.0, 0.0
     if len(spent_s) >= 10:
         print(f"last tenth / second tenth: {spent_s[9] / spent_s[1]:.2f}")
+
+
+def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
+    longest_s, optimizations, before = 0.0, 0, len(slam.keyframes)
+    for scan in scans:
+        started = perf_counter()
+        step = slam.track(scan.points, 1e-9 * scan.stamp_ns, scan.times_s, T_odom_base=scan.T_odom_base)
+        taken_s = perf_counter() - started
+        longest_s, optimizations = max(longest_s, taken_s), optimizations + (step.graph is not None)
+        sleep(max(_LIVE_S - taken_s, 0.0))
+    if longest_s:
+        print(
+            f"live: {longest_s:.3f} s at most a scan, {len(slam.keyframes) - before} keyframes, "
+            f"{optimizations} optimizations taken over"
+        )
 
 
 if __name__ == "__main__":

@@ -40,6 +40,10 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
     b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
     assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
+    chosen = np.flatnonzero(np.random.default_rng(graph[2]).random(len(pattern.sizes)) < 0.3)
+    here = np.isin(np.repeat(np.arange(len(pattern.sizes)), pattern.sizes), chosen)
+    part = cholesky.solve_part(b[here], chosen)
+    assert part.tobytes() == cholesky.solve(np.where(here[:, None], b, 0.0))[here].tobytes()
     assert np.allclose(pattern.multiply(values, b[:, 0]), A @ b[:, 0], rtol=1e-12, atol=1e-9)
 
 

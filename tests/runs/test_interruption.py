@@ -184,6 +184,28 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
     assert a.state.weight.tobytes() == b.state.weight.tobytes()
 
 
+def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monkeypatch):
+    monkeypatch.setattr("scanchain.slam._LARGE", 10)
+    monkeypatch.setattr("scanchain.slam._TAKEN_AFTER", 0.2)
+    log = open_log(office)
+    config = configured(2, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0})
+    straight = Slam(config, log.T_base_lidar, is_live=True)
+    broken = Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE, is_live=True)
+    breaks = 0
+    for scan in log.scans():
+        is_beside = broken.beside is not None
+        a, b = straight.process(scan), broken.process(scan)
+        assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
+        assert (a.graph is None) == (b.graph is None)
+        if broken.beside is not None and not is_beside:
+            breaks += 1
+            Checkpoints(tmp_path, 10.0).write(broken)
+            broken = read_checkpoint(tmp_path).slam
+            broken.points.reopen(tmp_path / POINTS_FILE)
+    assert breaks > 0
+    assert straight.finish().trajectory.poses.tobytes() == broken.finish().trajectory.poses.tobytes()
+
+
 def waiting_at(scan):
     """The command line as a script that dawdles before that scan, then says "there" and waits."""
     return f"""

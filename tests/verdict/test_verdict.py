@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -255,6 +256,16 @@ def test_a_scan_that_starts_a_segment_is_known_from_its_column_whatever_its_reas
     table.write(tmp_path / "steps.parquet", Trajectory(table.odometry.stamps_ns, poses))
     found = evidence_of(pq.ParquetFile(tmp_path / "steps.parquet").read(), None)
     assert np.flatnonzero(found.starts_segment).tolist() == [7]
+
+
+def test_a_table_gives_back_the_rows_that_were_added(monkeypatch):
+    monkeypatch.setattr("scanchain.runs.step_table._PART", 8)
+    table = StepTable()
+    steps = [replace(step, reason=f"reason {step.scan.index % 3}") for step in drive(20, 2)]
+    steps[9] = replace(steps[9], scan=replace(steps[9].scan, T_odom_base=lie.pose_2d(1.0, 2.0, 0.3)))
+    added = [table.append(step) for step in steps]
+    kept = [msgspec.msgpack.encode(list(rows), enc_hook=np.ndarray.tolist) for rows in (added, table.rows)]
+    assert kept[0] == kept[1] and len(table) == 20
 
 
 def test_the_worst_place_of_a_slip_lies_between_the_scans_before_and_after_it():

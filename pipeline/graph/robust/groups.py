@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import responses
+from scanchain.graph.covariance import difference_covariances
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
 _REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
@@ -74,11 +74,10 @@ class Contradiction:
     def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
         """The distance of the edges of a group, all of them kept or none."""
         k, count = self._problem.freedom, len(group)
-        i, j = self._problem.edges[group].T
         predicted = np.empty((k * count, k * count))
+        joints = difference_covariances(self._sparse, self._problem.edges[group])
         for place, edge in enumerate(group):
-            moved = responses(self._sparse, *self._problem.edges[edge])
-            joint = self._jacobians[group] @ (moved[j] - moved[i]) @ self._jacobians[edge].T
+            joint = self._jacobians[group] @ joints[place] @ self._jacobians[edge].T
             predicted[:, k * place : k * (place + 1)] = joint.reshape(-1, k)
         information = np.zeros((count, k, count, k))
         information[np.arange(count), :, np.arange(count)] = self._problem.information[group]

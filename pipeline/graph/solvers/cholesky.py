@@ -134,6 +134,12 @@ class SparseCholesky:
         self._stack = np.empty(self._fronts.stack_size)
         self._work = np.empty(self._fronts.widest**2)
         self._floor = np.empty(pattern.scalars)
+        self._every_front = np.arange(len(self._fronts.pivots))
+        self._front_of = np.repeat(self._every_front, self._fronts.pivots)
+        first_update = self._fronts.row_start[:-1] + self._fronts.pivots
+        has_parent = first_update < self._fronts.row_start[1:]
+        self._parent = np.full(len(has_parent), -1)
+        self._parent[has_parent] = self._front_of[self._fronts.rows[first_update[has_parent]]]
 
     @property
     def entries(self) -> int:
@@ -154,18 +160,42 @@ class SparseCholesky:
     def solve(self, right_side: Matrix) -> Matrix:
         """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
         columns = right_side[:, None] if right_side.ndim == 1 else right_side
+        return self._solve(columns, self._places, self._every_front).reshape(right_side.shape)
+
+    def solve_part(self, right_side: Matrix, variables: NDArray[np.int64]) -> Matrix:
+        """The part of these variables (v,) of the solution of A x = b, where b is zero but for them.
+
+        right_side, result : (s, m) of all their scalars, in their order. To the bit as ``solve`` has it, by the
+        fronts between these variables and the roots of the elimination tree alone.
+        """
+        sizes = self.pattern.sizes[variables]
+        within = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        places = self._places[np.repeat(self.pattern.starts[variables], sizes) + within]
+        return self._solve(right_side, places, self._path(places))
+
+    def _solve(self, columns: Matrix, places: NDArray[np.int64], path: NDArray[np.int64]) -> Matrix:
+        """Solutions (s, m) at these places of the elimination order, of which the path has all fronts."""
         result, local = np.empty_like(columns), np.empty(self._fronts.widest)
-        x = np.empty(self.pattern.scalars)
         for column in range(columns.shape[1]):
-            x[self._places] = columns[:, column]
-            cholesky.solve(self._fronts, self._factor, x, local)
-            result[:, column] = x[self._places]
-        return result.reshape(right_side.shape)
+            x = np.zeros(self.pattern.scalars)
+            x[places] = columns[:, column]
+            cholesky.solve(self._fronts, self._factor, path, x, local)
+            result[:, column] = x[places]
+        return result
+
+    def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Fronts that eliminate these places, and all that follow from them, ascending."""
+        path: set[int] = set()
+        for front in np.unique(self._front_of[places]).tolist():
+            while front >= 0 and front not in path:
+                path.add(front)
+                front = int(self._parent[front])
+        return np.array(sorted(path), np.int64)
 
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
         x = noise.copy()
-        cholesky.solve_upper(self._fronts, self._factor, x, np.empty(self._fronts.widest))
+        cholesky.solve_upper(self._fronts, self._factor, self._every_front, x, np.empty(self._fronts.widest))
         return x[self._places]
 
     def inverse_blocks(self) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 _SMALL = 1e-4  # rad; below this angle the series replaces the closed form
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def chart_blocks(
     T_i: NDArray[np.float64],
     T_j: NDArray[np.float64],
@@ -41,7 +41,7 @@ def chart_blocks(
     A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, -1.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def residuals(
     poses: NDArray[np.float64],
     edges: NDArray[np.int64],
@@ -61,7 +61,7 @@ def residuals(
         errors[e, 2] = r[2]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def jacobians(
     poses: NDArray[np.float64],
     edges: NDArray[np.int64],
@@ -91,7 +91,7 @@ def jacobians(
         J[1, 2] += -0.5 * r[0] + slope * r[1]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _half_cotangent(theta_rad: float) -> float:
     """(θ/2) / tan(θ/2), the diagonal of V(θ)⁻¹."""
     if abs(theta_rad) < _SMALL:
@@ -100,7 +100,7 @@ def _half_cotangent(theta_rad: float) -> float:
     return half * np.cos(half) / np.sin(half)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _half_cotangent_slope(theta_rad: float) -> float:
     """Derivative of (θ/2) / tan(θ/2): (sin θ − θ) / (4 sin²(θ/2))."""
     if abs(theta_rad) < 1e-2:

@@ -16,7 +16,7 @@ _PANEL = 32  # pivots eliminated before the rest of the front is touched
 _TILE = 256  # columns of the rest that are updated together, so that the panel stays in the cache
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def factorize(
     fronts: Fronts, blocks: Blocks, values: _Array, floor: _Array, factor: _Array, stack: _Array, work: _Array
 ) -> int:
@@ -60,11 +60,14 @@ def factorize(
     return -1
 
 
-@njit(cache=True)
-def solve(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
-    """Solve Uᵀ U x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars."""
-    count = fronts.pivots.size
-    for f in range(count):
+@njit(cache=True, nogil=True)
+def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
+    """Solve Uᵀ U x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars.
+
+    path : fronts that are visited, ascending, with each its parent: all of them, or where b is zero in the rest,
+        those alone whose part of x is wanted; the rest of x stays as it is
+    """
+    for f in path:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
@@ -77,13 +80,13 @@ def solve(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
                 local[b] -= row[b] * value
         for b in range(pivots, height):
             x[rows[b]] += local[b]
-    solve_upper(fronts, factor, x, local)
+    solve_upper(fronts, factor, path, x, local)
 
 
-@njit(cache=True)
-def solve_upper(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
+@njit(cache=True, nogil=True)
+def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
     """Solve U x = b in place; arguments as of ``solve``."""
-    for f in range(fronts.pivots.size - 1, -1, -1):
+    for f in path[::-1]:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
@@ -98,7 +101,7 @@ def solve_upper(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> Non
             x[rows[a]] = local[a]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
     """Add one block of A to the upper triangle of its front."""
     top, left, height, width = blocks.top[b], blocks.left[b], blocks.height[b], blocks.width[b]
@@ -112,7 +115,7 @@ def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
             at += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: NDArray[np.int64]) -> None:
     """Add a child's update matrix, row by row, in runs of columns that are neighbors in the front too."""
     size, count = place.size, 0
@@ -133,7 +136,7 @@ def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: N
                 target[b] += source[b0 + b]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
     """Factor the first ``pivots`` rows and update the rest; return -1 or the pivot that failed."""
     height = front.shape[0]
@@ -156,7 +159,7 @@ def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _update_rest(front: _Array, k0: int, k1: int, c0: int, c1: int) -> None:
     """Subtract Uᵀ U of rows k0 to k1 from columns c0 to c1 of the rows below: two rows, four pivots a time."""
     i = k1

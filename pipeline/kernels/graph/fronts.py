@@ -55,7 +55,7 @@ class Blocks(NamedTuple):
     turned: _Index
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -> Fronts:
     """Expand fronts of blocks to scalars.
 
@@ -97,7 +97,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
     return Fronts(row_start, scalar_rows, pivots, factor_start, children, place, stack_size, widest)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _walk(
     row_start: _Index, rows: _Index, pivots: _Index, children: _Index, parent: _Index, place: _Index
 ) -> tuple[int, int]:
@@ -125,7 +125,7 @@ def _walk(
     return widest, deepest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def lay_out_blocks(
     fronts: Fronts, scalar_start: _Index, sizes: _Index, block_rows: _Index, block_columns: _Index
 ) -> Blocks:

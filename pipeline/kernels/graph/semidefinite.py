@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidefinite: NDArray[np.bool_]) -> None:
     """Fill ``is_semidefinite`` (E,): matrices (E, k, k) without an eigenvalue below −rounding · largest entry.
 
@@ -22,7 +22,7 @@ def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidef
         )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _largest_entry(A) -> float:
     """The largest absolute value, NaN where one is."""
     largest = 0.0
@@ -35,7 +35,7 @@ def _largest_entry(A) -> float:
     return largest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _is_symmetric(A, margin: float) -> bool:
     for i in range(A.shape[0]):
         for j in range(i):
@@ -44,7 +44,7 @@ def _is_symmetric(A, margin: float) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _has_factor(A, shift: float, factor) -> bool:
     """True if A + shift · I has a Cholesky factor; ``factor`` (k, k) is a buffer for it."""
     for i in range(A.shape[0]):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
     """Parent of every position of the elimination order, -1 at a root (Liu 1990, algorithm 4.2).
 
@@ -34,7 +34,7 @@ def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
     return parent
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def postorder(parent: _Index) -> _Index:
     """Positions in an order in which every subtree is contiguous and children precede parents."""
     n = parent.size
@@ -64,7 +64,7 @@ def postorder(parent: _Index) -> _Index:
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
     """Positions below the diagonal in every block column of the factor, ascending: (start (n + 1,), rows).
 
@@ -96,7 +96,7 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
     return begin, rows[: begin[n]]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
     """Append the members beyond j that are not in column j yet; return the column's new end."""
     for i in members:
@@ -107,7 +107,7 @@ def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
     return end
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) -> _Index:
     """First position of every front (and n at the end): columns with nearly the same structure join.
 
@@ -151,7 +151,7 @@ def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) ->
     return fronts[: kept + 1]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _most_zeros(columns: int) -> float:
     """Share of explicit zeros that a front of so many scalar columns may hold."""
     if columns <= 4:

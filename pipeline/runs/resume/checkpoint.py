@@ -10,6 +10,7 @@ from time import perf_counter
 
 from scanchain import config, data
 from scanchain.clock import working_s
+from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
@@ -70,13 +71,16 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        PointStore, StoredPoints,
+        BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
         (PoseGraph, "_problem"): lambda graph: None,
         (PoseGraph, "_factor_is_now"): lambda graph: False,
+        (BackgroundOptimization, "_thread"): lambda beside: None,
+        (BackgroundOptimization, "_optimized"): lambda beside: None,
+        (BackgroundOptimization, "_error"): lambda beside: None,
         (VoxelSubmaps, "cached"): lambda submaps: OrderedDict(),
         (Relocalizer, "searched"): lambda relocalizer: None,
         (PlaceCloser, "recognizer"): lambda closer: None,

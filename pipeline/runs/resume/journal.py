@@ -71,7 +71,7 @@ def read_journal(folder: Path, limit: int | None = None) -> tuple[StepTable, int
         body = data[place + _HEAD.size : place + _HEAD.size + size]
         if len(body) < size or zlib.crc32(body) != crc:
             break
-        steps.rows.append(decoder.decode(body))
+        steps.add(decoder.decode(body))
         place += _HEAD.size + size
     return steps, place
 

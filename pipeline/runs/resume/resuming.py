@@ -80,7 +80,7 @@ def resume_recording(folder: Path, left: Left, recording: Recorder, checkpoints:
     is_whole = 0 < checkpoint.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
     if is_whole:
         os.truncate(before, checkpoint.recorded_bytes)
-    recording.resume(before if is_whole else None, left.steps.rows, slam.closures, slam.graph.state())
+    recording.resume(before if is_whole else None, tuple(left.steps.rows), slam.closures, slam.graph.state())
     recorded_bytes = recording.secure()
     checkpoints.write(slam, recorded_bytes)
     note = f"resumed after {counted(checkpoint.scans, 'scan')}"
