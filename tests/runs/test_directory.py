@@ -404,12 +404,12 @@ import sys, time
 from scanchain.__main__ import main
 from scanchain.odometry import FrontEnd
 locate = FrontEnd.locate
-def waiting(self, scan):
-    if scan.index == 40:
+def waiting(self, prepared):
+    if prepared.scan.index == 40:
         print("there", flush=True)
-    if scan.index >= 40:
+    if prepared.scan.index >= 40:
         time.sleep(0.2)
-    return locate(self, scan)
+    return locate(self, prepared)
 FrontEnd.locate = waiting
 sys.exit(main(sys.argv[1:]))
 """

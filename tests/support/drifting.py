@@ -17,6 +17,14 @@ class DriftingOdometry:
         self.T_odom_lidar = self.T_drifted = lie.identity(odometry.dimension)
 
     @property
+    def dimension(self):
+        return self.odometry.dimension
+
+    @property
+    def resolution(self):
+        return self.odometry.resolution
+
+    @property
     def local_map(self):
         return self.odometry.local_map
 
