@@ -61,6 +61,7 @@ for _command in _COMMANDS:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     atexit.register(gc.freeze)  # else garbage is sought once more, for half a second, before the interpreter goes
     try:
         return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0

@@ -441,10 +441,11 @@ def assert_same(a, b):
     assert tables[0].equals(tables[1])
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize("threads", ["1", "2", "8"])
 def test_the_same_run_in_another_process_is_bit_equal_whatever_the_threads(drive, tmp_path, threads):
     words = [sys.executable, "-m", "scanchain", "run", drive.log, "--out", tmp_path / "again", *drive.flags]
-    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), threads)
+    names = ("SCANCHAIN_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    limits = dict.fromkeys(names, threads)
     subprocess.run(words, cwd=ROOT, env=os.environ | limits, check=True, capture_output=True, timeout=200)
     assert_same(drive.folder, tmp_path / "again")
 

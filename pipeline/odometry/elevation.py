@@ -153,22 +153,30 @@ def _linearized(
     )  # of the twist of T_k, T_k exp(ξ), and of the offset
     scale = max(_TUKEY * float(np.median(np.abs(residual))), 1e-6)
     weight = 1.0 / (1.0 + (residual / scale) ** 2) ** 2
-    k, cells, size = len(poses), int(cell.max()) + 1, 6 * len(poses) + 1
+    k, cells = len(poses), int(cell.max()) + 1
+    size = 6 * k + 1
     H, b = np.zeros((size, size)), np.zeros(size)
     weighted = weight[:, None] * jacobian
     for scan in range(k):
         own = number == scan
         columns = np.r_[6 * scan : 6 * scan + 6, size - 1]
         H[np.ix_(columns, columns)] += weighted[own].T @ jacobian[own]
-        b[columns] += weighted[own].T @ residual[own]
-    total = np.bincount(cell, weight, cells)
-    sums = np.zeros((cells, size))  # of the weighted Jacobians: the mean of a plane moves with its points
-    for column in range(6):
-        sums[:, column:-1:6] = np.bincount(cell * k + number, weighted[:, column], cells * k).reshape(cells, k)
-    sums[:, -1] = np.bincount(cell, weighted[:, -1], cells)
-    mean = sums / total[:, None]
-    H -= mean.T @ sums
-    b -= mean.T @ np.bincount(cell, weight * residual, cells)
+        b[columns] += np.einsum("ni,n->i", weighted[own], residual[own])
+    # of the weighted Jacobians: the mean of a plane moves with its points; (cells, scans, 6) and (cells,)
+    of_poses = np.stack([np.bincount(cell * k + number, each, cells * k) for each in weighted.T[:6]], axis=-1)
+    of_poses, of_offset = of_poses.reshape(cells, k, 6), np.bincount(cell, weighted[:, -1], cells)
+    of_residual = np.bincount(cell, weight * residual, cells)
+    share = 1.0 / np.bincount(cell, weight, cells)
+    mean = of_poses * share[:, None, None]
+    # scan by scan: products so small are computed in one thread, to the same bits on every machine
+    among = np.matmul(mean.transpose(1, 2, 0)[:, None], of_poses.transpose(1, 0, 2)[None])
+    H[:-1, :-1] -= among.transpose(0, 2, 1, 3).reshape(size - 1, size - 1)
+    with_offset = np.einsum("ckj,c->kj", mean, of_offset).ravel()
+    H[:-1, -1] -= with_offset
+    H[-1, :-1] -= with_offset
+    H[-1, -1] -= (share * of_offset**2).sum()
+    b[:-1] -= np.einsum("ckj,c->kj", mean, of_residual).ravel()
+    b[-1] -= (share * of_offset * of_residual).sum()
     H += _RIDGE * np.trace(H) / size * np.eye(size)
     return H, b, float((weight * residual**2).sum() / weight.sum())
 

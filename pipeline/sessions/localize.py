@@ -134,7 +134,7 @@ def localize(
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
-    prior = open_saved_map(job.prior)
+    prior = _opened(job)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     early = load_settings(file=job.config_file, overrides=job.overrides)
     log = open_log(job.logs, early.config.log)
@@ -183,6 +183,14 @@ def localize(
         made.write(directory.path / RUN_FILE)
         directory.complete()
     return localized, text
+
+
+def _opened(job: Localizing) -> SavedMap:
+    """The map of a job. Raises InputError where it cannot be read, or the results would replace it."""
+    prior = open_saved_map(job.prior)
+    if job.out.resolve() in (job.prior.resolve(), prior.folder.resolve()):
+        raise InputError(f"{job.out}: is the map; choose another --out")
+    return prior
 
 
 def _check(log: Log, prior: SavedMap, config: Config) -> None:

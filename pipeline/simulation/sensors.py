@@ -59,7 +59,7 @@ def _planar(beams: int, step_deg: float, period_ns: int) -> Callable[[int], Rays
     return lambda index: rays
 
 
-def _spinning(elevations_deg: NDArray[np.float64], columns: int, period_ns: int) -> Callable[[int], Rays]:
+def spinning(elevations_deg: NDArray[np.float64], columns: int, period_ns: int) -> Callable[[int], Rays]:
     """Rings that turn clockwise from straight behind; the rays of a column are fired together."""
     rings = len(elevations_deg)
     azimuth = np.repeat(np.pi - 2.0 * np.pi * np.arange(columns) / columns, rings)
@@ -106,9 +106,9 @@ _HDL64_DEG = np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 
 SENSORS: dict[str, Sensor] = {
     "lms-270": Sensor(2, _TENTH_S, 0.1, 30.0, 0.01, 0.01, _planar(541, 0.5, _TENTH_S)),
     "utm-30": Sensor(2, 25_000_000, 0.1, 30.0, 0.01, 0.01, _planar(1081, 0.25, 25_000_000)),
-    "hdl-64": Sensor(3, _TENTH_S, 1.0, 100.0, 0.02, 0.02, _spinning(_HDL64_DEG, 2000, _TENTH_S)),
-    "os1-32": Sensor(3, _TENTH_S, 0.5, 100.0, 0.02, 0.02, _spinning(np.linspace(-22.5, 22.5, 32), 1024, _TENTH_S)),
-    "vlp-16": Sensor(3, _TENTH_S, 0.5, 100.0, 0.03, 0.02, _spinning(np.linspace(-15.0, 15.0, 16), 1800, _TENTH_S)),
+    "hdl-64": Sensor(3, _TENTH_S, 1.0, 100.0, 0.02, 0.02, spinning(_HDL64_DEG, 2000, _TENTH_S)),
+    "os1-32": Sensor(3, _TENTH_S, 0.5, 100.0, 0.02, 0.02, spinning(np.linspace(-22.5, 22.5, 32), 1024, _TENTH_S)),
+    "vlp-16": Sensor(3, _TENTH_S, 0.5, 100.0, 0.03, 0.02, spinning(np.linspace(-15.0, 15.0, 16), 1800, _TENTH_S)),
     "rosette": Sensor(3, _TENTH_S, 0.5, 100.0, 0.02, 0.02, _rosette(10_000, _TENTH_S)),
 }
 

@@ -98,7 +98,7 @@ def starts(log_path: Path, run: Path, first_scans: list[int], map_truth: Traject
     path_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)))
     found = Found([], [], [])
     for first in first_scans:
-        localizer = Localizer(prior, config, log.T_base_lidar)
+        localizer = Localizer(prior, config, log.T_base_lidar, is_live=False)
         after_m = off_m = off_rad = float("nan")
         for number in range(first, len(scans)):
             gone_m = float(path_m[number] - path_m[first])
@@ -127,7 +127,7 @@ def track(log_path: Path, run: Path, map_truth: Trajectory) -> Tracked:
     held = psutil.Process().memory_info().rss
     started = perf_counter()
     prior = open_saved_map(run)
-    localizer = Localizer(prior, config, log.T_base_lidar)
+    localizer = Localizer(prior, config, log.T_base_lidar, is_live=False)
     opening_s = perf_counter() - started
     odometry = Odometry(config, log.T_base_lidar)
     seconds = np.array([_both(odometry, localizer, scan) for scan in log.scans(config.preprocess)])

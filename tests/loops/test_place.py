@@ -310,7 +310,10 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
     mapped, log = passage(street()), passage(street(4.0, True)[4:5])
     (at_once,), _ = sought(mapped, log, tmp_path)
     monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
-    closer, moved = LoopCloser(configured(3), 3), replace(log[0], index=len(mapped), traveled_m=10_000.0)
+    closer, moved = (
+        LoopCloser(configured(3), 3, is_live=True),
+        replace(log[0], index=len(mapped), traveled_m=10_000.0),
+    )
     keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
     closer.begin_in(mapped, tmp_path)
     closer.start_segment(len(mapped))
@@ -324,7 +327,10 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
 def test_a_search_that_the_end_of_the_log_interrupts_is_completed(tmp_path, monkeypatch):
     monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
     mapped, log = passage(street()), passage(street(4.0, True)[4:5])
-    closer, moved = LoopCloser(configured(3), 3), replace(log[0], index=len(mapped), traveled_m=10_000.0)
+    closer, moved = (
+        LoopCloser(configured(3), 3, is_live=True),
+        replace(log[0], index=len(mapped), traveled_m=10_000.0),
+    )
     keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
     closer.begin_in(mapped, tmp_path)
     closer.start_segment(len(mapped))

@@ -102,6 +102,14 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
     assert code == 2 and "--initial is '1,2'; give x,y,yaw in meters and degrees, or a file .tum" in error
 
 
+def test_a_localized_log_never_replaces_its_map(office, call):
+    before = sorted(path.name for path in (office / "map").iterdir())
+    for out in (office / "map", office / "map" / "map"):
+        code, _, error = call("localize", office / "office.mcap", "--map", office / "map", "--out", out, "--force")
+        assert code == 2 and "is the map; choose another --out" in error
+    assert sorted(path.name for path in (office / "map").iterdir()) == before
+
+
 def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
     words = ("localize", office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--no-loops")
     code, _, error = call(*words)

@@ -79,21 +79,35 @@ def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float,
         cost += 0.5 * r2 * ratio
         total_weight += w
         squares += ratio * ratio * r2
-        shape = cell[SHAPE]
-        if shape != PLANE:
-            upper, gradient = _plus_point(upper, gradient, w, px, py, pz, ex, ey, ez)
-            w, along = -w, 0.0
-        if shape != POINT:
-            nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-            upper, gradient = _plus_plane(upper, gradient, w, px, py, pz, nx, ny, nz, along)
-    k = 0
+        upper, gradient = _plus(upper, gradient, w, cell, px, py, pz, ex, ey, ez, along)
     for row in range(6):
         b[row] = gradient[row]
+    _unfold(upper, H)
+    return cost, total_weight, squares
+
+
+@njit(cache=True, inline="always")
+def _plus(h, b, w, cell, px, py, pz, ex, ey, ez, along):
+    """Upper triangle h (21), by rows, and gradient b (6) with one correspondence of weight w, as by ``_add``."""
+    shape = cell[SHAPE]
+    if shape != PLANE:
+        h, b = _plus_point(h, b, w, px, py, pz, ex, ey, ez)
+        w, along = -w, 0.0
+    if shape != POINT:
+        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+        h, b = _plus_plane(h, b, w, px, py, pz, nx, ny, nz, along)
+    return h, b
+
+
+@njit(cache=True, inline="always")
+def _unfold(upper, H):
+    """Write the upper triangle (21), by rows, to the symmetric H (6, 6)."""
+    k = 0
+    for row in range(6):
         for column in range(row, 6):
             H[row, column] = upper[k]
             k += 1
     _mirror(H)
-    return cost, total_weight, squares
 
 
 @njit(cache=True, inline="always")
@@ -130,10 +144,12 @@ def _plus_point(h, b, w, px, py, pz, ex, ey, ez):
 @njit(cache=True, nogil=True)
 def information(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
     """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
+    if H.shape[0] == 6:
+        _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
+        return
     H.fill(0.0)
     unweighted.fill(0.0)
     s2, b = scale_m * scale_m, np.zeros(H.shape[0])
-    planar = points.shape[1] == 2
     for i in range(points.shape[0]):
         voxel = correspondence[i]
         if voxel < 0:
@@ -143,10 +159,30 @@ def information(voxels, points, T, origin, correspondence, weight, scale_m: floa
         ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
         px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
-        _add(H, b, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, planar)
-        _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, planar)
+        _add(H, b, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, True)
+        _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, True)
     _mirror(H)
     _mirror(unweighted)
+
+
+@njit(cache=True, nogil=True)
+def _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
+    """``information`` in space."""
+    s2, none = scale_m * scale_m, (0.0,) * 6
+    upper, plain = (0.0,) * 21, (0.0,) * 21
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0 or weight[i] == 0.0:
+            continue
+        cell = voxels.cells[voxel]
+        px, py, pz = move(T, points, i)
+        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
+        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        upper, _ = _plus(upper, none, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along)
+        plain, _ = _plus(plain, none, weight[i], cell, px, py, pz, ex, ey, ez, along)
+    _unfold(upper, H)
+    _unfold(plain, unweighted)
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +196,7 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
     while size < 2 * points.shape[0]:
         size *= 2
     slots, sums = np.full(size, -1, np.int32), np.zeros((size, 6))
-    H, s2 = np.zeros((6, 6)), scale_m * scale_m
+    s2, no_upper, none = scale_m * scale_m, (0.0,) * 21, (0.0,) * 6
     for i in range(points.shape[0]):
         voxel = correspondence[i]
         if voxel < 0 or weight[i] == 0.0:
@@ -174,7 +210,10 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
         ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
         px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
-        _add(H, sums[slot], weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, False)
+        w = weight[i] * ratio * ratio
+        _, gradient = _plus(no_upper, none, w, cell, px, py, pz, ex, ey, ez, along)
+        for m in range(6):
+            sums[slot, m] += gradient[m]
     spread = np.zeros((6, 6))
     for slot in range(size):
         if slots[slot] >= 0:

@@ -1,0 +1,130 @@
+"""Time of a 3D scan against the number of threads and of points, for ours and KISS-ICP, as a table and a picture.
+
+    python -m tests.benchmarks.threads [--points 10000 ...] [--threads 1 2 4 8] [--scans 12] [--png FILE]
+
+A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. The scans
+are in memory. Each method and number of threads has a process of its own and tracks the scans three times from
+the beginning, of which the fastest counts. Time is the median over the scans, without the first three, from one
+pose to the next on the clock: ours prepares scans ahead where it has threads, as ``scanchain run`` does. The
+last pose of ours is the same to the last bit for any number of threads, or the benchmark fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import msgspec
+import numpy as np
+
+from scanchain import lie
+from scanchain.comparison.methods import resolve
+from scanchain.comparison.worker import start
+from scanchain.data import Pose, Scan
+from scanchain.logs import open_log
+from scanchain.odometry import Odometry
+from scanchain.preprocess import prepare_ahead
+from scanchain.settings import load_settings
+from scanchain.simulation import record
+from scanchain.simulation.drive import plan
+from scanchain.simulation.sensors import SENSORS, spinning
+from scanchain.threads import threads, use_threads
+from tests.benchmarks.contest import in_fresh_process
+
+OURS, THEIRS = "plicp", "kiss-icp"
+REPEATS, WARM_UP = 3, 3
+RINGS, PERIOD_NS = 64, 100_000_000
+
+
+def scans_of(path: Path, points: int, count: int) -> None:
+    """Simulate a drive with so many rays a sweep."""
+    drive = plan("town", sensor="hdl-64", duration_s=count * PERIOD_NS * 1e-9)
+    rays = spinning(np.linspace(-24.0, 4.0, RINGS), round(points / RINGS), PERIOD_NS)
+    record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
+
+
+def tracked(path: Path, method: str, count: int) -> tuple[float, int, bytes]:
+    """Seconds a scan, points a scan, and the last pose, with so many threads in this process."""
+    use_threads(count)
+    log = open_log(path)
+    scans = list(log.scans())
+    chosen = resolve((method,), 3, file=None)[0]
+    if method != OURS:
+        chosen = msgspec.structs.replace(chosen, settings=chosen.settings | {"threads": count})
+    medians_s, pose = [], lie.identity(3)
+    for _ in range(REPEATS):
+        poses = (
+            our_poses(scans, log.T_base_lidar)
+            if method == OURS
+            else map(start(chosen, log.T_base_lidar).track, scans)
+        )
+        clock_s = [perf_counter()]
+        for each in poses:
+            clock_s.append(perf_counter())
+            pose = each
+        medians_s.append(float(np.median(np.diff(clock_s)[WARM_UP:])))
+    return min(medians_s), round(float(np.mean([len(scan.points) for scan in scans]))), pose.tobytes()
+
+
+def our_poses(scans: list[Scan], T_base_lidar: Pose) -> Iterator[Pose]:
+    """Track all scans, prepared ahead where there are threads."""
+    odometry = Odometry(load_settings(3).config, T_base_lidar)
+    for scan in prepare_ahead(iter(scans), odometry.resolution) if threads() > 1 else scans:
+        yield odometry.process(scan).T_odom_lidar
+
+
+def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
+    """Milliseconds a scan over points, a line for each method and number of threads."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for method, count in dict.fromkeys((row[0], row[1]) for row in rows):
+        chosen = [row for row in rows if row[:2] == (method, count)]
+        style = "-" if method == OURS else "--"
+        axes.plot(
+            [r[2] for r in chosen], [1e3 * r[3] for r in chosen], style, marker="o", label=f"{method}, {count}"
+        )
+    axes.set(xscale="log", yscale="log", xlabel="points a scan", ylabel="ms a scan")
+    axes.legend(title="method, threads", fontsize="small")
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, nargs="+", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
+    parser.add_argument("--scans", type=int, default=40)
+    parser.add_argument("--png", type=Path)
+    arguments = parser.parse_args()
+    print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
+    print(f"{'points':>9}{'threads':>9}{'ours ms':>10}{'KISS-ICP ms':>13}{'over ours':>11}", flush=True)
+    rows: list[tuple[str, int, int, float]] = []
+    with TemporaryDirectory() as folder:
+        for points in arguments.points:
+            path, poses = Path(folder) / f"{points}.mcap", set[bytes]()
+            scans_of(path, points, arguments.scans)
+            for count in arguments.threads:
+                times_s: dict[str, float] = {}
+                for method in (OURS, THEIRS):
+                    times_s[method], seen, pose = in_fresh_process(tracked, path, method, count)
+                    rows.append((method, count, seen, times_s[method]))
+                    poses |= {pose} if method == OURS else set()
+                ours_s, theirs_s = times_s[OURS], times_s[THEIRS]
+                print(
+                    f"{seen:9,}{count:9}{1e3 * ours_s:10.2f}{1e3 * theirs_s:13.2f}{theirs_s / ours_s:11.1f}",
+                    flush=True,
+                )
+            assert len(poses) == 1, f"{points} points: the last pose depends on the number of threads"
+    if arguments.png:
+        draw(arguments.png, rows)
+
+
+if __name__ == "__main__":
+    main()
