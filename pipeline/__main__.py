@@ -30,6 +30,7 @@ from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
 from scanchain.commands.view import view
+from scanchain.commands.warm_up import warm_up
 from scanchain.errors import InputError, ScanchainError, remedy_of
 
 
@@ -51,7 +52,7 @@ def scanchain() -> None:
 
 _COMMANDS = (
     run, localize, merge, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate,
-    evaluate, optimize, landmarks, config, sequence,
+    evaluate, optimize, landmarks, config, sequence, warm_up,
 )  # fmt: skip
 for _command in _COMMANDS:
     scanchain.add_command(_command)

@@ -58,33 +58,33 @@ def working_s() -> float:
 
 
 @contextmanager
-def announcing_compilation(say: Callable[[str], None], warm_up: Sequence[str] = ()) -> Iterator[None]:
+def announcing_compilation(say: Callable[[str], None], warm_up: Sequence[Sequence[str]] = ()) -> Iterator[None]:
     """Name each module of kernels when its compilation begins; kernels from the cache on disk are not named.
 
-    warm_up : arguments of ``python -m`` for a second process, which compiles what this one will need later
+    warm_up : arguments of ``python -m`` for each process that compiles what this one will need later
     """
     announcer = _Announcer(say, warm_up)
     try:
         with event.install_listener("numba:compile", announcer):
             yield
     finally:
-        if announcer.beside is not None:
-            announcer.beside.kill()
-            announcer.beside.wait()
+        for process in announcer.beside:
+            process.kill()
+            process.wait()
 
 
 class _Announcer(event.Listener):
-    def __init__(self, say: Callable[[str], None], warm_up: Sequence[str]) -> None:
+    def __init__(self, say: Callable[[str], None], warm_up: Sequence[Sequence[str]]) -> None:
         self.say, self.warm_up = say, warm_up
         self.modules: set[str] = set()
-        self.beside: subprocess.Popen[bytes] | None = None
+        self.beside: list[subprocess.Popen[bytes]] = []
 
     def on_start(self, event: Any) -> None:
         module = event.data["dispatcher"].py_func.__module__
         if module.startswith("scanchain.") and module not in self.modules:
             if not self.modules:
                 self.say("compiling, once after the installation:")
-                self.beside = _started(self.warm_up)
+                self.beside += map(_started, self.warm_up)
             self.modules.add(module)
             self.say(f"  {module.removeprefix('scanchain.')}")
 
@@ -92,10 +92,8 @@ class _Announcer(event.Listener):
         pass
 
 
-def _started(arguments: Sequence[str]) -> subprocess.Popen[bytes] | None:
-    """``python -m`` with these arguments, its output discarded; None without any."""
-    if not arguments:
-        return None
+def _started(arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    """``python -m`` with these arguments, its output discarded."""
     nothing = subprocess.DEVNULL
     return subprocess.Popen(
         [sys.executable, "-P", "-m", *arguments], stdin=nothing, stdout=nothing, stderr=nothing

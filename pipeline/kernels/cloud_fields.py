@@ -1,6 +1,6 @@
 """The points of a cloud that came back, out of the fields of its records."""
 
-from numba import njit
+from scanchain.kernels.compiling import njit
 
 
 @njit(cache=True, nogil=True)

@@ -1,19 +1,25 @@
 """What is compiled is told, once for each module of kernels, and counts as no work."""
 
 import json
+import os
 import subprocess
+import sys
 from time import perf_counter
 
 import pytest
-from numba import njit
+from numba import config, njit
 
+from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
+from scanchain.kernels import compiling
+from scanchain.kernels.registration.icp import align, fit_at
+from scanchain.kernels.registration.observability import add_signals, agreement
+from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.registration import VoxelMap
-from scanchain.runs import results
+from scanchain.runs import results, warm_up
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import run
-from scanchain.runs.warm_up import warm_up
 from scanchain.simulation import simulate
 
 
@@ -55,7 +61,7 @@ def test_what_is_compiled_already_is_not_told():
     assert told.lines == []
 
 
-def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(monkeypatch):
+def test_beside_what_is_compiled_processes_begin_once_and_are_over_in_the_end(monkeypatch):
     begun, start = [], subprocess.Popen
 
     def remembered(*words, **options):
@@ -63,18 +69,18 @@ def test_beside_what_is_compiled_a_process_begins_once_and_is_over_in_the_end(mo
         return begun[-1]
 
     monkeypatch.setattr(subprocess, "Popen", remembered)
-    with announcing_compilation(Told().say, ("http.server", "0")):
+    with announcing_compilation(Told().say, [("http.server", "0")] * 2):
         assert not begun
         for module in ("scanchain.kernels.voxels.voxel_shapes", "scanchain.kernels.geometry.eigen"):
             kernel(module)(2)
-        assert len(begun) == 1 and begun[0].poll() is None
-    assert begun[0].poll() is not None
+        assert [each.poll() for each in begun] == [None, None]
+    assert None not in [each.poll() for each in begun]
 
 
 def test_nothing_begins_where_nothing_is_compiled(monkeypatch):
     begun, told = [], Told()
     monkeypatch.setattr(subprocess, "Popen", lambda *words, **options: begun.append(words))
-    with announcing_compilation(told.say, ("http.server", "0")):
+    with announcing_compilation(told.say, [("http.server", "0")]):
         kernel("numba.np.arrayobj")(2)
     assert begun == told.lines == []
 
@@ -84,11 +90,80 @@ def test_a_warm_up_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkey
     made = {}
     for name in ("cloud_of", "grid_of"):
         monkeypatch.setattr(f"scanchain.runs.warm_up.{name}", _remembering(made, name))
-    warm_up(dimension)
+    warm_up.results(dimension)
     assert list(made) == ["cloud_of", "grid_of"]
     (result, _), cloud = made["cloud_of"]
     assert len(result.keyframes) == len(result.trajectory) == 3 and len(result.state.edges) >= 2
     assert len(cloud.points) > 0 and made["grid_of"][1].log_odds.max() > 0.0
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 16])
+def test_the_processes_beside_a_run_share_out_all_parts(cores):
+    parts = [part for words in warm_up.beside(3, cores) for part in words[2:]]
+    assert sorted(parts) == ["fit", "judge", "results"]
+    assert len(warm_up.beside(3, cores)) == min(max(cores - 1, 1), 3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_run_uses_the_types_that_were_compiled_ahead(office, tmp_path, dimension):
+    log = office if dimension == 2 else tmp_path / "town.mcap"
+    if dimension == 3:
+        simulate("town", log, duration_s=0.5, sensor="vlp-16")
+    warm_up.fit(dimension)
+    warm_up.judge(dimension)
+    kernels = align, fit_at, gradient_spread, agreement, add_signals
+    run(Job(logs=(log,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
+
+
+_COMPILES = """
+import sys, time
+from numba.core import event
+from scanchain.kernels.compiling import njit
+class Slow(event.Listener):
+    def on_start(self, event): print("compiled", flush=True); time.sleep(0.5)
+    def on_end(self, event): pass
+event.register("numba:compile", Slow())
+from kernel_of_a_test import double
+assert double(float(sys.argv[1])) == 2 * float(sys.argv[1])
+"""
+
+
+def test_of_processes_that_need_a_kernel_one_compiles_it_and_the_others_wait(tmp_path):
+    (tmp_path / "kernel_of_a_test.py").write_text(
+        "from scanchain.kernels.compiling import njit\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
+    )
+    place = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    words = [sys.executable, "-c", _COMPILES]
+    both = [subprocess.Popen([*words, x], env=place, stdout=subprocess.PIPE, text=True) for x in ("3", "4")]
+    told = [each.communicate(timeout=60)[0] for each in both]
+    assert [each.returncode for each in both] == [0, 0]
+    assert sorted(told) == ["", "compiled\n"]
+
+
+def test_a_kernel_that_another_process_compiles_for_too_long_is_compiled_here(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiling, "_PATIENCE_S", 0.1)
+    monkeypatch.setattr(compiling, "_took", lambda file: False)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    double = compiling.njit(cache=True)(lambda x: 2 * x)
+    assert double(2) == 4
+
+
+def test_the_command_goes_through_what_needs_kernels_and_names_what_failed(monkeypatch, capsys):
+    called, code = [], {"run": 1}
+
+    def remembered(words, **options):
+        called.append(words[4:])
+        return subprocess.CompletedProcess(words, code.get(words[4], 0), "", "error: no disk\n")
+
+    monkeypatch.setattr(subprocess, "run", remembered)
+    assert main(["warm-up", "3d"]) == 0
+    assert [words[0] for words in called] == ["simulate", "run", "simulate", "localize", "run", "merge"]
+    assert capsys.readouterr().out.splitlines()[0].startswith("compiling what 3D logs need")
+    code["localize"] = 2
+    assert main(["warm-up", "2d"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: scanchain localize ") and error.endswith(": no disk\n")
 
 
 def _remembering(made, name):

@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from scanchain.kernels.compiling import njit
 
 _SWEEPS = 30  # largest number of sweeps of rotations; a handful does
 _BESIDE = 1e-16  # largest off-diagonal entry as a share of the diagonal

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 _SMALL = 1e-8  # sine of half the angle, below which the series is exact
 

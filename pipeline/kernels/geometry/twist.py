@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from scanchain.kernels.compiling import njit
 
 
 @njit(cache=True)

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.voxel_shapes import move
 
 

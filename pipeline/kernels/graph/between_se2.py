@@ -1,8 +1,9 @@
 """Between factors in SE(2): residuals and Jacobians of e = log(Z⁻¹ T_i⁻¹ T_j), compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _SMALL = 1e-4  # rad; below this angle the series replaces the closed form
 

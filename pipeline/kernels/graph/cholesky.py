@@ -6,9 +6,9 @@ used, so that every inner loop runs along a row.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.graph.fronts import Blocks, Fronts
 
 _Array = NDArray[np.float64]

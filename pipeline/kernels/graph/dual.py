@@ -1,8 +1,9 @@
 """The dual matrix of a pose graph, whose definiteness certifies a minimum as the global one; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

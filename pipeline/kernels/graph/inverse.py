@@ -1,9 +1,9 @@
 """The inverse of a sparse matrix where the matrix itself has entries, from its Cholesky factor; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.graph.fronts import Blocks, Fronts
 
 _Array = NDArray[np.float64]

@@ -1,8 +1,9 @@
 """Sums over factors: χ² of every factor, and the normal equations scattered into their blocks; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 

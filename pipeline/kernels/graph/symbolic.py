@@ -4,8 +4,9 @@ Everything here works on blocks (variables such as poses), not on scalars, and i
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Index = NDArray[np.int64]
 

@@ -1,8 +1,9 @@
 """Poses along a spanning tree of the graph; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

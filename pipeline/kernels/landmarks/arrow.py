@@ -1,8 +1,9 @@
 """The product AᵀA of a landmark problem as an arrow, banded poses with a border, and its elimination; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

@@ -3,8 +3,9 @@
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Index = NDArray[np.int64]
 

@@ -1,8 +1,9 @@
 """Velocities of a wheeled robot integrated to motions, with the Jacobians by their noise; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 

@@ -1,8 +1,9 @@
 """Factors of landmark SLAM in the plane: whitened residuals and Jacobians; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

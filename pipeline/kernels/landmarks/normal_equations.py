@@ -1,8 +1,9 @@
 """The product H = AᵀA of a tall sparse matrix, with the structure of the product found once; compiled."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanchain.kernels.compiling import njit
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]

@@ -8,9 +8,9 @@ a reflection touches no row that is still zero there.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.graph.fronts import Fronts
 
 _Array = NDArray[np.float64]

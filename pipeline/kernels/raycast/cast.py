@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.raycast.extents import extents_of
 from scanchain.kernels.raycast.ground import hit_ground
 from scanchain.kernels.raycast.solids import hit_solid

@@ -1,7 +1,8 @@
 """Points compared with the ranges of a lidar elsewhere: on its surfaces, behind them, or in its free space."""
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 FAR = 1e9  # m, range of bins that no ray fell into
 

@@ -1,7 +1,8 @@
 """Beams drawn into an occupancy grid up to their ends."""
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 

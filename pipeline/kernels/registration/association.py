@@ -1,8 +1,8 @@
 """Correspondences: the nearest voxel mean of every point, and the weighted pairs of the closed form."""
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.hashing import find_row, pack
 from scanchain.kernels.voxels.voxel_shapes import move
 

@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
 from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.optimizers import (

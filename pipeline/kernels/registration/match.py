@@ -4,9 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.pose_log import twist_3d
 from scanchain.kernels.geometry.poses import adjoint, between, centered, inverse, twist_2d
 from scanchain.kernels.registration.icp import (

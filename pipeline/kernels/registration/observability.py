@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.geometry.poses import adjoint, centered
 from scanchain.kernels.registration.optimizers import solve

@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from scanchain.kernels.compiling import njit
 
 GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
 

@@ -1,8 +1,8 @@
 """Normal equations of the distances between points and the shapes of their corresponding voxels."""
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, POINT, SHAPE, move
 
 _SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)

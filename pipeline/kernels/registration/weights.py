@@ -1,7 +1,6 @@
 """Weights of correspondences: the sensor's variance over that of the residual."""
 
-from numba import njit
-
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.voxel_shapes import (
     ACROSS,
     DIRECTION,

@@ -4,7 +4,8 @@ import heapq
 import math
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 HIT, NEAR = 2, 1  # score of a point in a cell with a surface, and in one beside it
 APART_RAD = 0.1  # least angle between two distinct poses

@@ -1,8 +1,8 @@
 """The search of ``branch_and_bound`` near given places only, in steps of bounded work."""
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.search.branch_and_bound import HIT, is_taken
 
 LEVEL, TURN, COLUMN, ROW, NEXT = range(5)  # of a window; the next one of the same bound, or of those not in use

@@ -1,7 +1,8 @@
 """A bird's-eye view of a local map: the occupied heights above each cell of a square."""
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 HEIGHTS = 64  # number of heights, one bit of a cell each
 

@@ -4,8 +4,8 @@ import heapq
 import math
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.search.branch_and_bound import APART_RAD
 
 SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell

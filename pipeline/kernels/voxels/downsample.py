@@ -1,8 +1,8 @@
 """Downsampling to one point a voxel, and deskewing."""
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.twist import perturb
 from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
 

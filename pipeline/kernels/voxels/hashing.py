@@ -1,7 +1,8 @@
 """Open addressing on packed voxel coordinates: one int64 key a voxel, linear probing, a power of two of slots."""
 
 import numpy as np
-from numba import njit
+
+from scanchain.kernels.compiling import njit
 
 EMPTY = np.int64(-1)
 _OFFSET = 1 << 20

@@ -1,8 +1,8 @@
 """A running mean of points per voxel, in an open-addressing table."""
 
 import numpy as np
-from numba import njit
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.hashing import find, key_of
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit

@@ -11,9 +11,9 @@ when the shape was fitted. A 2D map is the plane z = 0 of the same layout.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
 from scanchain.kernels.voxels.hashing import find_row, first_slot, key_of, pack, unpack
 
