@@ -52,7 +52,7 @@ class SharedCache(FunctionCache):
         self._depth = 0  # of compilations under way in this process, for several types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What the cache has for these types, once no other process compiles the kernel; None to compile it here."""
+        """The kernel for these types, once no other process compiles it; None where it is to be compiled here."""
         found = super().load_overload(sig, target_context)
         if found is None:
             self._lock()
