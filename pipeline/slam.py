@@ -235,9 +235,8 @@ class Slam:
             self.traveled_m += lie.apart(self.T_odom_last, tracked.T_odom_lidar)[0]
         self.T_odom_last = tracked.T_odom_lidar
         self.stamps_ns.append(tracked.scan.stamp_ns)
-        if (
-            self.odometry_poses.append(tracked.T_odom_lidar) == 1
-        ):  # only now is the motion known that distorted the first scan
+        scan = self.odometry_poses.append(tracked.T_odom_lidar)
+        if scan == 1:  # only now is the motion known that distorted the first scan
             stored = self.points.add(located.first_points)
             self.keyframes[self.first] = replace(self.keyframes[self.first], stored=stored)
         self.lost_scans += tracked.state is State.LOST

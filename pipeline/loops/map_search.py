@@ -145,7 +145,7 @@ class MapSearch:
         graph: PoseGraph,
         components: NDArray[np.int64],
     ) -> tuple[Closure, ...]:
-        """What follows from what a search has found."""
+        """Closures by the result of a search, accepted where another find agrees."""
         if closure is None or closure.verdict is Verdict.REJECTED:
             return () if closure is None else (closure,)
         self.next_m = keyframes[-1].traveled_m + _STEP_M

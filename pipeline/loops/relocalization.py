@@ -255,7 +255,7 @@ class Search:
     search: WholeSearch
 
     def find(self) -> Find | None:
-        """What was found; None where there is nothing, or nothing clear."""
+        """The pose that the search found; None where there is none, or an ambiguous one."""
         best = self.search.best()
         if best is None or best.is_ambiguous or not best.is_likely:
             return None

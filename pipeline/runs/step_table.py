@@ -84,7 +84,7 @@ class StepTable:
 
     @property
     def rows(self) -> Iterator[StepRow]:
-        """The rows, made anew."""
+        """The rows, unpacked from the columns one by one."""
         texts = list(self._texts)
         for part in self._parts:
             for packed in part:

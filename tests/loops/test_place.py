@@ -293,6 +293,15 @@ def sought(mapped, log, folder):
     return closures, [k.T_odom_lidar for k in (*mapped, *log)]
 
 
+def begun_live(mapped, seen, folder):
+    """A live search in a map before its first keyframe, and the keyframes up to that one."""
+    closer = LoopCloser(configured(3), 3, is_live=True)
+    closer.begin_in(mapped, folder)
+    closer.start_segment(len(mapped))
+    T_odom_lidar = T_ODOM_WORLD @ seen.T_odom_lidar
+    return closer, [*mapped, replace(seen, index=len(mapped), T_odom_lidar=T_odom_lidar, traveled_m=10_000.0)]
+
+
 def accepted_of(closures):
     return [closure for closure in closures if closure.verdict is Verdict.ACCEPTED]
 
@@ -310,13 +319,7 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
     mapped, log = passage(street()), passage(street(4.0, True)[4:5])
     (at_once,), _ = sought(mapped, log, tmp_path)
     monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
-    closer, moved = (
-        LoopCloser(configured(3), 3, is_live=True),
-        replace(log[0], index=len(mapped), traveled_m=10_000.0),
-    )
-    keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
-    closer.begin_in(mapped, tmp_path)
-    closer.start_segment(len(mapped))
+    closer, keyframes = begun_live(mapped, log[0], tmp_path)
     found, scans = closer.close(keyframes, graph_of(keyframes)), 1
     while closer.map_search.search is not None:
         found, scans = closer.advance(keyframes, graph_of(keyframes)), scans + 1
@@ -327,13 +330,7 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
 def test_a_search_that_the_end_of_the_log_interrupts_is_completed(tmp_path, monkeypatch):
     monkeypatch.setattr("scanchain.loops.map_search._STEPS", 500)
     mapped, log = passage(street()), passage(street(4.0, True)[4:5])
-    closer, moved = (
-        LoopCloser(configured(3), 3, is_live=True),
-        replace(log[0], index=len(mapped), traveled_m=10_000.0),
-    )
-    keyframes = [*mapped, replace(moved, T_odom_lidar=T_ODOM_WORLD @ moved.T_odom_lidar)]
-    closer.begin_in(mapped, tmp_path)
-    closer.start_segment(len(mapped))
+    closer, keyframes = begun_live(mapped, log[0], tmp_path)
     assert not closer.close(keyframes, graph_of(keyframes)) and closer.map_search.search is not None
     assert closer.finish(keyframes, graph_of(keyframes)) and closer.map_search.search is None
 

@@ -16,29 +16,8 @@ class DriftingOdometry:
         self.drifted = drifted
         self.T_odom_lidar = self.T_drifted = lie.identity(odometry.dimension)
 
-    @property
-    def dimension(self):
-        return self.odometry.dimension
-
-    @property
-    def resolution(self):
-        return self.odometry.resolution
-
-    @property
-    def local_map(self):
-        return self.odometry.local_map
-
-    @property
-    def elevation(self):
-        return self.odometry.elevation
-
-    @property
-    def calibrated_from(self):
-        return self.odometry.calibrated_from
-
-    @property
-    def first_points(self):
-        return self.odometry.first_points
+    def __getattr__(self, name):
+        return getattr(self.odometry, name)
 
     def process(self, scan):
         tracked = self.odometry.process(scan)

@@ -209,7 +209,7 @@ class Recording:
         return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
 
     def _step(self, step: Step) -> list[Message]:
-        """What a step that was gathered makes due."""
+        """Messages that are due after a step."""
         messages = self.graph.draw(self.now) if self.graph.has_grown else []
         if self._draws_map_of(step):
             points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))

@@ -39,9 +39,7 @@ def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m:
         if voxel < 0:
             continue
         cell = voxels.cells[voxel]
-        px, py, pz = move(T, points, i)
-        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
-        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
         r2 *= weight[i]
         ratio = s2 / (s2 + r2)
         w = weight[i] * ratio * ratio
@@ -70,9 +68,7 @@ def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float,
         if voxel < 0:
             continue
         cell = voxels.cells[voxel]
-        px, py, pz = move(T, points, i)
-        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
-        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
         r2 *= weight[i]
         ratio = s2 / (s2 + r2)
         w = weight[i] * ratio * ratio
@@ -155,9 +151,7 @@ def information(voxels, points, T, origin, correspondence, weight, scale_m: floa
         if voxel < 0:
             continue
         cell = voxels.cells[voxel]
-        px, py, pz = move(T, points, i)
-        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
-        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
         ratio = s2 / (s2 + r2 * weight[i])
         _add(H, b, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, True)
         _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, True)
@@ -175,9 +169,7 @@ def _information_in_space(voxels, points, T, origin, correspondence, weight, sca
         if voxel < 0 or weight[i] == 0.0:
             continue
         cell = voxels.cells[voxel]
-        px, py, pz = move(T, points, i)
-        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
-        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
         ratio = s2 / (s2 + r2 * weight[i])
         upper, _ = _plus(upper, none, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along)
         plain, _ = _plus(plain, none, weight[i], cell, px, py, pz, ex, ey, ez, along)
@@ -206,9 +198,7 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
             slot = (slot + 1) & (size - 1)
         slots[slot] = voxel
         cell = voxels.cells[voxel]
-        px, py, pz = move(T, points, i)
-        ex, ey, ez, along, r2 = _residual(cell, px, py, pz)
-        px, py, pz = px - origin[0], py - origin[1], pz - origin[2]
+        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
         ratio = s2 / (s2 + r2 * weight[i])
         w = weight[i] * ratio * ratio
         _, gradient = _plus(no_upper, none, w, cell, px, py, pz, ex, ey, ez, along)
@@ -252,6 +242,14 @@ def _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar: bool):
         _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
     else:
         _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
+
+
+@njit(cache=True, inline="always")
+def _moved(cell, T, points, i: int, origin):
+    """Point i moved by T, from the origin, and its ``_residual``."""
+    x, y, z = move(T, points, i)
+    ex, ey, ez, along, r2 = _residual(cell, x, y, z)
+    return x - origin[0], y - origin[1], z - origin[2], ex, ey, ez, along, r2
 
 
 @njit(cache=True, inline="always")
