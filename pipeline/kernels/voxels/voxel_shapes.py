@@ -176,16 +176,14 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     lidar stands still leaves many points and no surface.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
-    m = voxels.moments[voxel]
-    size = voxels.size_m
-    cell = voxels.cells[voxel]
+    m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
     cell[0] = (ix + 0.5) * size + m[1] / m[0]
     cell[1] = (iy + 0.5) * size + m[2] / m[0]
     cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
-    if m[0] >= alone and _fit_shape(m, dimension, cell) >= (_BROAD * size) ** 2:
-        return
-    _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
-    _fit_shape(sums, dimension, cell)
+    width2 = _fit_shape(m, dimension, cell) if m[0] >= alone else 0.0
+    if width2 < (_BROAD * size) ** 2:
+        _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+        _fit_shape(sums, dimension, cell)
 
 
 @njit(cache=True, inline="always")
