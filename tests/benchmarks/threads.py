@@ -3,12 +3,12 @@
     python -m tests.benchmarks.threads [--points 10000 ...] [--log LOG ...] [--threads 1 2 4 8] [--scans 40]
         [--methods plicp kiss-icp small-vgicp genz-icp] [--png FILE]
 
-A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. After it come
-the first scans of logs. All are in memory. Each method and number of threads has a process of its own, with as many
-cores as threads, and tracks the scans three times from the beginning, of which the fastest counts. Time is the
-median over the scans, without the first three, from one pose to the next on the clock: ours prepares scans ahead
-where it has threads, as ``scanchain run`` does. The last pose of ours is the same to the last bit for any number of
-threads, or the benchmark fails.
+A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. After it
+come the first scans of logs. All are in memory. Each method and number of threads has a process of its own,
+with as many cores as threads, and tracks the scans three times from the beginning, of which the fastest counts.
+Time is the median over the scans, without the first three, from one pose to the next on the clock: ours
+prepares scans ahead where it has threads, as ``scanchain run`` does. The last pose of ours is the same to the
+last bit for any number of threads, or the benchmark fails.
 """
 
 from __future__ import annotations
