@@ -70,8 +70,24 @@ def _problem(dimension: int) -> tuple[Problem, Pose]:
     return problem, T
 
 
+def graph(dimension: int) -> None:
+    """Compile what the errors of a pose graph take: its linearization and the factor of that."""
+    slam = _straight_on(dimension)
+    slam.graph.position_errors(1)
+    slam.points.close()
+
+
 def results(dimension: int) -> None:
-    """Compile what follows the odometry of a lidar that drives straight on: pose graph and both maps."""
+    """Compile what follows the odometry: the end of the pose graph, and both maps."""
+    slam = _straight_on(dimension)
+    result = slam.finish()
+    cloud_of(result, slam.config)
+    grid_of(result, slam.config.maps)
+    slam.points.close()
+
+
+def _straight_on(dimension: int) -> Slam:
+    """SLAM after a few scans of a lidar that drove straight on."""
     config = load_settings(dimension).config
     slam = Slam(config, lie.identity(dimension))
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
@@ -80,10 +96,7 @@ def results(dimension: int) -> None:
         T_odom_lidar = lie.identity(dimension)
         T_odom_lidar[0, -1] = _STEP_M * index
         slam.place(_located(index, points, T_odom_lidar, slam))
-    result = slam.finish()
-    cloud_of(result, config)
-    grid_of(result, config.maps)
-    slam.points.close()
+    return slam
 
 
 def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Located:
@@ -94,12 +107,17 @@ def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Loca
     return Located(tracked, True, 1.0, points, match.information, points)
 
 
-_PARTS: Mapping[str, Callable[[int], None]] = MappingProxyType({"fit": fit, "judge": judge, "results": results})
+_PARTS: Mapping[str, Callable[[int], None]] = MappingProxyType(
+    {"fit": fit, "judge": judge, "results": results, "graph": graph}
+)
 
 
 def beside(dimension: int, cores: int) -> Sequence[Sequence[str]]:
-    """Arguments of ``python -m`` of the processes beside a run that compiles, by the order of first use."""
-    count = min(max(cores - 1, 1), len(_PARTS))
+    """Arguments of ``python -m`` of the processes beside a run that compiles, by the order of first use.
+
+    There are as many as cores, as the run itself often waits for them.
+    """
+    count = min(cores, len(_PARTS))
     return [("scanchain.runs.warm_up", str(dimension), *list(_PARTS)[first::count]) for first in range(count)]
 
 

@@ -115,6 +115,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     from scanchain.runs import processing, results, run
     from scanchain.runs.resume.journal import Journal
     from scanchain.runs.step_table import StepTable
+    from scanchain.viz.report.beside import Reporter
 
     watch = Stopwatch()
     watch.add("start and imports", time() - began)
@@ -129,7 +130,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("other results", processing, "write_results", "record_results")
     watch.over("other results", StepTable, "write")
     watch.over("other results", run, "_judge", "measure")
-    watch.over("report", api, "write_report")
+    watch.over("report", Reporter, "write")
     open_recording = api.open_recorder
 
     def record(*arguments: Any, **options: Any) -> Any:

@@ -16,6 +16,7 @@ from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.kernels import compiling
+from scanchain.kernels.graph.cholesky import factorize
 from scanchain.kernels.registration import residuals
 from scanchain.kernels.registration.icp import align, fit_at
 from scanchain.kernels.registration.observability import add_signals, agreement
@@ -105,8 +106,8 @@ def test_a_warm_up_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkey
 @pytest.mark.parametrize("cores", [1, 2, 3, 16])
 def test_the_processes_beside_a_run_share_out_all_parts(cores):
     parts = [part for words in warm_up.beside(3, cores) for part in words[2:]]
-    assert sorted(parts) == ["fit", "judge", "results"]
-    assert len(warm_up.beside(3, cores)) == min(max(cores - 1, 1), 3)
+    assert sorted(parts) == ["fit", "graph", "judge", "results"]
+    assert len(warm_up.beside(3, cores)) == min(cores, 4)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -116,7 +117,8 @@ def test_a_run_uses_the_types_that_were_compiled_ahead(office, tmp_path, dimensi
         simulate("town", log, duration_s=0.5, sensor="vlp-16")
     warm_up.fit(dimension)
     warm_up.judge(dimension)
-    kernels = align, fit_at, gradient_spread, agreement, add_signals
+    warm_up.graph(dimension)
+    kernels = align, fit_at, gradient_spread, agreement, add_signals, factorize
     ahead = [list(kernel.signatures) for kernel in kernels]  # tests before may have used other types
     run(Job(logs=(log,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
     assert all(ahead) and [list(kernel.signatures) for kernel in kernels] == ahead
