@@ -164,7 +164,7 @@ class ProximityCloser:
     def _near(
         self, graph: PoseGraph, old: int, connected: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Older keyframes where the newest may be, of the map alone if any is; and the uncertainty (old,) of all."""
+        """Older keyframes where the newest may be, of the map alone if any is; uncertainty (old,) of all."""
         uncertainty_m = self.drift.between(graph, len(graph) - 1, self.config.max_radius_m)[:old]
         reach_m = np.maximum(uncertainty_m, self.config.min_radius_m)
         near = np.flatnonzero(connected[:old] & (_distances_m(graph.poses, slice(old)) <= reach_m))
