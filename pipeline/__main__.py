@@ -26,6 +26,7 @@ from scanchain.commands.localize import localize
 from scanchain.commands.map import map_group
 from scanchain.commands.merge import merge
 from scanchain.commands.optimize import optimize
+from scanchain.commands.options import OWN_PROCESS
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
@@ -64,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     atexit.register(gc.freeze)  # else garbage is sought once more, for half a second, before the interpreter goes
     try:
-        return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
+        obj = OWN_PROCESS if arguments is None else None
+        return scanchain.main(words, prog_name="scanchain", standalone_mode=False, obj=obj) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 2

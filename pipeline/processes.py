@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum, auto
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from threading import Event
 from time import monotonic
+from types import ModuleType
 
 import psutil
 
@@ -59,6 +61,28 @@ def _family(pid: int) -> list[int]:
 def available_mib() -> float:
     """Memory that the machine can give without swapping."""
     return psutil.virtual_memory().available / _MIB
+
+
+def leave_pandas_out() -> None:
+    """Let pyarrow do without pandas, which it would import in a quarter of a second.
+
+    For a process of our own: pyarrow looks for pandas once, and converts nothing to it where it found none.
+    """
+    if "pandas" in sys.modules:
+        return
+    import pyarrow as pa
+
+    sys.meta_path.insert(0, _WithoutPandas())
+    pa.scalar(0)  # it looks now
+    del sys.meta_path[0]
+
+
+class _WithoutPandas(MetaPathFinder):
+    """Finds nothing but that pandas is not installed."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> None:
+        if fullname == "pandas":
+            raise ModuleNotFoundError("left out", name="pandas")
 
 
 def die_first() -> None:

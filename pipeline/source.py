@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
-from urllib.request import url2pathname
 
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
@@ -52,5 +51,7 @@ def source_of(named: Source | str) -> Source:
     if not _SCHEME.match(named):
         return Path(named)
     if named.lower().startswith("file://"):
+        from urllib.request import url2pathname  # which imports HTTP, too
+
         return Path(url2pathname(urlsplit(named).path))
     return Address(named)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from scanchain import plugins
 from scanchain.commands.options import (
     LOG,
+    OWN_PROCESS,
     OverrideCommand,
     collect_garbage_seldom,
     ground_truth,
@@ -25,7 +27,7 @@ from scanchain.errors import InputError, ScanchainError
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.job import SinkName
+    from scanchain.runs.job import Recorder, SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
@@ -99,11 +101,18 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     collect_garbage_seldom()
-    from scanchain.api import open_recorder, write_report
+    from scanchain.api import open_recorder
     from scanchain.commands.terminal import Terminal
+    from scanchain.processes import leave_pandas_out
     from scanchain.runs.job import Job
     from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
+    from scanchain.viz.report.beside import Reporter
+
+    def record(path: Path | None, **options: Any) -> Recorder:
+        if ctx.obj is OWN_PROCESS and not plugins.foreign:
+            leave_pandas_out()
+        return open_recorder(path, **options)
 
     truth_file, truth_topic = ground_truth(gt)
     job = Job(
@@ -119,8 +128,8 @@ def run(
         checkpoint_s=checkpoint,
         command=tuple(sys.argv),
     )
-    with Terminal("scans") as terminal:
-        finished = run_log(job, open_recorder, terminal, write_report)
+    with Reporter(beside=ctx.obj is OWN_PROCESS) as reporter, Terminal("scans") as terminal:
+        finished = run_log(job, record, terminal, reporter.write)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     fails = finished.metrics.verdict.fails(strict=strict)
     if fails and not is_seen:

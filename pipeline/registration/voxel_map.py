@@ -44,10 +44,11 @@ class VoxelMap:
         T_map_lidar = checks.pose(T_map_lidar, "T_map_lidar", self.dimension)
         checks.within_map(points, T_map_lidar, self.voxels.size_m, "points")
         self.insertions += 1
+        room = len(self) + len(points)
         if self.insertions % _SWEEP_EVERY == 0 and self.config.max_distance_m < np.inf:
-            self._rebuild(len(self), T_map_lidar, self.config.max_distance_m)
-        if len(self) + len(points) > len(self.voxels.cells):
-            self._rebuild(2 * (len(self) + len(points)), T_map_lidar, np.inf)
+            self._rebuild(room, T_map_lidar, self.config.max_distance_m)
+        elif room > len(self.voxels.cells):
+            self._rebuild(2 * room, T_map_lidar, np.inf)
         insert(self.voxels, points, T_map_lidar, self.insertions, _MIN_POINTS_ALONE[self.dimension])
 
     def points(self) -> Points:
@@ -62,7 +63,7 @@ class VoxelMap:
             self.voxels = kept
 
     def _rebuild(self, room: int, T_map_lidar: Pose, radius_m: float) -> None:
-        kept = _empty(max(room, len(self)), self.voxels.size_m)
+        kept = _empty(room, self.voxels.size_m)
         x, y, z = lie.lift(T_map_lidar)[:3, 3]
         oldest = self.insertions - self.config.max_insertions
         keep(self.voxels, kept, x, y, z, radius_m, oldest)

@@ -1,12 +1,14 @@
-"""Time of a 3D scan against the number of threads and of points, for ours and KISS-ICP, as a table and a picture.
+"""Time of a 3D scan against the number of threads and of points, for ours and others, as a table and a picture.
 
-    python -m tests.benchmarks.threads [--points 10000 ...] [--threads 1 2 4 8] [--scans 12] [--png FILE]
+    python -m tests.benchmarks.threads [--points 10000 ...] [--log LOG ...] [--threads 1 2 4 8] [--scans 40]
+        [--methods plicp kiss-icp small-vgicp genz-icp] [--png FILE]
 
-A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. The scans
-are in memory. Each method and number of threads has a process of its own and tracks the scans three times from
-the beginning, of which the fastest counts. Time is the median over the scans, without the first three, from one
-pose to the next on the clock: ours prepares scans ahead where it has threads, as ``scanchain run`` does. The
-last pose of ours is the same to the last bit for any number of threads, or the benchmark fails.
+A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. After it
+come the first scans of logs. All are in memory. Each method and number of threads has a process of its own,
+with as many cores as threads, and tracks the scans three times from the beginning, of which the fastest counts.
+Time is the median over the scans, without the first three, from one pose to the next on the clock: ours
+prepares scans ahead where it has threads, as ``scanchain run`` does. The last pose of ours is the same to the
+last bit for any number of threads, or the benchmark fails.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import argparse
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -36,7 +39,9 @@ from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
 from tests.benchmarks.contest import in_fresh_process
 
-OURS, THEIRS = "plicp", "kiss-icp"
+OURS = "plicp"
+METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
+WITH_THREADS = ("kiss-icp", "small-vgicp", "small-gicp")  # that have a setting of that name; others use all cores
 REPEATS, WARM_UP = 3, 3
 RINGS, PERIOD_NS = 64, 100_000_000
 
@@ -48,14 +53,15 @@ def scans_of(path: Path, points: int, count: int) -> None:
     record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
 
 
-def tracked(path: Path, method: str, count: int) -> tuple[float, int, bytes]:
-    """Seconds a scan, points a scan, and the last pose, with so many threads in this process."""
+def tracked(path: Path, method: str, count: int, most: int) -> tuple[float, int, bytes]:
+    """Seconds a scan, points a scan, and the last pose: at most so many scans, so many threads in this process."""
     use_threads(count)
     log = open_log(path)
-    scans = list(log.scans())
+    scans = list(islice(log.scans(), most))
     chosen = resolve((method,), 3, file=None)[0]
-    if method != OURS:
+    if method in WITH_THREADS:
         chosen = msgspec.structs.replace(chosen, settings=chosen.settings | {"threads": count})
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
     medians_s, pose = [], lie.identity(3)
     for _ in range(REPEATS):
         poses = (
@@ -78,6 +84,23 @@ def our_poses(scans: list[Scan], T_base_lidar: Pose) -> Iterator[Pose]:
         yield odometry.process(scan).T_odom_lidar
 
 
+def measured(path: Path, methods: list[str], counts: list[int], scans: int) -> list[tuple[str, int, int, float]]:
+    """Method, threads, points and seconds a scan of a log; a line is printed for each number of threads."""
+    rows: list[tuple[str, int, int, float]] = []
+    poses: set[bytes] = set()
+    for count in counts:
+        line, ours_s = "", 0.0
+        for method in methods:
+            taken_s, points, pose = in_fresh_process(tracked, path, method, count, scans)
+            rows.append((method, count, points, taken_s))
+            poses |= {pose} if method == OURS else set()
+            ours_s = ours_s or taken_s
+            line += f"{1e3 * taken_s:12.2f}" + f" x{taken_s / ours_s:.2f}".rjust(8)
+        print(f"{path.stem[:23]:24}{rows[-1][2]:9,}{count:9}{line}", flush=True)
+    assert len(poses) < 2, f"{path}: the last pose depends on the number of threads"
+    return rows
+
+
 def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
     """Milliseconds a scan over points, a line for each method and number of threads."""
     from matplotlib.figure import Figure
@@ -98,30 +121,24 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, nargs="+", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
+    parser.add_argument("--points", type=int, nargs="*", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
+    parser.add_argument("--log", type=Path, nargs="*", default=[])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
+    parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--scans", type=int, default=40)
     parser.add_argument("--png", type=Path)
     arguments = parser.parse_args()
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
-    print(f"{'points':>9}{'threads':>9}{'ours ms':>10}{'KISS-ICP ms':>13}{'over ours':>11}", flush=True)
+    print(
+        f"{'log':24}{'points':>9}{'threads':>9}" + "".join(f"{f'{method} ms':>20}" for method in arguments.methods)
+    )
     rows: list[tuple[str, int, int, float]] = []
     with TemporaryDirectory() as folder:
-        for points in arguments.points:
-            path, poses = Path(folder) / f"{points}.mcap", set[bytes]()
-            scans_of(path, points, arguments.scans)
-            for count in arguments.threads:
-                times_s: dict[str, float] = {}
-                for method in (OURS, THEIRS):
-                    times_s[method], seen, pose = in_fresh_process(tracked, path, method, count)
-                    rows.append((method, count, seen, times_s[method]))
-                    poses |= {pose} if method == OURS else set()
-                ours_s, theirs_s = times_s[OURS], times_s[THEIRS]
-                print(
-                    f"{seen:9,}{count:9}{1e3 * ours_s:10.2f}{1e3 * theirs_s:13.2f}{theirs_s / ours_s:11.1f}",
-                    flush=True,
-                )
-            assert len(poses) == 1, f"{points} points: the last pose depends on the number of threads"
+        for log in [*arguments.points, *arguments.log]:
+            path = log if isinstance(log, Path) else Path(folder) / f"town_{log}.mcap"
+            if path != log:
+                scans_of(path, int(log), arguments.scans)
+            rows += measured(path, arguments.methods, arguments.threads, arguments.scans)
     if arguments.png:
         draw(arguments.png, rows)
 

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from base64 import b64decode, b64encode
 from hashlib import sha256
 from types import SimpleNamespace
@@ -24,8 +25,10 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.simulation import simulate
+from scanchain.threads import VARIABLE
 from scanchain.viz.pictures.map_figures import AFTER, BEFORE, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
+from scanchain.viz.report.beside import Reporter
 from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
 from scanchain.viz.report.run import write_run_report
 from scanchain.viz.report.sections import loop_section
@@ -171,6 +174,36 @@ def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run
     assert "Worst place" in page and "scans 3 to 9: lost" in page and BEFORE in page and AFTER in page
     shown = re.findall(r">(\d\d)</text>", page[page.index("Worst place") : page.index("Loop closures")])
     assert "20" in shown and "30" in shown
+
+
+def test_a_report_drawn_beside_is_the_same_and_what_fails_there_is_raised_here(one_run, tmp_path, monkeypatch):
+    folder = shutil.copytree(one_run, tmp_path / "run")
+    page = (folder / "report.html").read_bytes()
+    monkeypatch.setenv(VARIABLE, "2")
+    for is_killed in (False, True):
+        (folder / "report.html").unlink()
+        with Reporter(beside=True) as reporter:
+            process = reporter._process
+            assert process is not None
+            if is_killed:
+                process.kill()
+                process.join()
+            reporter.write(folder)
+        assert (folder / "report.html").read_bytes() == page and not process.is_alive()
+    with Reporter(beside=True) as reporter, pytest.raises(FileNotFoundError, match="metrics"):
+        reporter.write(tmp_path)
+
+
+def test_a_command_leaves_pandas_out_for_pyarrow_alone():
+    program = """
+import sys
+from scanchain.processes import leave_pandas_out
+leave_pandas_out()
+import pyarrow as pa
+assert pa.array([1.0, None]).to_numpy(zero_copy_only=False)[0] == 1.0 and "pandas" not in sys.modules
+import pandas
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):

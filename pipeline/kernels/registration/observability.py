@@ -13,14 +13,13 @@ from scanchain.kernels.voxels.hashing import unpack
 from scanchain.kernels.voxels.voxel_shapes import (
     ACROSS,
     BORN,
-    DIRECTION,
     MEAN_TERM,
     PLANE,
-    SHAPE,
     SLOPE_ACROSS,
     SLOPE_ALONG,
     THICKNESS,
     move,
+    shape_of,
 )
 
 WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
@@ -191,7 +190,12 @@ def signal_along(problem, T, twist) -> float:
 
     T (d+1, d+1) : pose at which the problem's points were associated
     """
-    voxels, points, insertions = problem.voxels, problem.points, problem.settings.insertions
+    voxels, points, origin, insertions = (
+        problem.voxels,
+        problem.points,
+        problem.origin,
+        problem.settings.insertions,
+    )
     parameters = 2.0 if points.shape[1] == 2 else 3.0
     informative = np.zeros(points.shape[0])
     total, noise, most, dominant = 0.0, 0.0, 0.0, -1
@@ -200,14 +204,21 @@ def signal_along(problem, T, twist) -> float:
         voxel, weight = problem.correspondence[i], problem.weight[i]
         if voxel < 0 or weight == 0.0:
             continue
-        cell = voxels.cells[voxel]
-        dx, dy, dz = _displacement(T, points, i, problem.origin, twist)
-        along = cell[DIRECTION] * dx + cell[DIRECTION + 1] * dy + cell[DIRECTION + 2] * dz
+        x, y, z = move(T, points, i)
+        x, y, z = x - origin[0], y - origin[1], z - origin[2]
+        if points.shape[1] == 2:
+            dx, dy, dz = twist[0] - twist[2] * y, twist[1] + twist[2] * x, 0.0
+        else:
+            dx = twist[0] + twist[4] * z - twist[5] * y
+            dy = twist[1] + twist[5] * x - twist[3] * z
+            dz = twist[2] + twist[3] * y - twist[4] * x
+        shape, _, (nx, ny, nz) = shape_of(voxels.cells, voxel)
+        along = nx * dx + ny * dy + nz * dz
         beside = dx * dx + dy * dy + dz * dz - along * along
-        if cell[SHAPE] == PLANE:
-            noise += weight * _normal_variance(cell, dx, dy, dz, beside, parameters)
+        if shape == PLANE:
+            noise += weight * _normal_variance(voxels.cells, voxel, dx, dy, dz, beside, parameters)
         if voxels.history[voxel, BORN] <= youngest:
-            informative[i] = weight * (along * along if cell[SHAPE] == PLANE else beside)
+            informative[i] = weight * (along * along if shape == PLANE else beside)
             total += informative[i]
             if informative[i] > most:
                 most, dominant = informative[i], voxel
@@ -217,29 +228,19 @@ def signal_along(problem, T, twist) -> float:
 
 
 @njit(cache=True, inline="always")
-def _displacement(T, points, i: int, origin, twist):
-    """Displacement of a point moved by T, under a twist about the origin."""
-    x, y, z = move(T, points, i)
-    x, y, z = x - origin[0], y - origin[1], z - origin[2]
-    if points.shape[1] == 2:
-        return twist[0] - twist[2] * y, twist[1] + twist[2] * x, 0.0
-    return (
-        twist[0] + twist[4] * z - twist[5] * y,
-        twist[1] + twist[5] * x - twist[3] * z,
-        twist[2] + twist[3] * y - twist[4] * x,
-    )
-
-
-@njit(cache=True, inline="always")
-def _normal_variance(cell, dx: float, dy: float, dz: float, beside: float, parameters: float) -> float:
-    """Variance of n·d by the fit of a cell's normal n, ``beside`` being the squared length of d within the plane.
+def _normal_variance(
+    cells, voxel: int, dx: float, dy: float, dz: float, beside: float, parameters: float
+) -> float:
+    """Variance of n·d by the fit of a voxel's normal n, ``beside`` being the squared length of d within the plane.
 
     τ² is estimated from m points less the parameters of the fit.
     """
-    across = cell[ACROSS] * dx + cell[ACROSS + 1] * dy + cell[ACROSS + 2] * dz
-    m = 1.0 / cell[MEAN_TERM]
-    variance = cell[THICKNESS] * m / max(m - parameters, 1.0)
-    return variance * (cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * (beside - across * across))
+    across = cells[voxel, ACROSS] * dx + cells[voxel, ACROSS + 1] * dy + cells[voxel, ACROSS + 2] * dz
+    m = 1.0 / cells[voxel, MEAN_TERM]
+    variance = cells[voxel, THICKNESS] * m / max(m - parameters, 1.0)
+    return variance * (
+        cells[voxel, SLOPE_ACROSS] * across * across + cells[voxel, SLOPE_ALONG] * (beside - across * across)
+    )
 
 
 @njit(cache=True, nogil=True)

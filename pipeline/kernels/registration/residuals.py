@@ -3,7 +3,7 @@
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels.voxel_shapes import DIRECTION, LINE, PLANE, POINT, SHAPE, move
+from scanchain.kernels.voxels.voxel_shapes import LINE, PLANE, POINT, move, shape_of
 
 _SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)
 
@@ -27,30 +27,13 @@ def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m:
         held fixed); 0 leaves it out
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
     """
-    if H.shape[0] == 6 and curvature == 0.0:
-        return _in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, b)
-    H.fill(0.0)
-    b.fill(0.0)
-    cost = total_weight = squares = 0.0
-    s2 = scale_m * scale_m
-    planar = points.shape[1] == 2
-    for i in range(points.shape[0]):
-        voxel = correspondence[i]
-        if voxel < 0:
-            continue
-        cell = voxels.cells[voxel]
-        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
-        r2 *= weight[i]
-        ratio = s2 / (s2 + r2)
-        w = weight[i] * ratio * ratio
-        cost += 0.5 * r2 * ratio
-        total_weight += w
-        squares += ratio * ratio * r2
-        _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar)
-        if curvature > 0.0:
-            _add_curvature(H, curvature * w, px, py, pz, ex, ey, ez, planar)
-    _mirror(H)
-    return cost, total_weight, squares
+    if H.shape[0] == 6:
+        sums = _in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, b)
+    else:
+        sums = _in_plane(voxels, points, T, origin, correspondence, weight, scale_m, H, b)
+    if curvature > 0.0:
+        _add_curvature(voxels, points, T, origin, correspondence, weight, scale_m, curvature, H)
+    return sums
 
 
 @njit(cache=True, nogil=True)
@@ -67,48 +50,93 @@ def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float,
         voxel = correspondence[i]
         if voxel < 0:
             continue
-        cell = voxels.cells[voxel]
-        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
         r2 *= weight[i]
         ratio = s2 / (s2 + r2)
         w = weight[i] * ratio * ratio
         cost += 0.5 * r2 * ratio
         total_weight += w
         squares += ratio * ratio * r2
-        upper, gradient = _plus(upper, gradient, w, cell, px, py, pz, ex, ey, ez, along)
+        upper, gradient = _plus(upper, gradient, w, shape, normal, moved, residual, along)
+    _unfold(upper, H)
     for row in range(6):
         b[row] = gradient[row]
+    return cost, total_weight, squares
+
+
+@njit(cache=True, nogil=True)
+def _in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float, H, b):
+    """``normal_equations`` in the plane, without curvature, as ``_in_space``."""
+    cost = total_weight = squares = 0.0
+    s2 = scale_m * scale_m
+    upper, gradient = (0.0,) * 6, (0.0,) * 3
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0:
+            continue
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
+        r2 *= weight[i]
+        ratio = s2 / (s2 + r2)
+        w = weight[i] * ratio * ratio
+        cost += 0.5 * r2 * ratio
+        total_weight += w
+        squares += ratio * ratio * r2
+        upper, gradient = _plus_in_plane(upper, gradient, w, shape, normal, moved, residual, along)
     _unfold(upper, H)
+    for row in range(3):
+        b[row] = gradient[row]
     return cost, total_weight, squares
 
 
 @njit(cache=True, inline="always")
-def _plus(h, b, w, cell, px, py, pz, ex, ey, ez, along):
-    """Upper triangle h (21), by rows, and gradient b (6) with one correspondence of weight w, as by ``_add``."""
-    shape = cell[SHAPE]
+def _plus(h, b, w, shape, normal, moved, residual, along):
+    """Upper triangle h (21), by rows, and gradient b (6) with one correspondence of weight w, by its shape."""
     if shape != PLANE:
-        h, b = _plus_point(h, b, w, px, py, pz, ex, ey, ez)
+        h, b = _plus_point(h, b, w, moved, residual)
         w, along = -w, 0.0
     if shape != POINT:
-        nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-        h, b = _plus_plane(h, b, w, px, py, pz, nx, ny, nz, along)
+        h, b = _plus_plane(h, b, w, moved, normal, along)
     return h, b
 
 
 @njit(cache=True, inline="always")
-def _unfold(upper, H):
-    """Write the upper triangle (21), by rows, to the symmetric H (6, 6)."""
-    k = 0
-    for row in range(6):
-        for column in range(row, 6):
-            H[row, column] = upper[k]
-            k += 1
-    _mirror(H)
+def _plus_in_plane(h, b, w, shape, normal, moved, residual, r):
+    """Upper triangle h (6), by rows, and gradient b (3) with one correspondence of weight w.
+
+    Point-to-line: J = [n, p × n]; point-to-point: J = [I, (−p_y, p_x)ᵀ].
+    """
+    (px, py, _), (ex, ey, _), (nx, ny, _) = moved, residual, normal
+    if shape != PLANE:
+        upper = h[0] + w, h[1], h[2] - w * py, h[3] + w, h[4] + w * px, h[5] + w * (px * px + py * py)
+        return upper, (b[0] + w * ex, b[1] + w * ey, b[2] + w * (px * ey - py * ex))
+    turn = px * ny - py * nx
+    upper = (
+        h[0] + w * nx * nx, h[1] + w * nx * ny, h[2] + w * nx * turn,
+        h[3] + w * ny * ny, h[4] + w * ny * turn, h[5] + w * turn * turn,
+    )  # fmt: skip
+    return upper, (b[0] + w * nx * r, b[1] + w * ny * r, b[2] + w * turn * r)
 
 
 @njit(cache=True, inline="always")
-def _plus_plane(h, b, w, px, py, pz, nx, ny, nz, r):
-    """Upper triangle h (21), by rows, and gradient b (6) with ``_add_plane``."""
+def _unfold(upper, H):
+    """Write an upper triangle, by rows, to the symmetric H."""
+    k = 0
+    for row in range(H.shape[0]):
+        for column in range(row, H.shape[0]):
+            H[row, column] = H[column, row] = upper[k]
+            k += 1
+
+
+@njit(cache=True, inline="always")
+def _plus_plane(h, b, w, moved, normal, r):
+    """Upper triangle h (21), by rows, and gradient b (6) with one residual: J = [n, p × n]."""
+    (px, py, pz), (nx, ny, nz) = moved, normal
     cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
     wx, wy, wz, wcx, wcy, wcz, wr = w * nx, w * ny, w * nz, w * cx, w * cy, w * cz, r * w
     upper = (
@@ -123,8 +151,9 @@ def _plus_plane(h, b, w, px, py, pz, nx, ny, nz, r):
 
 
 @njit(cache=True, inline="always")
-def _plus_point(h, b, w, px, py, pz, ex, ey, ez):
-    """Upper triangle h (21), by rows, and gradient b (6) with ``_add_point`` of a point shape."""
+def _plus_point(h, b, w, moved, residual):
+    """Upper triangle h (21), by rows, and gradient b (6) with three residuals: J = [I, −p×]."""
+    (px, py, pz), (ex, ey, ez) = moved, residual
     upper = (
         h[0] + w, h[1], h[2], h[3], h[4] + w * pz, h[5] - w * py,
         h[6] + w, h[7], h[8] - w * pz, h[9], h[10] + w * px,
@@ -142,21 +171,8 @@ def information(voxels, points, T, origin, correspondence, weight, scale_m: floa
     """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
     if H.shape[0] == 6:
         _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
-        return
-    H.fill(0.0)
-    unweighted.fill(0.0)
-    s2, b = scale_m * scale_m, np.zeros(H.shape[0])
-    for i in range(points.shape[0]):
-        voxel = correspondence[i]
-        if voxel < 0:
-            continue
-        cell = voxels.cells[voxel]
-        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
-        ratio = s2 / (s2 + r2 * weight[i])
-        _add(H, b, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along, True)
-        _add(unweighted, b, weight[i], cell, px, py, pz, ex, ey, ez, along, True)
-    _mirror(H)
-    _mirror(unweighted)
+    else:
+        _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
 
 
 @njit(cache=True, nogil=True)
@@ -168,11 +184,33 @@ def _information_in_space(voxels, points, T, origin, correspondence, weight, sca
         voxel = correspondence[i]
         if voxel < 0 or weight[i] == 0.0:
             continue
-        cell = voxels.cells[voxel]
-        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
-        upper, _ = _plus(upper, none, weight[i] * ratio * ratio, cell, px, py, pz, ex, ey, ez, along)
-        plain, _ = _plus(plain, none, weight[i], cell, px, py, pz, ex, ey, ez, along)
+        upper, _ = _plus(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
+        plain, _ = _plus(plain, none, weight[i], shape, normal, moved, residual, along)
+    _unfold(upper, H)
+    _unfold(plain, unweighted)
+
+
+@njit(cache=True, nogil=True)
+def _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
+    """``information`` in the plane."""
+    s2, none = scale_m * scale_m, (0.0,) * 3
+    upper, plain = (0.0,) * 6, (0.0,) * 6
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0 or weight[i] == 0.0:
+            continue
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        upper, _ = _plus_in_plane(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
+        plain, _ = _plus_in_plane(plain, none, weight[i], shape, normal, moved, residual, along)
     _unfold(upper, H)
     _unfold(plain, unweighted)
 
@@ -197,11 +235,13 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
         while slots[slot] >= 0 and slots[slot] != voxel:
             slot = (slot + 1) & (size - 1)
         slots[slot] = voxel
-        cell = voxels.cells[voxel]
-        px, py, pz, ex, ey, ez, along, r2 = _moved(cell, T, points, i, origin)
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
         w = weight[i] * ratio * ratio
-        _, gradient = _plus(no_upper, none, w, cell, px, py, pz, ex, ey, ez, along)
+        _, gradient = _plus(no_upper, none, w, shape, normal, moved, residual, along)
         for m in range(6):
             sums[slot, m] += gradient[m]
     spread = np.zeros((6, 6))
@@ -223,7 +263,8 @@ def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
         if voxel < 0:
             continue
         x, y, z = move(T, points, i)
-        r2 = weight[i] * _residual(voxels.cells[voxel], x, y, z)[4]
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        r2 = weight[i] * _residual(shape, q, normal, x, y, z)[2]
         ratio = s2 / (s2 + r2)
         cost += 0.5 * r2 * ratio
         total_weight += weight[i] * ratio * ratio
@@ -232,158 +273,55 @@ def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
 
 
 @njit(cache=True, inline="always")
-def _add(H, b, w, cell, px, py, pz, ex, ey, ez, along, planar: bool):
-    """One correspondence of weight w, by the shape of its voxel."""
-    nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
-    shape = cell[SHAPE]
-    if planar:
-        _add_2d(H, b, w, px, py, ex, ey, nx, ny, shape == PLANE)
-    elif shape == PLANE:
-        _add_plane(H, b, w, px, py, pz, nx, ny, nz, along)
-    else:
-        _add_point(H, b, w, px, py, pz, ex, ey, ez, nx, ny, nz, shape == LINE)
-
-
-@njit(cache=True, inline="always")
-def _moved(cell, T, points, i: int, origin):
-    """Point i moved by T, from the origin, and its ``_residual``."""
-    x, y, z = move(T, points, i)
-    ex, ey, ez, along, r2 = _residual(cell, x, y, z)
-    return x - origin[0], y - origin[1], z - origin[2], ex, ey, ez, along, r2
-
-
-@njit(cache=True, inline="always")
-def _residual(cell, x, y, z):
+def _residual(shape, q, normal, x, y, z):
     """Residual vector (3) of a point, its offset along the voxel's direction, and its squared length."""
-    ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
-    nx, ny, nz = cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2]
+    (qx, qy, qz), (nx, ny, nz) = q, normal
+    ex, ey, ez = x - qx, y - qy, z - qz
     along = nx * ex + ny * ey + nz * ez
-    if cell[SHAPE] == PLANE:
-        return along * nx, along * ny, along * nz, along, along * along
-    if cell[SHAPE] == LINE:
+    if shape == PLANE:
+        return (along * nx, along * ny, along * nz), along, along * along
+    if shape == LINE:
         ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
-    return ex, ey, ez, along, ex * ex + ey * ey + ez * ez
-
-
-@njit(cache=True, inline="always")
-def _add_2d(H, b, w, px, py, ex, ey, nx, ny, plane: bool):
-    """Point-to-line: J = [n, p × n]; point-to-point: J = [I, (−p_y, p_x)ᵀ]."""
-    if plane:
-        turn = px * ny - py * nx
-        r = nx * ex + ny * ey
-        H[0, 0] += w * nx * nx
-        H[0, 1] += w * nx * ny
-        H[0, 2] += w * nx * turn
-        H[1, 1] += w * ny * ny
-        H[1, 2] += w * ny * turn
-        H[2, 2] += w * turn * turn
-        b[0] += w * nx * r
-        b[1] += w * ny * r
-        b[2] += w * turn * r
-    else:
-        H[0, 0] += w
-        H[1, 1] += w
-        H[0, 2] -= w * py
-        H[1, 2] += w * px
-        H[2, 2] += w * (px * px + py * py)
-        b[0] += w * ex
-        b[1] += w * ey
-        b[2] += w * (px * ey - py * ex)
-
-
-@njit(cache=True, inline="always")
-def _add_plane(H, b, w, px, py, pz, nx, ny, nz, r):
-    """One residual: J = [n, p × n], upper triangle."""
-    cx, cy, cz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
-    wx, wy, wz = w * nx, w * ny, w * nz
-    H[0, 0] += wx * nx
-    H[0, 1] += wx * ny
-    H[0, 2] += wx * nz
-    H[0, 3] += wx * cx
-    H[0, 4] += wx * cy
-    H[0, 5] += wx * cz
-    H[1, 1] += wy * ny
-    H[1, 2] += wy * nz
-    H[1, 3] += wy * cx
-    H[1, 4] += wy * cy
-    H[1, 5] += wy * cz
-    H[2, 2] += wz * nz
-    H[2, 3] += wz * cx
-    H[2, 4] += wz * cy
-    H[2, 5] += wz * cz
-    H[3, 3] += w * cx * cx
-    H[3, 4] += w * cx * cy
-    H[3, 5] += w * cx * cz
-    H[4, 4] += w * cy * cy
-    H[4, 5] += w * cy * cz
-    H[5, 5] += w * cz * cz
-    r *= w
-    b[0] += r * nx
-    b[1] += r * ny
-    b[2] += r * nz
-    b[3] += r * cx
-    b[4] += r * cy
-    b[5] += r * cz
+    return (ex, ey, ez), along, ex * ex + ey * ey + ez * ez
 
 
 @njit(cache=True, nogil=True)
-def _add_point(H, b, w, px, py, pz, ex, ey, ez, vx, vy, vz, line: bool):
-    """Three residuals, J = P [I, −p×], with P = I on a point shape and P = I − vvᵀ across a line."""
-    H[0, 0] += w
-    H[1, 1] += w
-    H[2, 2] += w
-    H[0, 4] += w * pz
-    H[0, 5] -= w * py
-    H[1, 3] -= w * pz
-    H[1, 5] += w * px
-    H[2, 3] += w * py
-    H[2, 4] -= w * px
-    H[3, 3] += w * (py * py + pz * pz)
-    H[4, 4] += w * (px * px + pz * pz)
-    H[5, 5] += w * (px * px + py * py)
-    H[3, 4] -= w * px * py
-    H[3, 5] -= w * px * pz
-    H[4, 5] -= w * py * pz
-    b[0] += w * ex
-    b[1] += w * ey
-    b[2] += w * ez
-    b[3] += w * (py * ez - pz * ey)
-    b[4] += w * (pz * ex - px * ez)
-    b[5] += w * (px * ey - py * ex)
-    if line:
-        _add_plane(H, b, -w, px, py, pz, vx, vy, vz, 0.0)
-
-
-@njit(cache=True, nogil=True)
-def _add_curvature(H, w, px, py, pz, ex, ey, ez, planar: bool):
-    """Second derivative of eᵀ exp(ξ) p at ξ = 0.
+def _add_curvature(voxels, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H):
+    """Add the second derivatives of eᵀ exp(ξ) p at ξ = 0 to H (k, k), e the residual of each correspondence.
 
     exp(ξ) p = p + φ × p + ρ + ½ φ × (φ × p) + ½ φ × ρ + …, so that the blocks are
         ½(e pᵀ + p eᵀ) − (eᵀp) I for (φ, φ), in 2D −eᵀp, and ½ φᵀ(ρ × e) for (ρ, φ).
     """
-    dot = ex * px + ey * py + ez * pz
-    half = 0.5 * w
-    if planar:
-        H[2, 2] -= w * dot
-        H[0, 2] += half * ey
-        H[1, 2] -= half * ex
-        return
-    H[0, 4] -= half * ez
-    H[0, 5] += half * ey
-    H[1, 3] += half * ez
-    H[1, 5] -= half * ex
-    H[2, 3] -= half * ey
-    H[2, 4] += half * ex
-    H[3, 3] += w * (ex * px - dot)
-    H[4, 4] += w * (ey * py - dot)
-    H[5, 5] += w * (ez * pz - dot)
-    H[3, 4] += half * (ex * py + ey * px)
-    H[3, 5] += half * (ex * pz + ez * px)
-    H[4, 5] += half * (ey * pz + ez * py)
-
-
-@njit(cache=True, inline="always")
-def _mirror(H):
+    s2 = scale_m * scale_m
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0:
+            continue
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        (ex, ey, ez), _, r2 = _residual(shape, q, normal, x, y, z)
+        px, py, pz = x - origin[0], y - origin[1], z - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        w = curvature * weight[i] * ratio * ratio
+        dot = ex * px + ey * py + ez * pz
+        half = 0.5 * w
+        if H.shape[0] == 3:
+            H[2, 2] -= w * dot
+            H[0, 2] += half * ey
+            H[1, 2] -= half * ex
+            continue
+        H[0, 4] -= half * ez
+        H[0, 5] += half * ey
+        H[1, 3] += half * ez
+        H[1, 5] -= half * ex
+        H[2, 3] -= half * ey
+        H[2, 4] += half * ex
+        H[3, 3] += w * (ex * px - dot)
+        H[4, 4] += w * (ey * py - dot)
+        H[5, 5] += w * (ez * pz - dot)
+        H[3, 4] += half * (ex * py + ey * px)
+        H[3, 5] += half * (ex * pz + ez * px)
+        H[4, 5] += half * (ey * pz + ez * py)
     for row in range(1, H.shape[0]):
         for column in range(row):
             H[row, column] = H[column, row]

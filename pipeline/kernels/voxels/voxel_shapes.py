@@ -105,12 +105,22 @@ def move(T, points, i: int):
     )
 
 
+@njit(cache=True, inline="always")
+def shape_of(cells, voxel: int):
+    """Shape of a voxel, its mean and its direction.
+
+    As numbers: where a function takes a row of ``cells``, references to it are counted at every point.
+    """
+    q = cells[voxel, 0], cells[voxel, 1], cells[voxel, 2]
+    normal = cells[voxel, DIRECTION], cells[voxel, DIRECTION + 1], cells[voxel, DIRECTION + 2]
+    return cells[voxel, SHAPE], q, normal
+
+
 @njit(cache=True, nogil=True)
 def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: int):
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
     for voxel in range(voxels.used[0]):
-        cell = voxels.cells[voxel]
-        dx, dy, dz = cell[0] - x, cell[1] - y, cell[2] - z
+        dx, dy, dz = voxels.cells[voxel, 0] - x, voxels.cells[voxel, 1] - y, voxels.cells[voxel, 2] - z
         is_old = voxels.history[voxel, SEEN] < oldest_tick
         if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
@@ -118,7 +128,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
         for k in range(voxels.moments.shape[1]):
             kept.moments[new, k] = voxels.moments[voxel, k]
         for k in range(CELL):
-            kept.cells[new, k] = cell[k]
+            kept.cells[new, k] = voxels.cells[voxel, k]
         for k in range(voxels.history.shape[1]):
             kept.history[new, k] = voxels.history[voxel, k]
 
@@ -145,17 +155,17 @@ def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
     x -= (ix + 0.5) * voxels.size_m
     y -= (iy + 0.5) * voxels.size_m
     z -= (iz + 0.5) * voxels.size_m
-    m = voxels.moments[voxel]
-    m[0] += 1.0
-    m[1] += x
-    m[2] += y
-    m[3] += z
-    m[4] += x * x
-    m[5] += x * y
-    m[6] += x * z
-    m[7] += y * y
-    m[8] += y * z
-    m[9] += z * z
+    moments = voxels.moments
+    moments[voxel, 0] += 1.0
+    moments[voxel, 1] += x
+    moments[voxel, 2] += y
+    moments[voxel, 3] += z
+    moments[voxel, 4] += x * x
+    moments[voxel, 5] += x * y
+    moments[voxel, 6] += x * z
+    moments[voxel, 7] += y * y
+    moments[voxel, 8] += y * z
+    moments[voxel, 9] += z * z
 
 
 @njit(cache=True, nogil=True)
@@ -166,16 +176,14 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     lidar stands still leaves many points and no surface.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
-    m = voxels.moments[voxel]
-    size = voxels.size_m
-    cell = voxels.cells[voxel]
+    m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
     cell[0] = (ix + 0.5) * size + m[1] / m[0]
     cell[1] = (iy + 0.5) * size + m[2] / m[0]
     cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
-    if m[0] >= alone and _fit_shape(m, dimension, cell) >= (_BROAD * size) ** 2:
-        return
-    _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
-    _fit_shape(sums, dimension, cell)
+    width2 = _fit_shape(m, dimension, cell) if m[0] >= alone else 0.0
+    if width2 < (_BROAD * size) ** 2:
+        _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
+        _fit_shape(sums, dimension, cell)
 
 
 @njit(cache=True, inline="always")
