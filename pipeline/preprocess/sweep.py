@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels.voxels import downsample as kernels
+
+_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling, larger ones are not kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class Sweep:
 
     def downsampled(self, voxel_m: float) -> Sweep:
         """The first point of every voxel of this size."""
-        chosen = _first_per_voxel(self.points, voxel_m, 0.0, np.inf)
+        chosen = first_per_voxel(self.points, voxel_m, 0.0, np.inf)
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s
         return Sweep(_gather(self.points, chosen), times_s, self.middle_s)
 
@@ -64,7 +67,7 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
     scale : of the voxels, 1 for ``preprocess.map_voxel_m``
     """
     voxel_m = scale * config.map_voxel_m
-    chosen = _first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
+    chosen = first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
     points = _gather(scan.points, chosen)
     if not config.deskew or not len(scan.times_s):
         return Sweep(points, np.empty(0), 0.0)
@@ -74,14 +77,36 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
 
 def downsample(points: Points, voxel_m: float) -> Points:
     """The first point of every voxel."""
-    return _gather(points, _first_per_voxel(points, voxel_m, 0.0, np.inf))
+    return _gather(points, first_per_voxel(points, voxel_m, 0.0, np.inf))
 
 
-def _first_per_voxel(
+def first_per_voxel(
     points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
 ) -> NDArray[np.int32]:
-    chosen = np.empty(len(points), np.int32)
-    return chosen[: kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, chosen)]
+    """Indices (M,) of the first point (N, d) in each voxel, near and far points left out."""
+    table, chosen = _scratch.room(len(points))
+    count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
+    return chosen[:count].copy()
+
+
+class _Scratch(threading.local):
+    """Arrays of each thread, used again and again: to get them anew may take longer than what fills them."""
+
+    def __init__(self) -> None:
+        self.table = np.empty(_LEAST_SLOTS, np.int64)
+        self.chosen = np.empty(_LEAST_SLOTS // 2, np.int32)
+
+    def room(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Table and indices to downsample so many points."""
+        slots = max(1 << max(2 * count - 1, 0).bit_length(), _LEAST_SLOTS)
+        if slots > _MOST_SLOTS:
+            return np.empty(slots, np.int64), np.empty(count, np.int32)
+        if slots > len(self.table):
+            self.table, self.chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
+        return self.table[:slots], self.chosen
+
+
+_scratch = _Scratch()
 
 
 def _gather(points: NDArray[np.floating], chosen: NDArray[np.int32]) -> Points:

@@ -318,7 +318,7 @@ def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
 def test_downsampling_keeps_the_first_point_of_each_voxel_in_range(dimension, dtype):
     points = some_points(dimension).astype(dtype)
     chosen = np.empty(len(points), np.int32)
-    count = downsample.first_per_voxel(points, 0.4, 0.5, 3.0, chosen)
+    count = downsample.first_per_voxel(points, 0.4, 0.5, 3.0, np.arange(2048), chosen)
     assert chosen[:count].tolist() == naive.first_per_voxel(points.astype(float), 0.4, 0.5, 3.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
-from scanchain.kernels.voxels.downsample import first_per_voxel
+from scanchain.preprocess.sweep import first_per_voxel
 from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds.town import town
 
@@ -107,6 +107,5 @@ def _scans(drive, every_m, voxel_m, cylinders_at, boxes_at):
 
 def _thinned(T, points: Matrix, moves, voxel_m, dimension):
     points = np.ascontiguousarray(points[:, :dimension])
-    chosen = np.empty(len(points), np.int32)
-    chosen = chosen[: first_per_voxel(points, voxel_m, 0.0, 1e9, chosen)]
+    chosen = first_per_voxel(points, voxel_m, 0.0, 1e9)
     return LabeledScan(T if dimension == 3 else lie.flatten(T), points[chosen], moves[chosen])

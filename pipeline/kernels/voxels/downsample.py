@@ -10,17 +10,15 @@ _BLOCK = 2048  # points whose keys are computed at once, which the compiler make
 
 
 @njit(cache=True, nogil=True)
-def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, chosen):
+def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, table, chosen):
     """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
 
     points : (N, d) meters from the lidar; chosen : (N,) int32. Returns how many were chosen.
+    table : a power of two of slots, at least 2 N, whatever they hold
     Neighbors on a ring mostly share a voxel, so the last key is tried before the table.
     """
-    n = points.shape[0]
-    slots = 1024
-    while slots < 2 * n:
-        slots *= 2
-    table = np.full(slots, EMPTY)
+    n, slots = points.shape[0], table.size
+    table.fill(EMPTY)
     keys, held, rows = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int32)
     count = 0
     last = EMPTY
