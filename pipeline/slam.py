@@ -31,6 +31,7 @@ from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.graph.robust.losses import rejection_limit
 from scanchain.loops import LoopCloser, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
@@ -42,6 +43,11 @@ _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over o
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
+_UPDATE_GROWTH = 0.02  # the same of a large graph, for an optimization that keeps the verdicts
+_JUDGED_GROWTH = 1.0  # the same, for one that judges all closures anew
+_CONTRADICTING = 10.0  # times the χ² limit of a loop edge, from which on a closure contradicts a large graph
+_WORK_PER_KEYFRAME = 1e6  # most multiplications that factoring a large graph may take for each keyframe since
+_LAG = 200  # number of the last keyframes that follow new closures while a large graph waits for that
 _LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
 _TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
@@ -114,7 +120,10 @@ class Slam:
         self.joins_segment = False
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
         self.lost_scans = 0
-        self.optimized_at = 0
+        self.optimized_at = self.judged_at = 0
+        self.contradicting_closures = 0  # of the waiting ones
+        self.smoothed_at, self.new_closures = 0, 0
+        self.contradiction = _CONTRADICTING * rejection_limit(config.graph.robust_scale, self.graph.freedom)
         self.beside: BackgroundOptimization | None = None
         self.first = 0  # number of the first keyframe of this log
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
@@ -329,11 +338,14 @@ class Slam:
         expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
         error = lie.log(lie.between(Z_ij, expected))
         self.waiting_closures += 1
+        self.new_closures += 1
         self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         if self._joins_segment(closure):
             self._move_segment(closure)
-        return replace(closure, chi2_before=float(error @ information @ error))
+        chi2_before = float(error @ information @ error)
+        self.contradicting_closures += chi2_before > self.contradiction
+        return replace(closure, chi2_before=chi2_before)
 
     def _joins_segment(self, closure: Closure) -> bool:
         """True for the first closure of the newest segment to an older one."""
@@ -360,21 +372,42 @@ class Slam:
         is_urgent = self.joins_segment or (self.first > 0 and self.moves_map)
         enough = 0 if is_urgent else _OPTIMIZE_EVERY
         size = len(self.keyframes) - self.first
-        if not self.moves_map or (size >= _LARGE and not is_urgent):
+        is_large = size >= _LARGE
+        if is_large and not is_urgent:
+            enough = max(enough, _UPDATE_GROWTH * size, self.graph.work / _WORK_PER_KEYFRAME)
+        elif not self.moves_map:
             enough = max(enough, _GROWTH * size)
         if not self.waiting_closures or grown < enough or self.beside is not None:
+            if is_large:
+                self._smooth()
             return None
         rejection: OutlierRejection = "edges" if self.moves_map else "gnc"
-        if size < _LARGE or not self.is_live:
+        if is_large and not is_urgent:
+            rejection = self._rejection_of_large(size)
+        if not is_large or not self.is_live:
             return self._optimize(rejection)
         due = len(self.keyframes) + int(_TAKEN_AFTER * len(self.keyframes))
         self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)
-        self._begin_waiting()
+        self._begin_waiting(rejection)
         return None
+
+    def _smooth(self) -> None:
+        """Let the last keyframes of a large graph follow the closures that wait."""
+        if self.new_closures and len(self.keyframes) >= max(self.optimized_at, self.smoothed_at) + _OPTIMIZE_EVERY:
+            self.graph.follow(self.config.graph, len(self.keyframes) - _LAG)
+            self.smoothed_at, self.new_closures = len(self.keyframes), 0
+            self._follow_graph()
+
+    def _rejection_of_large(self, size: int) -> OutlierRejection:
+        """An update, or where the graph has grown much or most new closures disagree, a new verdict on all."""
+        disagree = self.contradicting_closures > 0.5 * self.waiting_closures
+        if len(self.keyframes) - self.judged_at < (_GROWTH if disagree else _JUDGED_GROWTH) * size:
+            return "retained"
+        return "edges" if disagree else "gnc"
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
-        self._begin_waiting()
+        self._begin_waiting(rejection)
         return state
 
     def _take_over(self, beside: BackgroundOptimization) -> GraphState:
@@ -384,9 +417,12 @@ class Slam:
         self._follow_graph()
         return self.graph.state()
 
-    def _begin_waiting(self) -> None:
+    def _begin_waiting(self, rejection: OutlierRejection) -> None:
         """All closures so far are taken into account: wait for the next."""
-        self.waiting_closures, self.moves_map, self.optimized_at = 0, False, len(self.keyframes)
+        if rejection != "retained":
+            self.judged_at = len(self.keyframes)
+        self.waiting_closures = self.contradicting_closures = self.new_closures = 0
+        self.moves_map, self.optimized_at = False, len(self.keyframes)
         self.joins_segment = False
         self._follow_graph()
 

@@ -14,6 +14,8 @@ from scanchain.data import Matrix
 from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.kernels.graph import between_se2, between_se3, scatter
 
+WASTE = 0.1  # share of edges without weight that is worth a new analysis
+
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
@@ -85,6 +87,13 @@ class BetweenProblem:
         sparse = self.restricted(kept)
         sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
         return sparse
+
+    def weighed(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
+        """As ``factored``; where few edges are left out, these weigh nothing, which takes no new analysis."""
+        if kept.mean() < 1.0 - WASTE:
+            return self.factored(poses, errors, kept)
+        self.cholesky.factorize(self.linearize(poses, errors, kept.astype(np.float64)).values)
+        return self
 
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""

@@ -14,7 +14,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.optimization import Solved, solve
 from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
-from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.graph.robust.graduation import Graduated
 from scanchain.graph.robust.groups import apart
 from scanchain.graph.robust.left_out import LeftOut
 from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
@@ -112,12 +112,12 @@ class Explainer:
         information: Matrix,
         is_loop: NDArray[np.bool_],
         config: GraphConfig,
-        rejection: OutlierRejection,
+        rejection: Graduated,
     ) -> None:
         """problem_of : the problem under an explanation; measured, information : of all edges, as added."""
         self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
         self._measured, self._information = measured, information
-        self._rejection: OutlierRejection = rejection
+        self._rejection: Graduated = rejection
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""

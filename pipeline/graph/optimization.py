@@ -12,8 +12,9 @@ from scanchain.data import GraphState, Matrix, fit_text
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.robust.graduation import OutlierRejection, minimize
+from scanchain.graph.robust.graduation import Graduated, minimize
 from scanchain.graph.robust.losses import robust_loss
+from scanchain.graph.robust.update import Since, update
 from scanchain.graph.solvers.minimizer import Minimizer, Minimum
 from scanchain.words import counted
 
@@ -85,10 +86,11 @@ def solve(
     is_loop: NDArray[np.bool_],
     config: GraphConfig,
     initialize: Initialization,
-    rejection: OutlierRejection,
+    rejection: Graduated | Since,
 ) -> Solved:
     """Minimize from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
 
+    rejection : ``Since`` for an update, under the truncated loss
     Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
     """
     outlier_free = config.robust == "none" or not is_loop.any()
@@ -97,7 +99,10 @@ def solve(
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     minimizer = Minimizer(problem, is_loop, config.optimizer)
-    minimum = minimize(minimizer, guess, loss, config.max_iterations, config.tolerance, rejection)
+    if isinstance(rejection, Since):
+        minimum = update(minimizer, minimizer.evaluate(guess, loss), loss, rejection)
+    else:
+        minimum = minimize(minimizer, guess, loss, config.max_iterations, config.tolerance, rejection)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0

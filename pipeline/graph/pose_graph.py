@@ -16,7 +16,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
-from scanchain.graph.explanation import Explainer, Explanation, corrections, odometry_of
+from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
@@ -28,10 +28,11 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization
+from scanchain.graph.optimization import Optimization, solve
 from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
 
@@ -57,6 +58,8 @@ class PoseGraph:
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
+        self.since = Since(0, 0)
+        self.work = 0.0  # multiplications that factoring H took in the last optimization
         self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
@@ -243,7 +246,8 @@ class PoseGraph:
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization
+        rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization;
+            "retained" is cheapest: it begins with the inliers at hand and judges new edges by these
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
@@ -252,15 +256,7 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            explainer = Explainer(
-                self._problem_of,
-                self._measurements.rows,
-                self._information.rows,
-                self.is_loop,
-                config,
-                rejection,
-            )
-            explained = explainer.solve(self._explanation, self.poses, initialize)
+            explained = self._explained(problem, config, initialize, rejection)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
         solved, minimum = explained.solved, explained.solved.minimum
@@ -268,6 +264,9 @@ class PoseGraph:
         self._poses.replace(solved.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
+        edges = len(self.edges)
+        self.since = Since(self.since.judged if rejection == "retained" else edges, edges)
+        self.work = self._problem.cholesky.work
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -279,6 +278,24 @@ class PoseGraph:
             initialization=solved.initialization,
             time_s=working_s() - begin,
         )
+
+    def follow(self, config: GraphConfig, first: int) -> None:
+        """Move the poses from this one on to the minimum near them, all others held (fixed-lag smoothing).
+
+        Of the loop edges to them those are in force whose χ² is small there, until all are optimized again.
+        """
+        chosen = np.flatnonzero((self.edges >= first).any(axis=1))
+        poses, ends = np.unique(self.edges[chosen], return_inverse=True)
+        edges, is_loop = ends.reshape(-1, 2), self.is_loop[chosen]
+        measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
+        is_held = (poses < first) | self.fixed[poses]
+        problem = BetweenProblem(edges, measured, information, is_held, self.is_point[poses])
+        solved = solve(problem, self.poses[poses], is_loop, config, "given", Since(len(chosen), len(chosen)))
+        moved, weight = self.poses.copy(), self.weight.copy()
+        moved[poses], weight[chosen] = solved.poses, solved.minimum.weights
+        self._poses.replace(moved)
+        self._weight.replace(weight)
+        self._changed()
 
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
@@ -293,6 +310,7 @@ class PoseGraph:
         result._is_loop.extend(self.is_loop)
         result._weight.extend(self.weight)
         result._fixed, result._explanation = set(self._fixed), self._explanation
+        result.since, result.work = self.since, self.work
         return result
 
     def take_over(self, optimized: PoseGraph) -> None:
@@ -302,6 +320,7 @@ class PoseGraph:
         self._poses.replace(np.concatenate([optimized.poses, T_new_old @ self.poses[count:]]))
         self._weight.replace(np.concatenate([optimized.weight, self.weight[edges:]]))
         self._explanation = optimized._explanation
+        self.since, self.work = optimized.since, optimized.work
         self._changed()
 
     def certify(self) -> Certificate:
@@ -381,6 +400,18 @@ class PoseGraph:
                 raise self._singular(error, problem) from error
             self._factor_is_now = True
         return problem
+
+    def _explained(
+        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: OutlierRejection
+    ) -> Explained:
+        """The minimum and the errors of odometry that explain loop edges, anew or as they are."""
+        if rejection == "retained" and config.robust == "truncated":
+            solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
+            return Explained(problem, solved, self._explanation)
+        measured, information = self._measurements.rows, self._information.rows
+        graduated = "gnc" if rejection == "retained" else rejection
+        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, graduated)
+        return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:
         """The least-squares problem; rebuilt after the graph has grown."""

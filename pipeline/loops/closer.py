@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LoopsConfig
-from scanchain.data import Closure, Keyframe, Proposal, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.graph.nearest import nearest_position
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.map_search import MapSearch
 from scanchain.loops.place_closer import PlaceCloser
@@ -127,23 +128,21 @@ class ProximityCloser:
 
         connected : (K,) keyframes in the component of the newest
         """
+        self.drift.measure(graph)
         old = self._old(keyframes)
         if not old:
             return ()
         T_world, newest = graph.poses, len(keyframes) - 1
-        uncertainty_m = self.drift.between(graph, newest, self.config.max_radius_m)[:old]
-        distance_m = np.linalg.norm(T_world[:old, :-1, -1] - T_world[-1, :-1, -1], axis=1)
-        near = np.flatnonzero(
-            connected[:old] & (distance_m <= np.maximum(uncertainty_m, self.config.min_radius_m))
-        )
-        if (near < self.of_map).any():
-            near = near[near < self.of_map]
-        if not len(near):
-            return ()
-        target = self.submaps.anchor_of(int(near[np.argmin(distance_m[near])]))
+        nearest, distance_m = nearest_position(T_world[:old], T_world[-1], connected[:old])
+        near = np.array([nearest])
+        if self.of_map or distance_m > self.config.min_radius_m:
+            near, _ = self._near(graph, old, connected)
+            if not len(near):
+                return ()
+        target = self.submaps.anchor_of(int(near[np.argmin(_distances_m(T_world, near))]))
         if self.search is None and target < self.of_map:
             kept = self.target_in_map
-            if kept in near and distance_m[kept] <= _KEPT_M * keyframes[kept].scale:
+            if kept in near and _distances_m(T_world, kept) <= _KEPT_M * keyframes[kept].scale:
                 target = kept
             self.target_in_map = target
         T_first = lie.between(T_world[target], T_world[-1])
@@ -153,11 +152,23 @@ class ProximityCloser:
         closure = verified.closure(target, newest)
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)
+        if not self.search.is_due(keyframes):
+            return (closure,)
+        near, uncertainty_m = self._near(graph, old, connected)
         found = self.search.find(keyframes, T_world, near, uncertainty_m)
         if found is None:
             return (closure,)
         searched = self.verifier.verify(keyframes, newest, found.anchor, found.T_anchor_source, newest=old - 1)
         return closure, searched.closure(found.anchor, newest, Proposal.PLACE)
+
+    def _near(
+        self, graph: PoseGraph, old: int, connected: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Older keyframes where the newest may be, of the map alone if any is; uncertainty (old,) of all."""
+        uncertainty_m = self.drift.between(graph, len(graph) - 1, self.config.max_radius_m)[:old]
+        reach_m = np.maximum(uncertainty_m, self.config.min_radius_m)
+        near = np.flatnonzero(connected[:old] & (_distances_m(graph.poses, slice(old)) <= reach_m))
+        return near[near < self.of_map] if (near < self.of_map).any() else near, uncertainty_m
 
     def _old(self, keyframes: Sequence[Keyframe]) -> int:
         """Number of the first keyframes that lie far enough back along the path to count as revisited."""
@@ -166,3 +177,8 @@ class ProximityCloser:
         while old > 0 and keyframes[old - 1].traveled_m > limit_m:
             old -= 1
         return old
+
+
+def _distances_m(T_world: Matrix, keyframes: NDArray[np.int64] | slice | int) -> NDArray[np.float64]:
+    """Distances of some keyframes from the newest."""
+    return np.linalg.norm(T_world[keyframes, :-1, -1] - T_world[-1, :-1, -1], axis=-1)

@@ -58,16 +58,8 @@ class Drift:
         self.drift = drift
         self.lengths = GrowingArray((), np.float64)
 
-    def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
-        """Uncertainty (K,) of each keyframe of the graph relative to one of them, meters, at most the limit."""
-        self._measure_new_edges(graph)
-        is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
-        lengths = np.where(is_open, self.lengths.rows, np.inf)
-        meters = shortest_paths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
-        meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift against each other
-        return np.minimum(self.drift * meters, limit_m)
-
-    def _measure_new_edges(self, graph: PoseGraph) -> None:
+    def measure(self, graph: PoseGraph) -> None:
+        """Take the lengths of the edges that are new since the last call, odometry corrected as it is now."""
         new = slice(len(self.lengths), len(graph.edges))
         d = graph.dimension
         measurements, information = graph.added_since(len(self.lengths))
@@ -76,3 +68,12 @@ class Drift:
         sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
         lengths = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.maximum(translations_m, sigmas_m / self.drift))
         self.lengths.extend(lengths)
+
+    def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:
+        """Uncertainty (K,) of each keyframe of the graph relative to one of them, meters, at most the limit."""
+        self.measure(graph)
+        is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
+        lengths = np.where(is_open, self.lengths.rows, np.inf)
+        meters = shortest_paths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
+        meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift against each other
+        return np.minimum(self.drift * meters, limit_m)

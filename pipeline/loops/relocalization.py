@@ -54,6 +54,10 @@ class PlanarSearch:
         self.submaps = submaps
         self.next_m = 0.0
 
+    def is_due(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True if the lidar has traveled far enough since the last search."""
+        return keyframes[-1].traveled_m >= self.next_m
+
     def find(
         self,
         keyframes: Sequence[Keyframe],
@@ -61,12 +65,12 @@ class PlanarSearch:
         near: NDArray[np.int64],
         uncertainty_m: NDArray[np.float64],
     ) -> Found | None:
-        """The best fit of the newest keyframe; None where there is none, an ambiguous one, or a search is not due.
+        """The best fit of the newest keyframe; None where there is none, an ambiguous one, or none is needed.
 
         near : older keyframes within reach; uncertainty_m : of the position of each of the older keyframes
         """
         source = keyframes[-1]
-        if uncertainty_m[near].max() <= _BASIN_M or source.traveled_m < self.next_m:
+        if uncertainty_m[near].max() <= _BASIN_M:
             return None
         self.next_m = source.traveled_m + _INTERVAL * float(uncertainty_m[near].max())
         anchors = self._anchors(near, T_world)

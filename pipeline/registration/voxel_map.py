@@ -11,6 +11,7 @@ from scanchain.kernels.voxels.voxel_shapes import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
+_LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 
 
@@ -29,7 +30,7 @@ class VoxelMap:
         self.config = config
         self.scale = checks.positive(scale, "scale")
         self.insertions = 0
-        self.voxels = _empty(1 << 12, scale * config.voxel_size_m)
+        self.voxels = _empty(_LEAST, scale * config.voxel_size_m)
 
     def __len__(self) -> int:
         return int(self.voxels.used[0])
@@ -56,8 +57,8 @@ class VoxelMap:
 
     def compact(self) -> None:
         """Free the memory that is there for further points."""
-        if _capacity(len(self)) < len(self.voxels.cells):
-            kept = _empty(len(self), self.voxels.size_m)
+        if _capacity(len(self), _LEAST_COMPACT) < len(self.voxels.cells):
+            kept = _empty(len(self), self.voxels.size_m, _LEAST_COMPACT)
             keep(self.voxels, kept, 0.0, 0.0, 0.0, np.inf, 0)
             self.voxels = kept
 
@@ -69,8 +70,8 @@ class VoxelMap:
         self.voxels = kept
 
 
-def _empty(room: int, voxel_size_m: float) -> Voxels:
-    capacity = _capacity(room)
+def _empty(room: int, voxel_size_m: float, least: int = _LEAST) -> Voxels:
+    capacity = _capacity(room, least)
     return Voxels(
         rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),
         keys=np.zeros(capacity, np.int64),
@@ -82,5 +83,5 @@ def _empty(room: int, voxel_size_m: float) -> Voxels:
     )
 
 
-def _capacity(room: int) -> int:
-    return 1 << max(12, int(np.ceil(np.log2(max(room, 1)))))
+def _capacity(room: int, least: int) -> int:
+    return 1 << int(np.ceil(np.log2(max(room, least))))

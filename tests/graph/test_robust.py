@@ -304,3 +304,57 @@ def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
     graph.add_edges(edges, measured, np.tile(np.diag(sigma**-2), (len(edges), 1, 1)), is_loop)
     assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10
     assert not graph.drift.any() and graph.slips == ()
+
+
+def extended(graph, whole, count):
+    """The graph with more poses of a whole one, up to so many, chained to its own, and with their edges."""
+    first, last = len(graph), whole.edges.max(axis=1)
+    T_new_old = lie.identity(2) if not first else graph.poses[-1] @ lie.inverse(whole.poses[first - 1])
+    for index in range(first, count):
+        graph.add_pose(lie.normalize(T_new_old @ whole.poses[index]), index)
+    new = np.flatnonzero((last >= first) & (last < count))
+    graph.add_edges(whole.edges[new], whole.measurements[new], whole.information[new], whole.is_loop[new])
+    return graph
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.1, 0), (0.43, 0), (0.43, 1)])
+def test_updates_of_a_growing_graph_reach_costs_as_low_as_graduations_of_all(share, seed):
+    whole, *_ = with_false_loops("intel", share, seed)
+    graph = extended(PoseGraph(2), whole, 900)
+    graph.optimize(GraphConfig(), initialize="given")
+    for count in range(950, len(whole), 150):
+        anew = extended(graph, whole, count).copy()
+        updated = graph.optimize(GraphConfig(), initialize="given", rejection="retained")
+        graduated = anew.optimize(GraphConfig(), initialize="given", rejection="gnc")
+        assert updated.cost_after < 1.02 * graduated.cost_after
+        assert updated.iterations <= min(9, graduated.iterations)
+
+
+def test_the_last_poses_follow_new_loops_as_if_all_others_were_fixed():
+    whole, *_ = with_false_loops("intel", 0.0)
+    graph = extended(PoseGraph(2), whole, 900)
+    graph.optimize(GraphConfig(), initialize="given")
+    anew, before = extended(graph, whole, 1000).copy(), graph.poses.copy()
+    graph.follow(GraphConfig(), 850)
+    for index in range(850):
+        anew.fix(index)
+    anew.optimize(GraphConfig(), initialize="given", rejection="gnc")
+    assert np.array_equal(graph.poses[:850], before[:850])
+    assert position_error_m(graph, anew) < 0.01 < np.linalg.norm(graph.poses[-1, :2, 2] - before[-1, :2, 2])
+    assert np.array_equal(graph.is_rejected, anew.is_rejected)
+
+
+@pytest.mark.parametrize(("off_m", "is_taken"), [(0.3, True), (30.0, False)])
+def test_an_update_takes_in_a_loop_as_far_off_as_odometry_may_be_and_no_farther(off_m, is_taken):
+    graph = PoseGraph(2)
+    for index in range(21):
+        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
+    for index in range(20):
+        graph.add_edge(index, index + 1, lie.pose_2d(1.0, 0.0, 0.0), 100.0 * np.eye(3))
+    graph.add_edge(0, 3, lie.pose_2d(3.0, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    graph.optimize(GraphConfig(), initialize="given", rejection="gnc")
+    graph.add_edge(0, 20, lie.pose_2d(20.0 + off_m, 0.0, 0.0), 1e4 * np.eye(3), is_loop=True)
+    answer = graph.optimize(GraphConfig(), initialize="given", rejection="retained")
+    assert graph.weight.tolist() == [1.0] * 21 + [float(is_taken)]
+    assert graph.poses[20, 0, 2] == pytest.approx(20.0 + is_taken * off_m, abs=0.01)
+    assert answer.cost_after < answer.chi2_before

@@ -6,6 +6,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.graph.nearest import nearest_position
 from scanchain.kernels.graph.shortest_paths import shortest_paths
 from scanchain.kernels.registration import optimizers
 from scanchain.kernels.registration.association import associate
@@ -341,6 +342,19 @@ def test_shortest_paths_equal_those_of_scipy(seed):
         dense[i, j] = dense[j, i] = min(dense[i, j], length)
     expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
     assert shortest_paths(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_nearest_position_is_that_of_a_search_through_all_that_are_chosen(dimension):
+    rng = np.random.default_rng(4)
+    poses = np.tile(np.eye(dimension + 1), (50, 1, 1))
+    poses[:, :-1, -1] = rng.normal(size=(50, dimension))
+    for count in (50, 5, 0):
+        chosen = np.isin(np.arange(50), rng.permutation(50)[:count])
+        distances_m = np.where(chosen, np.linalg.norm(poses[:, :-1, -1] - poses[7, :-1, -1], axis=1), np.inf)
+        nearest, distance_m = nearest_position(poses, poses[7], chosen)
+        assert distance_m == distances_m.min()
+        assert nearest == (np.argmin(distances_m) if count else -1)
 
 
 def test_an_edge_of_infinite_length_leads_nowhere():

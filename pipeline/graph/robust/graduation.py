@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import REJECTED_WEIGHT, Matrix
+from scanchain.graph.between import WASTE
 from scanchain.graph.edge_checks import is_connected
 from scanchain.graph.robust.groups import Contradiction, agreeing_groups
 from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
-OutlierRejection = Literal["gnc", "edges", "refined"]
+Graduated = Literal["gnc", "edges", "refined"]
+OutlierRejection = Literal[Graduated, "retained"]
 
-_WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
@@ -29,7 +30,7 @@ def minimize(
     loss: RobustLoss,
     max_iterations: int,
     tolerance: float,
-    rejection: OutlierRejection,
+    rejection: Graduated,
 ) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
@@ -49,9 +50,21 @@ def minimize(
     return replace(minimum, iterations=used + minimum.iterations)
 
 
+def settle(
+    minimizer: Minimizer, start: Evaluation, inliers: InlierSet, max_iterations: int, tolerance: float
+) -> Minimum:
+    """The minimum with these inliers."""
+    weights = minimizer.weights(start.chi2, inliers)
+    chosen = Focus(minimizer).on(weights)
+    kept = inliers.kept
+    inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
+    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
+    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
+
+
 def _graduate(minimizer: Minimizer, now: Evaluation, graduation: Graduation) -> tuple[Evaluation, RobustLoss, int]:
     """Follow the minimum from the convex loss to the loss itself, one step for each level."""
-    used, focus = 0, _Focus(minimizer)
+    used, focus = 0, Focus(minimizer)
     while not graduation.is_over(now.chi2[minimizer.loops]):
         loss = graduation.loss
         chosen = focus.on(minimizer.weights(now.chi2, loss))
@@ -84,7 +97,7 @@ def _settle_without_outliers(
     )
 
 
-class _Focus:
+class Focus:
     """Leaves out edges of weight zero, which fill in the factor for nothing: soon most of the wrong ones."""
 
     def __init__(self, minimizer: Minimizer) -> None:
@@ -97,7 +110,7 @@ class _Focus:
         """A minimizer of the edges with weight, (E,), and of hardly any other."""
         wanted = weights > 0.0
         wasted = 1.0 - wanted.sum() / self._kept.sum()
-        if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
+        if self._is_free and ((wanted & ~self._kept).any() or wasted > WASTE):
             self._kept, self._chosen = wanted, self._whole.restricted(wanted)
         return self._chosen
 
@@ -108,11 +121,11 @@ def _refine(
     loss: RobustLoss,
     max_iterations: int,
     tolerance: float,
-    rejection: OutlierRejection,
+    rejection: Graduated,
 ) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
-    minimum = _settle(minimizer, now, InlierSet(kept, nominal), max_iterations, tolerance)
+    minimum = settle(minimizer, now, InlierSet(kept, nominal), max_iterations, tolerance)
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
@@ -140,7 +153,7 @@ def _refine_edges(
         if share < _FEWEST or not (gain > 0.0).any():
             break
         inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
-        trial = _settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
+        trial = settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
         used = minimum.iterations + trial.iterations
         if not trial.estimate.cost < minimum.estimate.cost:
             minimum, share = replace(minimum, iterations=used), _FEWER * share
@@ -168,7 +181,7 @@ def _refine_groups(
         kept = minimum.weights > 0.5
         kept[group] ^= True
         inliers = InlierSet(kept[minimizer.loops], price)
-        trial = _settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
+        trial = settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
         against = _against(minimizer, trial, price)
         trial = _refine_edges(minimizer, trial, against, price, max_iterations, tolerance)
         used = minimum.iterations + trial.iterations
@@ -208,18 +221,6 @@ def _without(kept: NDArray[np.bool_], group: NDArray[np.int64]) -> NDArray[np.bo
     rest = kept.copy()
     rest[group] = False
     return rest
-
-
-def _settle(
-    minimizer: Minimizer, start: Evaluation, inliers: InlierSet, max_iterations: int, tolerance: float
-) -> Minimum:
-    """The minimum with these inliers."""
-    weights = minimizer.weights(start.chi2, inliers)
-    chosen = _Focus(minimizer).on(weights)
-    kept = inliers.kept
-    inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
-    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
-    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
 
 
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:

@@ -69,7 +69,7 @@ class Contradiction:
         self._problem = problem
         self._errors = problem.errors(poses)
         self._jacobians = problem.jacobians(poses, self._errors)
-        self._sparse = problem.factored(poses, self._errors, kept)
+        self._sparse = problem.weighed(poses, self._errors, kept)
 
     def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
         """The distance of the edges of a group, all of them kept or none."""

@@ -147,6 +147,11 @@ class SparseCholesky:
         pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
         return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
 
+    @property
+    def work(self) -> float:
+        """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
+        return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
+
     def factorize(self, values: NDArray[np.float64]) -> None:
         """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
         self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])

@@ -15,6 +15,7 @@ from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.update import Since
 from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.connectivity import Drift, Segments
@@ -71,7 +72,7 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        BackgroundOptimization, PointStore, StoredPoints,
+        Since, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
