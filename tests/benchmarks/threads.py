@@ -43,6 +43,7 @@ OURS = "plicp"
 METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
 WITH_THREADS = ("kiss-icp", "small-vgicp", "small-gicp")  # that have a setting of that name; others use all cores
 REPEATS, WARM_UP = 3, 3
+STYLES = ("-", "--", "-.", ":")
 RINGS, PERIOD_NS = 64, 100_000_000
 
 
@@ -102,19 +103,21 @@ def measured(path: Path, methods: list[str], counts: list[int], scans: int) -> l
 
 
 def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
-    """Milliseconds a scan over points, a line for each method and number of threads."""
+    """Milliseconds a scan over points: a color for each method, a line style for each number of threads."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
+    methods, counts = (list(dict.fromkeys(row[k] for row in rows)) for k in (0, 1))
     for method, count in dict.fromkeys((row[0], row[1]) for row in rows):
         chosen = [row for row in rows if row[:2] == (method, count)]
-        style = "-" if method == OURS else "--"
+        style = STYLES[counts.index(count) % len(STYLES)]
+        color, label = f"C{methods.index(method)}", f"{method}, {count}"
         axes.plot(
-            [r[2] for r in chosen], [1e3 * r[3] for r in chosen], style, marker="o", label=f"{method}, {count}"
+            [r[2] for r in chosen], [1e3 * r[3] for r in chosen], style, color=color, marker=".", label=label
         )
     axes.set(xscale="log", yscale="log", xlabel="points a scan", ylabel="ms a scan")
-    axes.legend(title="method, threads", fontsize="small")
+    figure.legend(title="method, threads", fontsize="small", loc="outside right center")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
 
@@ -138,7 +141,8 @@ def main() -> None:
             path = log if isinstance(log, Path) else Path(folder) / f"town_{log}.mcap"
             if path != log:
                 scans_of(path, int(log), arguments.scans)
-            rows += measured(path, arguments.methods, arguments.threads, arguments.scans)
+            seen = measured(path, arguments.methods, arguments.threads, arguments.scans)
+            rows += seen if path != log else []  # the picture is of one place
     if arguments.png:
         draw(arguments.png, rows)
 
