@@ -101,7 +101,7 @@ def run(
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
     collect_garbage_seldom()
-    from scanchain.api import open_recorder
+    from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.processes import leave_pandas_out
     from scanchain.runs.job import Job
@@ -128,7 +128,7 @@ def run(
         checkpoint_s=checkpoint,
         command=tuple(sys.argv),
     )
-    with Reporter(beside=ctx.obj is OWN_PROCESS) as reporter, Terminal("scans") as terminal:
+    with Reporter(write_report, beside=ctx.obj is OWN_PROCESS) as reporter, Terminal("scans") as terminal:
         finished = run_log(job, record, terminal, reporter.write)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     fails = finished.metrics.verdict.fails(strict=strict)

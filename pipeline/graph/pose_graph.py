@@ -404,7 +404,7 @@ class PoseGraph:
     def _explained(
         self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: OutlierRejection
     ) -> Explained:
-        """The minimum and the errors of odometry that explain loop edges, anew or as they are."""
+        """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
         if rejection == "retained" and config.robust == "truncated":
             solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
             return Explained(problem, solved, self._explanation)

@@ -134,9 +134,9 @@ class ProximityCloser:
             return ()
         T_world, newest = graph.poses, len(keyframes) - 1
         nearest, distance_m = nearest_position(T_world[:old], T_world[-1], connected[:old])
-        near = np.array([nearest])
+        near, uncertainty_m = np.array([nearest]), None
         if self.of_map or distance_m > self.config.min_radius_m:
-            near, _ = self._near(graph, old, connected)
+            near, uncertainty_m = self._near(graph, old, connected)
             if not len(near):
                 return ()
         target = self.submaps.anchor_of(int(near[np.argmin(_distances_m(T_world, near))]))
@@ -154,7 +154,8 @@ class ProximityCloser:
             return (closure,)
         if not self.search.is_due(keyframes):
             return (closure,)
-        near, uncertainty_m = self._near(graph, old, connected)
+        if uncertainty_m is None:
+            near, uncertainty_m = self._near(graph, old, connected)
         found = self.search.find(keyframes, T_world, near, uncertainty_m)
         if found is None:
             return (closure,)

@@ -60,6 +60,8 @@ class Drift:
 
     def measure(self, graph: PoseGraph) -> None:
         """Take the lengths of the edges that are new since the last call, odometry corrected as it is now."""
+        if len(self.lengths) == len(graph.edges):
+            return
         new = slice(len(self.lengths), len(graph.edges))
         d = graph.dimension
         measurements, information = graph.added_since(len(self.lengths))

@@ -90,7 +90,7 @@ def first_per_voxel(
 
 
 class _Scratch(threading.local):
-    """Arrays of each thread, used again and again: to get them anew may take longer than what fills them."""
+    """Arrays of each thread, reused: to allocate them for every scan may take longer than to fill them."""
 
     def __init__(self) -> None:
         self.table = np.empty(_LEAST_SLOTS, np.int64)

@@ -182,7 +182,7 @@ def test_a_report_drawn_beside_is_the_same_and_what_fails_there_is_raised_here(o
     monkeypatch.setenv(VARIABLE, "2")
     for is_killed in (False, True):
         (folder / "report.html").unlink()
-        with Reporter(beside=True) as reporter:
+        with Reporter(write_run_report, beside=True) as reporter:
             process = reporter._process
             assert process is not None
             if is_killed:
@@ -190,7 +190,7 @@ def test_a_report_drawn_beside_is_the_same_and_what_fails_there_is_raised_here(o
                 process.join()
             reporter.write(folder)
         assert (folder / "report.html").read_bytes() == page and not process.is_alive()
-    with Reporter(beside=True) as reporter, pytest.raises(FileNotFoundError, match="metrics"):
+    with Reporter(write_run_report, beside=True) as reporter, pytest.raises(FileNotFoundError, match="metrics"):
         reporter.write(tmp_path)
 
 

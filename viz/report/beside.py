@@ -6,6 +6,7 @@ import gc
 import multiprocessing
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -25,10 +26,12 @@ class Reporter:
     The process is a copy of this one, so that it need not import the same once more, and ends with this one,
     however that ends. On one core, and where processes cannot be copied, the report is drawn in this one.
 
+    draw : adds report.html to a run directory
     beside : False to draw it in this process, where it is not our own
     """
 
-    def __init__(self, *, beside: bool) -> None:
+    def __init__(self, draw: Callable[[Path], None], *, beside: bool) -> None:
+        self._draw = draw
         self._is_beside = beside and sys.platform == "linux" and threads() > 1
         self._process: BaseProcess | None = None
         self._pipe: Any = None  # a Connection, by another name on Windows
@@ -37,7 +40,7 @@ class Reporter:
         if self._is_beside:
             self._pipe, theirs = multiprocessing.Pipe()
             context = multiprocessing.get_context("fork")
-            self._process = context.Process(target=_serve, args=(theirs, self._pipe), daemon=True)
+            self._process = context.Process(target=_serve, args=(self._draw, theirs, self._pipe), daemon=True)
             self._process.start()
             theirs.close()
         return self
@@ -53,17 +56,17 @@ class Reporter:
     def write(self, directory: Path) -> None:
         """Add report.html to a run directory. Raises what drawing it raised."""
         if self._pipe is None:
-            return _write(directory)
+            return self._draw(directory)
         try:
             self._pipe.send(directory)
             error = self._pipe.recv()
         except (EOFError, OSError):  # the process was killed, for its memory for example
-            return _write(directory)
+            return self._draw(directory)
         if error is not None:
             raise error
 
 
-def _serve(pipe: Connection, other_end: Connection) -> None:
+def _serve(draw: Callable[[Path], None], pipe: Connection, other_end: Connection) -> None:
     """Draw the report once its directory is known; the end of the run before that ends this, too."""
     other_end.close()
     gc.disable()  # imports make much that lasts, and this process ends soon
@@ -76,7 +79,7 @@ def _serve(pipe: Connection, other_end: Connection) -> None:
         directory = pipe.recv()
         error = None
         try:
-            _write(directory)
+            draw(directory)
         except Exception as raised:
             error = raised
         pipe.send(error)
@@ -92,9 +95,3 @@ def _load() -> None:
 
     Trajectory(np.zeros(1, np.int64), np.eye(4)[None])
     figure.load()
-
-
-def _write(directory: Path) -> None:
-    from scanchain.viz.report.run import write_run_report
-
-    write_run_report(directory)
