@@ -68,10 +68,10 @@ def trajectory_section(
     low, high = surroundings(*figures.frame([trajectory], truth), [points])
     drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     above = "seen from above; dark is low, bright is high."
-    over_map = path_over_map("path", points, trajectory.positions, lines, low, high)
+    over_map = path_over_map(points, trajectory.positions, lines, low, high)
     drawings = (
         Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
-        *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture("map", points, low, high)),)),
+        *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
         Drawing(
             "Interactive map",
             f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
