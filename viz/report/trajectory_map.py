@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -128,8 +127,9 @@ def _states(tables: Tables) -> NDArray[np.int64]:
     if tables.closures is None or not tables.closures.num_rows:
         return marks
     keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
-    chosen = tables.closures.filter(pc.field("rejected_by") == BACK_END)
-    for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
+    is_rejected = np.array(tables.closures["rejected_by"].to_pylist()) == BACK_END
+    ends = np.stack([tables.closures[name].to_numpy() for name in ("target_scan", "source_scan")])
+    for scan in np.unique(ends[:, is_rejected]).tolist():
         end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
         stretch = marks[scan:end]
         stretch[stretch < 0] = names.index(_DISPUTED)
