@@ -78,6 +78,9 @@ class Kernel(_Quiet):
         """Compile the kernel as kernels call it, for such arguments."""
         self.inner.compile(tuple(map(numba.typeof, arguments)))
 
+    def __reduce__(self) -> str:
+        return self.__qualname__  # pickled by its name
+
     @property
     def _numba_type_(self) -> types.Dispatcher:
         return types.Dispatcher(self.inner)

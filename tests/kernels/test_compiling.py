@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -253,6 +254,11 @@ def body(kernel):
     code = kernel.inspect_llvm(kernel.signatures[0])
     begin = code.index("define linkonce_odr i32")
     return code[begin : code.index("\n}", begin)]
+
+
+def test_a_kernel_is_pickled_by_its_name():
+    assert pickle.loads(pickle.dumps(align)) is align
+    assert len(pickle.dumps(align)) < 100
 
 
 def test_what_was_compiled_for_kernels_becomes_a_kernel_for_python(tmp_path):
