@@ -3,7 +3,7 @@
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keep_valid(x, y, z, low_square: float, high_square: float, points, kept):
     """Copy the points whose squared range is finite, above low_square and at most high_square, in their order.
 

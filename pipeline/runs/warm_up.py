@@ -1,7 +1,7 @@
-"""``python -m scanchain.runs.warm_up 3 fit results``: compile parts of what a run needs, with synthetic scans.
+"""``python -m scanchain.runs.warm_up 3 fit maps``: compile parts of what a run needs, with synthetic scans.
 
 A run whose kernels have to be compiled first starts this beside itself, on cores that it does not need yet; what
-one process is compiling the others wait for.
+one process is compiling the others wait for. Each part imports what it needs, as it is to begin at once.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ import gc
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Points, Pose, Prior, Scan, State
+from scanchain.config import Config
+from scanchain.data import Keyframe, Matrix, Points, Pose, Prior, Scan, State
 from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
-from scanchain.kernels.registration.observability import Spectrum, add_signals, agreement
+from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.odometry import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.registration import VoxelMap
 from scanchain.registration.correlative import CorrelativeMap, Window
 from scanchain.registration.plicp import settings_of
-from scanchain.runs.results import cloud_of, grid_of
 from scanchain.settings import load_settings
-from scanchain.slam import Slam
 
 _SCANS = 3
 _STEP_M = 1.0
@@ -35,7 +35,7 @@ _POINTS = 100
 def fit(dimension: int) -> None:
     """Compile the alignment of points to a voxel map, the largest of the kernels."""
     problem, T = _problem(dimension)
-    align(problem, T, np.zeros(lie.twist_size(T)), 1.0, 1.0)
+    align.compile_inner(problem, T, np.zeros(lie.twist_size(T)), 1.0, 1.0)
 
 
 def judge(dimension: int) -> None:
@@ -45,11 +45,11 @@ def judge(dimension: int) -> None:
     if dimension == 2:
         grid = CorrelativeMap(VoxelMap(2, load_settings(2).config.local_map), T)
         grid.search(np.ones((1, 2)), T, Window(0.0, 0.0, 1.0, 1.0, answers=1))
-    gradient_spread(problem.voxels, problem.points, T, problem.origin, problem.correspondence, problem.weight, 1.0)
-    agreement(np.eye(k), np.eye(k), 1.0)
-    spectrum = Spectrum(np.ones(k), np.ones(k), np.eye(k), np.ones(k))
-    add_signals(problem, T, spectrum)
-    fit_at(problem, T, Fit(np.eye(k), np.eye(k), 0.0, 0.0, 0.0, 0, 0, 0))
+    correspondences = problem.correspondence, problem.weight
+    gradient_spread.compile_inner(problem.voxels, problem.points, T, problem.origin, *correspondences, 1.0)
+    agreement.compile_inner(np.eye(k), np.eye(k), 1.0)
+    signal_along.compile_inner(problem, T, np.zeros(k))
+    fit_at.compile_inner(problem, T, Fit(np.eye(k), np.eye(k), 0.0, 0.0, 0.0, 0, 0, 0))
 
 
 def _problem(dimension: int) -> tuple[Problem, Pose]:
@@ -71,44 +71,66 @@ def _problem(dimension: int) -> tuple[Problem, Pose]:
 
 
 def graph(dimension: int) -> None:
-    """Compile what the errors of a pose graph take: its linearization and the factor of that."""
-    slam = _straight_on(dimension)
+    """Compile the optimization of a pose graph and the errors of its poses."""
+    from scanchain.slam import Slam
+
+    slam = Slam(load_settings(dimension).config, lie.identity(dimension))
+    for keyframe in _straight_on(dimension):
+        slam.place(_located(keyframe, slam.config))
     slam.graph.position_errors(1)
+    slam.finish()
     slam.points.close()
 
 
-def results(dimension: int) -> None:
-    """Compile what follows the odometry: the end of the pose graph, and both maps."""
-    slam = _straight_on(dimension)
-    result = slam.finish()
-    cloud_of(result, slam.config)
-    grid_of(result, slam.config.maps)
-    slam.points.close()
+def maps(dimension: int) -> None:
+    """Compile what draws both maps."""
+    from scanchain.runs import results
 
-
-def _straight_on(dimension: int) -> Slam:
-    """SLAM after a few scans of a lidar that drove straight on."""
+    keyframes = _straight_on(dimension)
+    driven = _Driven(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
     config = load_settings(dimension).config
-    slam = Slam(config, lie.identity(dimension))
+    results.cloud_of(driven, config)
+    results.grid_of(driven, config.maps)
+
+
+class _Driven(NamedTuple):
+    keyframes: Sequence[Keyframe]
+    T_world_keyframes: Matrix
+
+
+class _Held(NamedTuple):
+    held: Points
+
+    def read(self) -> Points:
+        return self.held
+
+
+def _straight_on(dimension: int) -> list[Keyframe]:
+    """Keyframes of a lidar that drove straight on."""
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
     points[:, 2:] *= 0.02  # into the slice of which the grid is drawn
-    for index in range(_SCANS):
-        T_odom_lidar = lie.identity(dimension)
+    poses = [lie.identity(dimension) for _ in range(_SCANS)]
+    for index, T_odom_lidar in enumerate(poses):
         T_odom_lidar[0, -1] = _STEP_M * index
-        slam.place(_located(index, points, T_odom_lidar, slam))
-    return slam
+    return [
+        Keyframe(index, index, index, _Held(points), T_odom_lidar, _STEP_M * index)
+        for index, T_odom_lidar in enumerate(poses)
+    ]
 
 
-def _located(index: int, points: Points, T_odom_lidar: Pose, slam: Slam) -> Located:
-    scan = Scan(index, index, index, points.astype(np.float32), np.empty(0, np.float32), 0, None)
-    match = first_match(T_odom_lidar, points, slam.config.matching)
-    prior = Prior(T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
-    tracked = Tracked(scan, points, points, T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
+def _located(keyframe: Keyframe, config: Config) -> Located:
+    points = keyframe.points
+    scan = Scan(
+        keyframe.index, keyframe.index, keyframe.index, points.astype(np.float32), np.empty(0, np.float32), 0, None
+    )
+    match = first_match(keyframe.T_odom_lidar, points, config.matching)
+    prior = Prior(keyframe.T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
+    tracked = Tracked(scan, points, points, keyframe.T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
     return Located(tracked, True, 1.0, points, match.information, points)
 
 
 _PARTS: Mapping[str, Callable[[int], None]] = MappingProxyType(
-    {"fit": fit, "judge": judge, "results": results, "graph": graph}
+    {"fit": fit, "judge": judge, "graph": graph, "maps": maps}
 )
 
 

@@ -8,7 +8,7 @@ _SWEEPS = 30  # largest number of sweeps of rotations; a handful does
 _BESIDE = 1e-16  # largest off-diagonal entry as a share of the diagonal
 
 
-@njit(cache=True)
+@njit()
 def normal_2d(cxx: float, cxy: float, cyy: float):
     """Eigenvalues (small, large) of [[cxx, cxy], [cxy, cyy]] and the unit eigenvector of the small one."""
     half_trace = 0.5 * (cxx + cyy)
@@ -18,7 +18,7 @@ def normal_2d(cxx: float, cxy: float, cyy: float):
     return half_trace - root, half_trace + root, -math.sin(angle), math.cos(angle)
 
 
-@njit(cache=True)
+@njit()
 def eigenvalues_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float):
     """Eigenvalues of a symmetric 3×3 matrix, ascending, by the trigonometric formula (Smith 1961)."""
     off = xy * xy + xz * xz + yz * yz
@@ -36,7 +36,7 @@ def eigenvalues_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: fl
     return small, 3.0 * mean - small - large, large
 
 
-@njit(cache=True)
+@njit()
 def eigenvector_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, eigenvalue: float):
     """Unit eigenvector of a simple eigenvalue: the longest cross product of two rows of A − λI.
 
@@ -60,7 +60,7 @@ def eigenvector_3d(xx: float, xy: float, xz: float, yy: float, yz: float, zz: fl
     return vx * scale, vy * scale, vz * scale
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def eigensystem(A, values, vectors):
     """Eigenvalues, ascending, of a small symmetric matrix A (k, k) and its unit eigenvectors, a column each.
 
@@ -84,7 +84,7 @@ def eigensystem(A, values, vectors):
     _sort_columns(values, vectors)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _rotate_pair(A, vectors, p: int, q: int):
     """Turn axes p and q so that A[p, q] becomes zero: t = tan of the angle, the smaller root of t² + 2τt = 1."""
     tau = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
@@ -101,7 +101,7 @@ def _rotate_pair(A, vectors, p: int, q: int):
         A[p, i], A[q, i] = c * A[p, i] - s * A[q, i], s * A[p, i] + c * A[q, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sort_columns(values, vectors):
     """Bring eigenvalues into ascending order, their vectors along."""
     for i in range(1, values.shape[0]):

@@ -9,7 +9,7 @@ from scanchain.kernels.compiling import njit
 _SMALL = 1e-8  # sine of half the angle, below which the series is exact
 
 
-@njit(cache=True)
+@njit()
 def quaternions(R, out):
     """Write unit quaternions xyzw, w ≥ 0, of rotations (N, 3, 3) to ``out`` (N, 4).
 
@@ -20,21 +20,21 @@ def quaternions(R, out):
         _quaternion(R[n], out[n])
 
 
-@njit(cache=True)
+@njit()
 def rotation_vectors(R, out):
     """Write the rotation vectors, angles in [0, π], of rotations (N, 3, 3) to ``out`` (N, 3)."""
     for n in range(R.shape[0]):
         _rotation_vector(R[n], out[n])
 
 
-@njit(cache=True)
+@njit()
 def twists(T, out):
     """Write the twists (ρ, φ) of poses (N, 4, 4) to ``out`` (N, 6)."""
     for n in range(T.shape[0]):
         twist_3d(T[n], out[n])
 
 
-@njit(cache=True)
+@njit()
 def twist_3d(T, out):
     """Write the twist (ρ, φ) of a pose (4, 4) to ``out`` (6,): φ = log R, ρ = V(φ)⁻¹ t.
 
@@ -55,7 +55,7 @@ def twist_3d(T, out):
     out[2] = w - 0.5 * cw + e * (x * cv - y * cu)
 
 
-@njit(cache=True)
+@njit()
 def _rotation_vector(R, out):
     """Write the rotation vector of R, whose first three rows and columns are a rotation, to ``out`` (3,)."""
     quat = np.empty(4)
@@ -66,7 +66,7 @@ def _rotation_vector(R, out):
         out[axis] = scale * quat[axis]
 
 
-@njit(cache=True)
+@njit()
 def _quaternion(R, out):
     """Write the quaternion xyzw of the rotation in R to ``out`` (4,), normalized, w ≥ 0."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]

@@ -7,7 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True)
+@njit()
 def inverse(T):
     """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1] of T (d+1, d+1)."""
     d = T.shape[0] - 1
@@ -20,7 +20,7 @@ def inverse(T):
     return out
 
 
-@njit(cache=True)
+@njit()
 def between(T_a, T_b):
     """T_a⁻¹ T_b of two (d+1, d+1)."""
     d = T_a.shape[0] - 1
@@ -34,7 +34,7 @@ def between(T_a, T_b):
     return out
 
 
-@njit(cache=True)
+@njit()
 def centered(T, T_origin):
     """The pose T (d+1, d+1) with its position relative to that of T_origin."""
     d = T.shape[0] - 1
@@ -44,7 +44,7 @@ def centered(T, T_origin):
     return out
 
 
-@njit(cache=True)
+@njit()
 def apart(T_a, T_b):
     """Distance between two poses: meters, and the angle in [0, π] between their rotations.
 
@@ -62,7 +62,7 @@ def apart(T_a, T_b):
     return math.sqrt(square), 2.0 * math.atan2(sine, math.sqrt(max(cosine2, 0.0)))
 
 
-@njit(cache=True)
+@njit()
 def twist_2d(T):
     """The twist (3,) of T (3, 3): θ = atan2(R₂₁, R₁₁), ρ = V(θ)⁻¹ t, V⁻¹ = [c, θ/2; −θ/2, c], c = θ/2 cot θ/2."""
     theta = math.atan2(T[1, 0], T[0, 0])
@@ -75,7 +75,7 @@ def twist_2d(T):
     return out
 
 
-@njit(cache=True)
+@njit()
 def adjoint(T):
     """Ad (k, k) with T exp(ξ) T⁻¹ = exp(Ad ξ): [R, (t_y, −t_x)ᵀ; 0, 1] in the plane, [R, t^ R; 0, R] in space."""
     d = T.shape[0] - 1

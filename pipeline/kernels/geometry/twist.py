@@ -5,7 +5,7 @@ import math
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True)
+@njit()
 def perturb(twist, T, origin, out):
     """Write exp(twist) T, the twist about ``origin`` (3,), to ``out``; T (3, 3) in SE(2), (4, 4) in SE(3).
 
@@ -23,7 +23,7 @@ def perturb(twist, T, origin, out):
         out[axis, d] += origin[axis]
 
 
-@njit(cache=True)
+@njit()
 def _perturb_2d(twist, T, out):
     theta = twist[2]
     c, s = math.cos(theta), math.sin(theta)
@@ -40,7 +40,7 @@ def _perturb_2d(twist, T, out):
     out[1, 2] += b * twist[0] + a * twist[1]
 
 
-@njit(cache=True)
+@njit()
 def _perturb_3d(twist, T, out):
     x, y, z = twist[3], twist[4], twist[5]
     theta2 = x * x + y * y + z * z
@@ -61,7 +61,7 @@ def _perturb_3d(twist, T, out):
     out[2, 3] += w
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _rotate(x, y, z, a, b, u, v, w):
     """Apply (I + a K + b K²) to (u, v, w), K the skew matrix of (x, y, z)."""
     cu, cv, cw = y * w - z * v, z * u - x * w, x * v - y * u
@@ -69,7 +69,7 @@ def _rotate(x, y, z, a, b, u, v, w):
     return u + a * cu + b * du, v + a * cv + b * dv, w + a * cw + b * dw
 
 
-@njit(cache=True)
+@njit()
 def orthonormalize(T):
     """Make the rotation of T exactly orthonormal again, in place, by Gram–Schmidt.
 

@@ -8,7 +8,7 @@ from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.voxel_shapes import move
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def largest_magnitude(points) -> float:
     """Largest |coordinate| of points (N, d); infinite where one is NaN or infinite, 0 without points."""
     largest = 0.0
@@ -22,7 +22,7 @@ def largest_magnitude(points) -> float:
     return largest
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def largest_moved(points, T) -> float:
     """Largest |coordinate| of finite points (N, d) moved by the pose T (d+1, d+1); 0 without points."""
     largest = 0.0
@@ -32,7 +32,7 @@ def largest_moved(points, T) -> float:
     return largest
 
 
-@njit(cache=True)
+@njit()
 def rigidity_error(T) -> float:
     """Largest |entry| of RᵀR − I and of the last row less (0, …, 0, 1) of T (d+1, d+1).
 

@@ -8,7 +8,7 @@ from scanchain.kernels.compiling import njit
 _SMALL = 1e-4  # rad; below this angle the series replaces the closed form
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def chart_blocks(
     T_i: NDArray[np.float64],
     T_j: NDArray[np.float64],
@@ -42,7 +42,7 @@ def chart_blocks(
     A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, -1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def residuals(
     poses: NDArray[np.float64],
     edges: NDArray[np.int64],
@@ -62,7 +62,7 @@ def residuals(
         errors[e, 2] = r[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def jacobians(
     poses: NDArray[np.float64],
     edges: NDArray[np.int64],
@@ -92,7 +92,7 @@ def jacobians(
         J[1, 2] += -0.5 * r[0] + slope * r[1]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _half_cotangent(theta_rad: float) -> float:
     """(θ/2) / tan(θ/2), the diagonal of V(θ)⁻¹."""
     if abs(theta_rad) < _SMALL:
@@ -101,7 +101,7 @@ def _half_cotangent(theta_rad: float) -> float:
     return half * np.cos(half) / np.sin(half)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _half_cotangent_slope(theta_rad: float) -> float:
     """Derivative of (θ/2) / tan(θ/2): (sin θ − θ) / (4 sin²(θ/2))."""
     if abs(theta_rad) < 1e-2:

@@ -9,7 +9,7 @@ _SMALL = 1e-3  # rad; below this angle the series replaces the closed form
 _Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def residuals(poses: _Array, edges: NDArray[np.int64], measurements: _Array, errors: _Array) -> None:
     """Fill e = (ρ, φ) = log(Z⁻¹ T_i⁻¹ T_j) of every edge: φ = log R_E, ρ = V(φ)⁻¹ t_E (Barfoot 2017, eq. 7.100).
 
@@ -22,7 +22,7 @@ def residuals(poses: _Array, edges: NDArray[np.int64], measurements: _Array, err
         _translation_part(E, errors[e])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def jacobians(poses: _Array, edges: NDArray[np.int64], errors: _Array, jacobian: _Array) -> None:
     """Fill ∂e/∂ξ_j = J_r(e)⁻¹ Ad(T_j⁻¹) for left twists, T_j ← exp(ξ_j) T_j; ∂e/∂ξ_i is its negative.
 
@@ -52,7 +52,7 @@ def jacobians(poses: _Array, edges: NDArray[np.int64], errors: _Array, jacobian:
             J[a, 5] -= J[a, 0] * T[1, 3] - J[a, 1] * T[0, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _relative(T_i: _Array, T_j: _Array, Z: _Array, E: _Array) -> None:
     """Fill E (3, 4), the upper rows of Z⁻¹ T_i⁻¹ T_j."""
     for a in range(3):
@@ -67,7 +67,7 @@ def _relative(T_i: _Array, T_j: _Array, Z: _Array, E: _Array) -> None:
         E[a, 3] = t - Z[0, a] * Z[0, 3] - Z[1, a] * Z[1, 3] - Z[2, a] * Z[2, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _rotation_vector(R: _Array, quat: _Array, error: _Array) -> None:
     """Write φ = log R into error[3:6] by the quaternion xyzw, which is well conditioned from 0 to π.
 
@@ -94,7 +94,7 @@ def _rotation_vector(R: _Array, quat: _Array, error: _Array) -> None:
     error[3], error[4], error[5] = scale * quat[0], scale * quat[1], scale * quat[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _translation_part(E: _Array, error: _Array) -> None:
     """Write ρ = V(φ)⁻¹ t = t − ½ φ×t + k φ×(φ×t) into error[0:3]."""
     p, q, r = error[3], error[4], error[5]
@@ -106,7 +106,7 @@ def _translation_part(E: _Array, error: _Array) -> None:
     error[2] = z - 0.5 * w + k * (p * v - q * u)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _second_coefficient(theta2: float) -> float:
     """(1 − (θ/2)/tan(θ/2)) / θ², of the squared hat in V(φ)⁻¹."""
     if theta2 < _SMALL * _SMALL:
@@ -115,7 +115,7 @@ def _second_coefficient(theta2: float) -> float:
     return (1.0 - half * np.cos(half) / np.sin(half)) / theta2
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
     """Fill C = J_l(φ)⁻¹ = I − ½ [φ]× + k [φ]×² of SO(3)."""
     theta2 = p * p + q * q + r * r
@@ -127,7 +127,7 @@ def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
     C[1, 2], C[2, 1] = k * q * r + 0.5 * p, k * q * r - 0.5 * p
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _coupling(error: _Array, Q: _Array) -> None:
     """Fill Q(−ρ, −φ) (Barfoot 2017, eq. 7.86b).
 
@@ -156,7 +156,7 @@ def _coupling(error: _Array, Q: _Array) -> None:
     Q[1, 2], Q[2, 1] = yz - u, yz + u
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _coupling_coefficients(theta2: float) -> tuple[float, float, float]:
     """(θ − sin θ)/θ³, (θ² + 2 cos θ − 2)/(2θ⁴), (2θ − 3 sin θ + θ cos θ)/(2θ⁵), by series below 0.1 rad."""
     if theta2 < 1e-2:
@@ -172,7 +172,7 @@ def _coupling_coefficients(theta2: float) -> tuple[float, float, float]:
     return a, b, c
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _multiply(A: _Array, B: _Array, out: _Array) -> None:
     """Fill out = A B, 3 × 3."""
     for a in range(3):

@@ -16,7 +16,7 @@ _PANEL = 32  # pivots eliminated before the rest of the front is touched
 _TILE = 256  # columns of the rest that are updated together, so that the panel stays in the cache
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def factorize(
     fronts: Fronts, blocks: Blocks, values: _Array, floor: _Array, factor: _Array, stack: _Array, work: _Array
 ) -> int:
@@ -60,7 +60,7 @@ def factorize(
     return -1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
     """Solve Uᵀ U x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars.
 
@@ -83,7 +83,7 @@ def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, lo
     solve_upper(fronts, factor, path, x, local)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
     """Solve U x = b in place; arguments as of ``solve``."""
     for f in path[::-1]:
@@ -101,7 +101,7 @@ def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Arr
             x[rows[a]] = local[a]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
     """Add one block of A to the upper triangle of its front."""
     top, left, height, width = blocks.top[b], blocks.left[b], blocks.height[b], blocks.width[b]
@@ -115,7 +115,7 @@ def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
             at += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: NDArray[np.int64]) -> None:
     """Add a child's update matrix, row by row, in runs of columns that are neighbors in the front too."""
     size, count = place.size, 0
@@ -136,7 +136,7 @@ def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: N
                 target[b] += source[b0 + b]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
     """Factor the first ``pivots`` rows and update the rest; return -1 or the pivot that failed."""
     height = front.shape[0]
@@ -159,7 +159,7 @@ def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
     return -1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _update_rest(front: _Array, k0: int, k1: int, c0: int, c1: int) -> None:
     """Subtract Uᵀ U of rows k0 to k1 from columns c0 to c1 of the rows below: two rows, four pivots a time."""
     i = k1

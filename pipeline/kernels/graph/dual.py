@@ -9,7 +9,7 @@ _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def scatter_dual(
     leap: _Array,
     force: _Array,
@@ -53,7 +53,7 @@ def scatter_dual(
             _add_pair(leap[e], force[e], torque[e], tau[e], kappa[e], i > j, blocks[pair])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_first(leap: _Array, force: _Array, tau: float, kappa: float, block: _Array) -> None:
     """Add an edge to the diagonal block of its first pose."""
     d = leap.size
@@ -66,7 +66,7 @@ def _add_first(leap: _Array, force: _Array, tau: float, kappa: float, block: _Ar
     block[d, d] += tau
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_pair(
     leap: _Array, force: _Array, torque: _Array, tau: float, kappa: float, from_higher: bool, block: _Array
 ) -> None:

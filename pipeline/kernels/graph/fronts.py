@@ -56,7 +56,7 @@ class Blocks(NamedTuple):
     turned: _Index
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -> Fronts:
     """Expand fronts of blocks to scalars.
 
@@ -98,7 +98,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
     return Fronts(row_start, scalar_rows, pivots, factor_start, children, place, stack_size, widest)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _walk(
     row_start: _Index, rows: _Index, pivots: _Index, children: _Index, parent: _Index, place: _Index
 ) -> tuple[int, int]:
@@ -126,7 +126,7 @@ def _walk(
     return widest, deepest
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def lay_out_blocks(
     fronts: Fronts, scalar_start: _Index, sizes: _Index, block_rows: _Index, block_columns: _Index
 ) -> Blocks:

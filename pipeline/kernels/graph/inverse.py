@@ -10,7 +10,7 @@ _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def selected_inverse(
     fronts: Fronts, blocks: Blocks, factor: _Array, inverse: _Array, stack: _Array, work: _Array
 ) -> None:
@@ -48,7 +48,7 @@ def selected_inverse(
             child = sibling[child]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _families(fronts: Fronts) -> tuple[_Index, _Index]:
     """First child of every front, and the next child of its parent, ascending; -1 where there is none."""
     count = fronts.pivots.size
@@ -67,7 +67,7 @@ def _families(fronts: Fronts) -> tuple[_Index, _Index]:
     return first_child, sibling
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
     """Fill row and column a of Z from those beyond it; upper is row a of U in the columns of the front."""
     height = upper.size
@@ -84,7 +84,7 @@ def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
     row[a] = total / upper[a]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _take_block(Z: _Array, blocks: Blocks, b: int, inverse: _Array) -> None:
     """Copy one block out of its front."""
     top, left, at = blocks.top[b], blocks.left[b], blocks.offset[b]

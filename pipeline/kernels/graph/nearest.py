@@ -5,7 +5,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest_position(poses, pose, chosen):
     """Index of the pose (K, d+1, d+1) whose position is nearest, of those chosen (K,), and its distance in meters.
 

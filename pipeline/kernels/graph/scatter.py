@@ -8,7 +8,7 @@ from scanchain.kernels.compiling import njit
 _Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def squared_norms(errors: _Array, information: _Array, chi2: _Array) -> None:
     """Fill χ² = eᵀ Ω e of every factor; errors (E, k), information (E, k, k), chi2 (E,)."""
     k = errors.shape[1]
@@ -23,7 +23,7 @@ def squared_norms(errors: _Array, information: _Array, chi2: _Array) -> None:
         chi2[f] = total
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def multiply(
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
@@ -48,7 +48,7 @@ def multiply(
                 at += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def scatter_between(
     jacobian: _Array,
     errors: _Array,
@@ -82,7 +82,7 @@ def scatter_between(
             _add(blocks[pair], M, -1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(block: _Array, M: _Array, sign: float) -> None:
     """Add ±M to a block."""
     for a in range(M.shape[0]):
@@ -90,14 +90,14 @@ def _add(block: _Array, M: _Array, sign: float) -> None:
             block[a, b] += sign * M[a, b]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_row(row: _Array, g: _Array, sign: float) -> None:
     """Add ±g to a row of the gradient."""
     for a in range(g.size):
         row[a] += sign * g[a]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _weigh(J: _Array, e: _Array, omega: _Array, weight: float, whitened: _Array, M: _Array, g: _Array) -> None:
     """Fill whitened = w Ω J, M = Jᵀ w Ω J and g = (w Ω J)ᵀ e of one factor."""
     k = e.size

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidefinite: NDArray[np.bool_]) -> None:
     """Fill ``is_semidefinite`` (E,): matrices (E, k, k) without an eigenvalue below −rounding · largest entry.
 
@@ -23,7 +23,7 @@ def find_semidefinite(matrices: NDArray[np.float64], rounding: float, is_semidef
         )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _largest_entry(A) -> float:
     """The largest absolute value, NaN where one is."""
     largest = 0.0
@@ -36,7 +36,7 @@ def _largest_entry(A) -> float:
     return largest
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _is_symmetric(A, margin: float) -> bool:
     for i in range(A.shape[0]):
         for j in range(i):
@@ -45,7 +45,7 @@ def _is_symmetric(A, margin: float) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _has_factor(A, shift: float, factor) -> bool:
     """True if A + shift · I has a Cholesky factor; ``factor`` (k, k) is a buffer for it."""
     for i in range(A.shape[0]):

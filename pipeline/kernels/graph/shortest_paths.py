@@ -7,7 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def shortest_paths(edges, lengths, count: int, source: int, limit: float):
     """Length (count,) of the shortest path from the source to every node, infinite beyond the limit.
 
@@ -30,7 +30,7 @@ def shortest_paths(edges, lengths, count: int, source: int, limit: float):
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _neighbors(edges, lengths, count: int):
     """The neighbors of node n and the lengths to them: rows first[n] to first[n + 1]."""
     first = np.zeros(count + 2, np.int64)

@@ -11,7 +11,7 @@ from scanchain.kernels.compiling import njit
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
     """Parent of every position of the elimination order, -1 at a root (Liu 1990, algorithm 4.2).
 
@@ -35,7 +35,7 @@ def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
     return parent
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def postorder(parent: _Index) -> _Index:
     """Positions in an order in which every subtree is contiguous and children precede parents."""
     n = parent.size
@@ -65,7 +65,7 @@ def postorder(parent: _Index) -> _Index:
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
     """Positions below the diagonal in every block column of the factor, ascending: (start (n + 1,), rows).
 
@@ -97,7 +97,7 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
     return begin, rows[: begin[n]]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
     """Append the members beyond j that are not in column j yet; return the column's new end."""
     for i in members:
@@ -108,7 +108,7 @@ def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
     return end
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) -> _Index:
     """First position of every front (and n at the end): columns with nearly the same structure join.
 
@@ -152,7 +152,7 @@ def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) ->
     return fronts[: kept + 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _most_zeros(columns: int) -> float:
     """Share of explicit zeros that a front of so many scalar columns may hold."""
     if columns <= 4:

@@ -9,7 +9,7 @@ _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def follow_tree(start: _Index, incident: _Index, edges: _Index, Z: _Array, poses: _Array, reached: _Index) -> None:
     """Chain measurements breadth first from the poses that are already reached.
 
@@ -38,7 +38,7 @@ def follow_tree(start: _Index, incident: _Index, edges: _Index, Z: _Array, poses
             _step(poses[v], Z[e], forward, poses[other], d)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _step(T: _Array, Z: _Array, forward: bool, result: _Array, d: int) -> None:
     """Write T Z, or T Z⁻¹ where the edge is followed against its direction."""
     result[:] = 0.0

@@ -10,7 +10,7 @@ _Index = NDArray[np.int64]
 _PANEL = 16  # rows of the border that are subtracted from the corner together
 
 
-@njit(cache=True)
+@njit()
 def bandwidth(row_start: _Index, columns: _Index, split: int) -> int:
     """Largest distance of two columns before ``split`` in one row."""
     widest = 0
@@ -23,7 +23,7 @@ def bandwidth(row_start: _Index, columns: _Index, split: int) -> int:
     return widest
 
 
-@njit(cache=True)
+@njit()
 def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, split: int, band: _Array, border: _Array,
     corner: _Array, g: _Array,
@@ -53,7 +53,7 @@ def products(
                     corner[i - split, j - split] += product
 
 
-@njit(cache=True)
+@njit()
 def eliminate(band: _Array, border: _Array, share: float) -> int:
     """Factor P = UᵀU in its band and turn the border Bᵀ into Y = U⁻ᵀ Bᵀ (Golub & Van Loan 2013, 4.3.5).
 
@@ -79,7 +79,7 @@ def eliminate(band: _Array, border: _Array, share: float) -> int:
     return -1
 
 
-@njit(cache=True)
+@njit()
 def complement(corner: _Array, border: _Array) -> None:
     """Subtract YᵀY from the upper triangle of the corner, four rows of Y at a time, in cached panels."""
     whole = border.shape[0] - border.shape[0] % 4
@@ -98,7 +98,7 @@ def complement(corner: _Array, border: _Array) -> None:
             _subtract(corner[a, a:], border[j, a], border[j, a:])
 
 
-@njit(cache=True)
+@njit()
 def eliminate_corner(corner: _Array, floor: _Array) -> int:
     """Factor S = UᵀU in place, in its upper triangle; a pivot at or below its floor has failed.
 
@@ -116,7 +116,7 @@ def eliminate_corner(corner: _Array, floor: _Array) -> int:
     return -1
 
 
-@njit(cache=True)
+@njit()
 def solve_corner(corner: _Array, x: _Array) -> None:
     """Solve UᵀU x = b in place, U in the upper triangle."""
     n = x.size
@@ -130,7 +130,7 @@ def solve_corner(corner: _Array, x: _Array) -> None:
         x[a] = total / corner[a, a]
 
 
-@njit(cache=True)
+@njit()
 def invert(
     band: _Array, border: _Array, corner: _Array, Z_band: _Array, Z_border: _Array, Z_corner: _Array
 ) -> None:
@@ -165,7 +165,7 @@ def invert(
             Z_band[w + i - j, j] = total / pivot
 
 
-@njit(cache=True)
+@njit()
 def blocks(Z_band: _Array, Z_border: _Array, Z_corner: _Array, wanted: _Index, result: _Array) -> None:
     """Fill blocks of the inverse: wanted (N, c) columns of A, result (N, c, c); NaN for poses beyond the band."""
     w, n = Z_band.shape[0] - 1, Z_band.shape[1]
@@ -181,7 +181,7 @@ def blocks(Z_band: _Array, Z_border: _Array, Z_corner: _Array, wanted: _Index, r
                     result[k, a, b] = Z_band[w + i - j, j] if j - i <= w else np.nan
 
 
-@njit(cache=True)
+@njit()
 def solve_forward(band: _Array, x: _Array) -> None:
     """Solve Uᵀ x = b in place, U in its band."""
     w = band.shape[0] - 1
@@ -191,7 +191,7 @@ def solve_forward(band: _Array, x: _Array) -> None:
         x[j] /= band[w, j]
 
 
-@njit(cache=True)
+@njit()
 def solve_backward(band: _Array, x: _Array) -> None:
     """Solve U x = b in place, U in its band."""
     w = band.shape[0] - 1
@@ -201,13 +201,13 @@ def solve_backward(band: _Array, x: _Array) -> None:
             x[i] -= band[w + i - j, j] * x[j]
 
 
-@njit(cache=True)
+@njit()
 def _subtract(row: _Array, factor: float, other: _Array) -> None:
     for c in range(row.size):
         row[c] -= factor * other[c]
 
 
-@njit(cache=True)
+@njit()
 def _divide(row: _Array, number: float) -> None:
     for c in range(row.size):
         row[c] /= number

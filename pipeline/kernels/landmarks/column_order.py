@@ -10,7 +10,7 @@ from scanchain.kernels.compiling import njit
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True)
+@njit()
 def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Index, rows: _Index) -> _Index:
     """Column to eliminate at each position, by approximate minimum degree (COLAMD, Davis et al. 2004).
 
@@ -57,7 +57,7 @@ def column_minimum_degree(row_start: _Index, columns: _Index, column_start: _Ind
     return order
 
 
-@njit(cache=True)
+@njit()
 def _join(
     r: int, k: int, begin: _Index, length: _Index, done: NDArray[np.bool_], mark: _Index, store: _Index, end: int
 ) -> int:
@@ -70,7 +70,7 @@ def _join(
     return end
 
 
-@njit(cache=True)
+@njit()
 def _count_beyond(
     members: _Index, k: int, column_start: _Index, rows: _Index, held: _Index, length: _Index, beyond: _Index,
     seen: _Index,
@@ -87,7 +87,7 @@ def _count_beyond(
             beyond[r] -= 1
 
 
-@njit(cache=True)
+@njit()
 def _adopt(
     w: int, pivot: int, column_start: _Index, rows: _Index, held: _Index, length: _Index, beyond: _Index
 ) -> int:

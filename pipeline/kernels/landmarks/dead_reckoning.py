@@ -8,7 +8,7 @@ from scanchain.kernels.compiling import njit
 _Array = NDArray[np.float64]
 
 
-@njit(cache=True)
+@njit()
 def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Array, spread: _Array) -> None:
     """Chain the arcs that a robot drives at constant velocities, from every node's time to the next.
 
@@ -53,7 +53,7 @@ def integrate(times_s: _Array, velocities: _Array, nodes_s: _Array, motion: _Arr
         motion[k, 0], motion[k, 1], motion[k, 2] = x, y, heading
 
 
-@njit(cache=True)
+@njit()
 def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, driven: float) -> None:
     """Propagate a covariance along one arc and add that of its own noise."""
     for a in range(2):  # F P Fᵀ, F the identity but for its last column

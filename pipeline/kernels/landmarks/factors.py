@@ -10,7 +10,7 @@ _Index = NDArray[np.int64]
 _NOWHERE_M = 1e-9  # distance to the pose below which a landmark has no bearing
 
 
-@njit(cache=True)
+@njit()
 def bearing_range_block(
     pose: _Array, landmark: _Array, bearing_rad: float, range_m: float, r: _Array, J: _Array
 ) -> None:
@@ -45,7 +45,7 @@ def bearing_range_block(
         J[0, 2] = -1.0
 
 
-@njit(cache=True)
+@njit()
 def bearing_range(
     poses: _Array, landmarks: _Array, observed: _Index, measured: _Array, whitening: _Array, residuals: _Array,
     jacobians: _Array,
@@ -66,7 +66,7 @@ def bearing_range(
                 jacobians[k, a, c] = whitening[a, 0] * J[0, c] + whitening[a, 1] * J[1, c]
 
 
-@njit(cache=True)
+@njit()
 def odometry_block(first: _Array, second: _Array, moved: _Array, r: _Array, J: _Array) -> None:
     """Residual and Jacobian of a motion measured in the frame of its beginning.
 
@@ -87,7 +87,7 @@ def odometry_block(first: _Array, second: _Array, moved: _Array, r: _Array, J: _
     J[0, 2], J[1, 2] = -s * dx + c * dy, -c * dx - s * dy
 
 
-@njit(cache=True)
+@njit()
 def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array) -> None:
     """Fill W r and W J of every motion from a pose to the next.
 

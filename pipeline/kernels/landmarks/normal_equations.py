@@ -9,7 +9,7 @@ _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True)
+@njit()
 def product_structure(
     row_start: _Index, columns: _Index, column_start: _Index, rows: _Index
 ) -> tuple[_Index, _Index, _Index]:
@@ -49,7 +49,7 @@ def product_structure(
     return start, others[:end].copy(), slots
 
 
-@njit(cache=True)
+@njit()
 def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, slots: _Index, H: _Array, g: _Array
 ) -> None:
@@ -70,7 +70,7 @@ def products(
                 at += 1
 
 
-@njit(cache=True)
+@njit()
 def gradient(row_start: _Index, columns: _Index, values: _Array, b: _Array, g: _Array, diagonal: _Array) -> None:
     """Fill g = Aᵀb and the diagonal of AᵀA, both (n,)."""
     g[:] = 0.0

@@ -17,7 +17,7 @@ _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
 
-@njit(cache=True)
+@njit()
 def assign_rows(
     fronts: Fronts, row_start: _Index, columns: _Index, place: _Index
 ) -> tuple[_Index, _Index, _Index, int]:
@@ -63,7 +63,7 @@ def assign_rows(
     return begin, rows, height, deepest
 
 
-@njit(cache=True)
+@njit()
 def factorize(
     fronts: Fronts,
     begin: _Index,
@@ -116,7 +116,7 @@ def factorize(
         top += 1
 
 
-@njit(cache=True)
+@njit()
 def _find_leads(
     fronts: Fronts, children: _Index, height: _Index, mine: _Index, row_start: _Index, columns: _Index,
     place: _Index, local: _Index, leads: _Index,
@@ -135,7 +135,7 @@ def _find_leads(
             at += 1
 
 
-@njit(cache=True)
+@njit()
 def _place_own(
     front: _Array, target: _Index, mine: _Index, row_start: _Index, columns: _Index, values: _Array, b: _Array,
     place: _Index, local: _Index,
@@ -148,7 +148,7 @@ def _place_own(
         row[-1] = b[mine[k]]
 
 
-@njit(cache=True)
+@njit()
 def _place_children(
     front: _Array, target: _Index, at: int, fronts: Fronts, children: _Index, height: _Index, stack: _Array,
     depth: int,
@@ -172,7 +172,7 @@ def _place_children(
     return depth
 
 
-@njit(cache=True)
+@njit()
 def _keep(front: _Array, columns: _Index, pivots: int, factor: _Array, z: _Array) -> None:
     """Store the rows of R that belong to the pivots; zeros where the front has too few rows."""
     width = columns.size
@@ -185,7 +185,7 @@ def _keep(front: _Array, columns: _Index, pivots: int, factor: _Array, z: _Array
             z[columns[a]] = 0.0
 
 
-@njit(cache=True)
+@njit()
 def back_substitute(fronts: Fronts, factor: _Array, z: _Array) -> None:
     """Solve R x = z in place; z (n,) in the order of the columns. A zero on the diagonal gives infinities."""
     for f in range(fronts.pivots.size - 1, -1, -1):
@@ -199,20 +199,20 @@ def back_substitute(fronts: Fronts, factor: _Array, z: _Array) -> None:
             z[fronts.rows[column0 + a]] = total / row[a]
 
 
-@njit(cache=True)
+@njit()
 def _handed_on(height: int, rest: int, pivots: int) -> int:
     """Number of update rows of a front of this height."""
     return max(min(height, rest + pivots) - pivots, 0)
 
 
-@njit(cache=True)
+@njit()
 def _rows_of(fronts: Fronts, height: _Index, child: int) -> int:
     """Update rows of a front, for its parent."""
     width = fronts.row_start[child + 1] - fronts.row_start[child]
     return int(_handed_on(height[child], width - fronts.pivots[child], fronts.pivots[child]))
 
 
-@njit(cache=True)
+@njit()
 def _sort_by_lead(leads: _Index, width: int) -> tuple[_Index, _Index]:
     """Rows that begin at or before each column, (width,), and the position of every row when sorted so."""
     stairs = np.zeros(width + 1, np.int64)
@@ -226,7 +226,7 @@ def _sort_by_lead(leads: _Index, width: int) -> tuple[_Index, _Index]:
     return stairs, target
 
 
-@njit(cache=True)
+@njit()
 def _triangularize(front: _Array, width: int, stairs: _Index, sums: _Array) -> None:
     """Reflect the front to an upper trapezoid, column after column: F ← F − v (2 vᵀF / vᵀv)."""
     for k in range(min(front.shape[0], width)):

@@ -12,7 +12,7 @@ from scanchain.kernels.raycast.solids import hit_solid
 SECTORS = 720  # sectors of azimuth; a ray tests only the solids that overlap its own
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def cast_rays(
     origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, max_range_m,
     ranges_m, solid_of_ray,
@@ -64,17 +64,17 @@ def cast_rays(
         solid_of_ray[n] = hit
 
 
-@njit(cache=True)
+@njit()
 def _nearer(best, hit, t, solid):
     return (t, solid) if t < best else (best, hit)
 
 
-@njit(cache=True)
+@njit()
 def _sector(azimuth_rad):
     return math.floor((azimuth_rad + math.pi) * (SECTORS / (2.0 * math.pi)))
 
 
-@njit(cache=True)
+@njit()
 def _sectors(extents, max_range_m):
     """The solids that overlap each sector, near to far: ``members[starts[s] : starts[s + 1]]``."""
     order = np.argsort(extents[:, 2], kind="mergesort")
@@ -95,7 +95,7 @@ def _sectors(extents, max_range_m):
     return starts, members
 
 
-@njit(cache=True)
+@njit()
 def _span(extent, max_range_m):
     """First sector and number of sectors that an extent overlaps; none beyond the sensor's reach."""
     if extent[2] > max_range_m:

@@ -7,7 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True)
+@njit()
 def _middle(origins):
     """Middle of the origins in the plane and the largest distance of one from it."""
     x, y, slack = 0.0, 0.0, 0.0
@@ -19,7 +19,7 @@ def _middle(origins):
     return x, y, slack
 
 
-@njit(cache=True)
+@njit()
 def extents_of(origins, boxes, cylinders, ellipsoids):
     """(S, 5) extent of each solid: bearing, half angle, nearest distance in the plane, slopes between.
 
@@ -44,7 +44,7 @@ def extents_of(origins, boxes, cylinders, ellipsoids):
     return result
 
 
-@njit(cache=True)
+@njit()
 def _slopes(far, bottom, top, out):
     """Least and greatest slope of a ray to a solid that begins ``out[2]`` away and ends ``far`` away."""
     near = out[2]
@@ -58,7 +58,7 @@ def _slopes(far, bottom, top, out):
         out[4] = top / near if near > 0.0 else np.inf
 
 
-@njit(cache=True)
+@njit()
 def _disc_extent(dx, dy, radius, out):
     """Bearing, half angle and nearest distance of a disc, into ``out``; returns its farthest distance."""
     distance = math.hypot(dx, dy)
@@ -69,7 +69,7 @@ def _disc_extent(dx, dy, radius, out):
     return distance + radius
 
 
-@njit(cache=True)
+@njit()
 def _box_extent(x, y, slack, box, out):
     """Bearing, half angle and nearest distance of a box, into ``out``; returns its farthest distance."""
     dx, dy, c, s = box[0] - x, box[1] - y, box[6], box[7]

@@ -7,7 +7,7 @@ from scanchain.kernels.compiling import njit
 FAR = 1e9  # m, range of bins that no ray fell into
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest_ranges(points, ranges_m):
     """Fill ``ranges_m`` (E, A) with the least range in each bin of direction, FAR where no point is.
 
@@ -21,7 +21,7 @@ def nearest_ranges(points, ranges_m):
             ranges_m[row, column] = min(ranges_m[row, column], range_m)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     """Numbers of points (N, 3), moved by T (4, 4) into the lidar's frame, that agree and that contradict.
 
@@ -48,7 +48,7 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     return agreeing, contradicting
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through):
     """Count, for each point, the scan as one that saw a surface there or saw through it.
 
@@ -83,7 +83,7 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
                 seen_through[i] += 1
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _sight(x, y, z, ranges_m, limits):
     """1 where a point in the lidar's frame was seen, −1 where it lies in free space, else 0."""
     reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
@@ -111,7 +111,7 @@ def _sight(x, y, z, ranges_m, limits):
     return -1 if _least(ranges_m, row, column, 1, FAR)[0] < FAR else 0
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _least(ranges_m, row, column, half, enough_m):
     """Least range, or any below ``enough_m``, and its row; of the bins ``half`` away at most, below 1.
 
@@ -129,7 +129,7 @@ def _least(ranges_m, row, column, half, enough_m):
     return least_m, row_of_least
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _bin_of(x: float, y: float, z: float, shape):
     """Row and column of a direction, and the range; (0, 0, 0) at the lidar itself."""
     range_m = np.sqrt(x * x + y * y + z * z)

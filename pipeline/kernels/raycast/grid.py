@@ -7,7 +7,7 @@ from scanchain.kernels.compiling import njit
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
     """Fill ``starts`` and ``ends`` (N, 2) with the part of each beam that lies in a horizontal slice.
 
@@ -47,7 +47,7 @@ def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def bounds(points, out):
     """Widen ``out`` (4,), min x, min y, max x, max y, to hold the points (N, 2)."""
     for i in range(points.shape[0]):
@@ -56,7 +56,7 @@ def bounds(points, out):
         out[2], out[3] = max(out[2], x), max(out[3], y)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, miss, low, high, log_odds, drawn):
     """Add the evidence of several scans: the cells that beams cross are free, the cells they end in occupied.
 
@@ -90,7 +90,7 @@ def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, mis
             )  # fmt: skip
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _carve(x, y, end_x, end_y, number, miss, low, log_odds, drawn):
     """Free every cell from (x, y) up to, not including, that of the end (Amanatides & Woo 1987); unit: cells."""
     column, row = int(x), int(y)

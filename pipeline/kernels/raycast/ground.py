@@ -7,7 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True)
+@njit()
 def hit_ground(ox, oy, oz, dx, dy, dz, ground, max_range_m):
     """Distance at which a ray from above first meets the ground, inf if it does not.
 
@@ -24,7 +24,7 @@ def hit_ground(ox, oy, oz, dx, dy, dz, ground, max_range_m):
     return _descend(ox, oy, oz, dx, dy, dz, ground, start, max_range_m)
 
 
-@njit(cache=True)
+@njit()
 def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
     """Distance of the first root of the gap f(t) = z − h at or beyond ``start_m``, before which there is none.
 
@@ -53,7 +53,7 @@ def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
     return np.inf
 
 
-@njit(cache=True)
+@njit()
 def _steepest(dx, dy, dz, ground):
     """Bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
     slope_x, slope_y = ground[1] * ground[2], ground[4] * ground[5]
@@ -66,7 +66,7 @@ def _steepest(dx, dy, dz, ground):
     return closing, curvature
 
 
-@njit(cache=True)
+@njit()
 def _gap(x, y, z, dx, dy, dz, ground):
     """Height of a position above the ground and its change along the ray."""
     phase_x, phase_y = ground[2] * x + ground[3], ground[5] * y + ground[6]

@@ -7,7 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 
-@njit(cache=True)
+@njit()
 def hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids):
     """Distance at which a ray enters the solid of that number, inf if it does not."""
     if solid < len(boxes):
@@ -18,7 +18,7 @@ def hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids):
     return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, ellipsoids[solid - len(cylinders)])
 
 
-@njit(cache=True)
+@njit()
 def _slab(o, d, low, high):
     """Interval of t in which o + t d lies between two planes (Kay & Kajiya 1986)."""
     if abs(d) < 1e-12:
@@ -27,7 +27,7 @@ def _slab(o, d, low, high):
     return min(a, b), max(a, b)
 
 
-@njit(cache=True)
+@njit()
 def _hit_box(ox, oy, oz, dx, dy, dz, box):
     x, y, c, s = ox - box[0], oy - box[1], box[6], box[7]
     enter_x, leave_x = _slab(c * x + s * y, c * dx + s * dy, -box[2], box[2])
@@ -37,7 +37,7 @@ def _hit_box(ox, oy, oz, dx, dy, dz, box):
     return enter if 0.0 < enter <= leave else np.inf
 
 
-@njit(cache=True)
+@njit()
 def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
     x, y = ox - cylinder[0], oy - cylinder[1]
     a, b = dx * dx + dy * dy, x * dx + y * dy
@@ -54,7 +54,7 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
     return enter if 0.0 < enter <= leave else np.inf
 
 
-@njit(cache=True)
+@njit()
 def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, ellipsoid):
     x, y, z = (
         (ox - ellipsoid[0]) / ellipsoid[3],

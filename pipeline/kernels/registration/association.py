@@ -7,7 +7,7 @@ from scanchain.kernels.voxels.hashing import find_row, pack
 from scanchain.kernels.voxels.voxel_shapes import move
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def associate(voxels, points, T, reach: int, max_distance_m: float, correspondence):
     """Number of points with a voxel mean within the distance; the row of the nearest in ``correspondence`` (N,).
 
@@ -51,7 +51,7 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weighted_pairs(voxels, points, T, correspondence, scale_m: float, source, target, weight):
     """Number of pairs; the moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))² of each, one row a pair.
 

@@ -110,7 +110,7 @@ class Fit(NamedTuple):
     ending: int
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def problem_of(voxels, points, T_first, prior, settings):
     """``Problem`` of points (N, d), twists about the position of T_first (d+1, d+1)."""
     origin, N = np.zeros(3), points.shape[0]
@@ -119,7 +119,7 @@ def problem_of(voxels, points, T_first, prior, settings):
     return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), settings)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def align(problem, T, offset, range_m: float, first_scale_m: float):
     """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
 
@@ -166,7 +166,7 @@ def align(problem, T, offset, range_m: float, first_scale_m: float):
     return Fit(H, unweighted, cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def fit_at(problem, T, fit):
     """``Fit`` at the pose T itself, by correspondences within the last distance; cost and ending of ``fit``."""
     settings = problem.settings
@@ -178,7 +178,7 @@ def fit_at(problem, T, fit):
     return Fit(H, unweighted, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def correspond(problem, T, reach: int, max_distance_m: float):
     """Number of correspondences of the problem at the pose T, which are associated and weighted again."""
     pairs = associate(problem.voxels, problem.points, T, reach, max_distance_m, problem.correspondence)
@@ -189,7 +189,7 @@ def correspond(problem, T, reach: int, max_distance_m: float):
     return pairs
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def shape_information(problem, T):
     """Information (k, k) of planes and lines at the pose T, with and without robust weights.
 
@@ -215,7 +215,7 @@ def shape_information(problem, T):
     return H, unweighted
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def refine(voxels, points, starts, poses, prior, least_share, settings):
     """Align many scans to one map, each pose in place, unless the scan does not fit.
 
@@ -236,7 +236,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
                     poses[k, i, j] = T[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def root_mean_square_range(points) -> float:
     """Of points (N, d) in the lidar frame; meters."""
     total = 0.0
@@ -246,7 +246,7 @@ def root_mean_square_range(points) -> float:
     return np.sqrt(total / max(points.shape[0], 1))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial, x, factor) -> bool:
     """True if one step x (k,) was taken with the present correspondences; False where H is singular.
 
@@ -278,7 +278,7 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _linearize(problem, scale_m: float, iterate):
     """Fill the iterate's normal equations and sums at its pose, the prior included."""
     settings = problem.settings
@@ -304,7 +304,7 @@ def _linearize(problem, scale_m: float, iterate):
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _evaluate(problem, scale_m: float, iterate):
     """Fill the iterate's sums at its pose, and leave its normal equations as they are."""
     cost, total_weight, squares = robust_sums(
@@ -314,7 +314,7 @@ def _evaluate(problem, scale_m: float, iterate):
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _accept(now, trial):
     """Copy the trial to the present iterate."""
     for i in range(now.T.shape[0]):
@@ -328,7 +328,7 @@ def _accept(now, trial):
         now.sums[i] = trial.sums[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _prior_cost(prior, offset) -> float:
     """½ ξᵀ prior ξ."""
     total = 0.0
@@ -338,20 +338,20 @@ def _prior_cost(prior, offset) -> float:
     return 0.5 * total
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _largest_move(x, range_m: float) -> float:
     """Largest distance that a step x moves a point at that range; meters."""
     shift, turn = _squares(x)
     return np.sqrt(shift) + np.sqrt(turn) * range_m
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _is_small(x, settings) -> bool:
     shift, turn = _squares(x)
     return shift < settings.tolerance_m**2 and turn < settings.tolerance_rad**2
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _squares(x):
     """Squared length of the translation and of the rotation in a step x (k,)."""
     d = 2 if x.shape[0] == 3 else 3

@@ -56,7 +56,7 @@ class Result(NamedTuple):
     ending: int
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def match(voxels, points, T_first, expected, settings):
     """``Result`` of points (N, d) aligned to a map from T_first (d+1, d+1), near a predicted pose.
 
@@ -106,7 +106,7 @@ def match(voxels, points, T_first, expected, settings):
     return _result(problem, T, T_first, fit, last, spectrum, range_m, spread)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def assess(voxels, points, T, fit, settings):
     """``Result`` of a fit by another method at T (d+1, d+1), its information about T itself.
 
@@ -122,7 +122,7 @@ def assess(voxels, points, T, fit, settings):
     return _result(problem, T, T, fit, last, spectrum, range_m, np.zeros((0, 0)))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
     """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
 
@@ -153,7 +153,7 @@ def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _spread(problem, T, fit):
     """Covariance (6, 6) of the gradient at T, by which each surface errs as its residuals say; empty in the plane.
 
@@ -177,19 +177,19 @@ def _spread(problem, T, fit):
     return spread
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _variance(problem, fit) -> float:
     """Variance of a residual, by the fit, or the sensor's where the fit is closer than that; m²."""
     return max(problem.settings.variance, _residual_of(fit) ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _residual_of(fit) -> float:
     """Root of the weighted mean squared residual, meters; infinite without correspondences."""
     return math.sqrt(fit.squares / fit.total_weight) if fit.total_weight > 0.0 else math.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _about_target(information, T, variance: float):
     """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
     out = congruent(adjoint(inverse(centered(T, T))), information)
@@ -199,7 +199,7 @@ def _about_target(information, T, variance: float):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _twist_between(T_from, T_to):
     """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
     motion = between(inverse(centered(T_to, T_to)), inverse(centered(T_from, T_to)))
@@ -210,7 +210,7 @@ def _twist_between(T_from, T_to):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _uncertainty_of(covariance, range_m: float) -> float:
     """Standard deviation of a point at that range, by the covariance (k, k) of its pose; meters."""
     k = covariance.shape[0]

@@ -43,7 +43,7 @@ class Spectrum(NamedTuple):
     signals: NDArray[np.float64]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def spectrum_of(H, total_weight: float, range_m: float):
     """``Spectrum`` of the information H (k, k) of residuals with this sum of weights."""
     k = H.shape[0]
@@ -58,14 +58,14 @@ def spectrum_of(H, total_weight: float, range_m: float):
     return Spectrum(scale, values, vectors, np.full(k, np.inf))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _twist_of(spectrum, m: int, twist):
     """Write direction m of the spectrum to ``twist`` (k,), in meters and radians."""
     for i in range(twist.shape[0]):
         twist[i] = spectrum.vectors[i, m] * spectrum.scale[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def agreement(H, unweighted, range_m: float) -> float:
     """Share of the information that the robust kernel leaves to the direction that loses most, 0 to 1.
 
@@ -96,7 +96,7 @@ def agreement(H, unweighted, range_m: float) -> float:
     return max(values[0], 0.0)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def worst(spectrum) -> int:
     """Index of the direction with the lowest signal-to-noise ratio."""
     m = 0
@@ -106,7 +106,7 @@ def worst(spectrum) -> int:
     return m
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def is_below(spectrum, m: int, times: float, settings) -> bool:
     """True if direction m lies below so many times the limits of a degenerate one."""
     return (
@@ -114,7 +114,7 @@ def is_below(spectrum, m: int, times: float, settings) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings):
     """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
 
@@ -148,7 +148,7 @@ def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings
     return prior
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def remove_noise(spectrum, H, total_weight: float, settings):
     """Take the noise-induced part along weak directions from the information H (k, k) of residuals.
 
@@ -164,7 +164,7 @@ def remove_noise(spectrum, H, total_weight: float, settings):
                 H[i, j] -= noise * along / (spectrum.scale[i] * spectrum.scale[j])
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def add_signals(problem, T, spectrum):
     """Fill the spectrum's signals, from the weakest direction on to the first that is not weak."""
     twist = np.empty(spectrum.values.shape[0])
@@ -175,7 +175,7 @@ def add_signals(problem, T, spectrum):
             break
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def signal_along(problem, T, twist) -> float:
     """Signal-to-noise ratio of the information along a twist (k,) (after Hatleskog & Alexis 2024).
 
@@ -227,7 +227,7 @@ def signal_along(problem, T, twist) -> float:
     return max(total, 0.0) / max(noise, 1e-300)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _normal_variance(
     cells, voxel: int, dx: float, dy: float, dz: float, beside: float, parameters: float
 ) -> float:
@@ -243,7 +243,7 @@ def _normal_variance(
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
     """Sum of the information (N,) of correspondences with a voxel or its neighbors."""
     ix, iy, iz = unpack(voxels.keys[voxel])
@@ -256,7 +256,7 @@ def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def seen_from_source(T, T_first, H, direction, variance: float):
     """Information (k, k) and a direction (k,) of twists, in the source's own frame.
 
@@ -272,7 +272,7 @@ def seen_from_source(T, T_first, H, direction, variance: float):
     return information, turned
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def definite_inverse(matrix):
     """Inverse of a positive definite (k, k), of another zeros."""
     k = matrix.shape[0]
@@ -287,7 +287,7 @@ def definite_inverse(matrix):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def congruent(A, H):
     """AᵀHA of two (k, k)."""
     k = H.shape[0]

@@ -7,7 +7,7 @@ from scanchain.kernels.compiling import njit
 GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     """True if the normal equations could be solved; the step ξ of one iteration is written to ``x`` (k,).
 
@@ -36,7 +36,7 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     return solved
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def solve(H, b, damping: float, factor, x) -> bool:
     """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
     k = b.shape[0]
@@ -64,7 +64,7 @@ def solve(H, b, damping: float, factor, x) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def predicted_decrease(H, b, x) -> float:
     """Decrease of the quadratic model along the step, −bᵀx − ½ xᵀHx."""
     total = 0.0
@@ -76,7 +76,7 @@ def predicted_decrease(H, b, x) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def relax(damping: float, gain: float) -> float:
     """The damping after an accepted step of gain ratio ρ: λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999)."""
     return damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)

@@ -8,7 +8,7 @@ from scanchain.kernels.voxels.voxel_shapes import LINE, PLANE, POINT, move, shap
 _SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H, b):
     """Normal equations of all residuals at T, written to H (k, k) and b (k,).
 
@@ -36,7 +36,7 @@ def normal_equations(voxels, points, T, origin, correspondence, weight, scale_m:
     return sums
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float, H, b):
     """``normal_equations`` in space, without curvature: where a 3D scan spends most of its time.
 
@@ -67,7 +67,7 @@ def _in_space(voxels, points, T, origin, correspondence, weight, scale_m: float,
     return cost, total_weight, squares
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float, H, b):
     """``normal_equations`` in the plane, without curvature, as ``_in_space``."""
     cost = total_weight = squares = 0.0
@@ -94,7 +94,7 @@ def _in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float,
     return cost, total_weight, squares
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _plus(h, b, w, shape, normal, moved, residual, along):
     """Upper triangle h (21), by rows, and gradient b (6) with one correspondence of weight w, by its shape."""
     if shape != PLANE:
@@ -105,7 +105,7 @@ def _plus(h, b, w, shape, normal, moved, residual, along):
     return h, b
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _plus_in_plane(h, b, w, shape, normal, moved, residual, r):
     """Upper triangle h (6), by rows, and gradient b (3) with one correspondence of weight w.
 
@@ -123,7 +123,7 @@ def _plus_in_plane(h, b, w, shape, normal, moved, residual, r):
     return upper, (b[0] + w * nx * r, b[1] + w * ny * r, b[2] + w * turn * r)
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _unfold(upper, H):
     """Write an upper triangle, by rows, to the symmetric H."""
     k = 0
@@ -133,7 +133,7 @@ def _unfold(upper, H):
             k += 1
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _plus_plane(h, b, w, moved, normal, r):
     """Upper triangle h (21), by rows, and gradient b (6) with one residual: J = [n, p × n]."""
     (px, py, pz), (nx, ny, nz) = moved, normal
@@ -150,7 +150,7 @@ def _plus_plane(h, b, w, moved, normal, r):
     return upper, (b[0] + wr * nx, b[1] + wr * ny, b[2] + wr * nz, b[3] + wr * cx, b[4] + wr * cy, b[5] + wr * cz)
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _plus_point(h, b, w, moved, residual):
     """Upper triangle h (21), by rows, and gradient b (6) with three residuals: J = [I, −p×]."""
     (px, py, pz), (ex, ey, ez) = moved, residual
@@ -166,7 +166,7 @@ def _plus_point(h, b, w, moved, residual):
     return upper, (b[0] + w * ex, b[1] + w * ey, b[2] + w * ez, b[3] + turn[0], b[4] + turn[1], b[5] + turn[2])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def information(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
     """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
     if H.shape[0] == 6:
@@ -175,7 +175,7 @@ def information(voxels, points, T, origin, correspondence, weight, scale_m: floa
         _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
     """``information`` in space."""
     s2, none = scale_m * scale_m, (0.0,) * 6
@@ -195,7 +195,7 @@ def _information_in_space(voxels, points, T, origin, correspondence, weight, sca
     _unfold(plain, unweighted)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
     """``information`` in the plane."""
     s2, none = scale_m * scale_m, (0.0,) * 3
@@ -215,7 +215,7 @@ def _information_in_plane(voxels, points, T, origin, correspondence, weight, sca
     _unfold(plain, unweighted)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: float):
     """Covariance (6, 6) of b in ``normal_equations``, by how b differs from voxel to voxel: Σ b_v b_vᵀ.
 
@@ -253,7 +253,7 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
     return spread
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
     """The cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m², as ``normal_equations`` returns them."""
     cost = total_weight = squares = 0.0
@@ -272,7 +272,7 @@ def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
     return cost, total_weight, squares
 
 
-@njit(cache=True, inline="always")
+@njit(forceinline=True)
 def _residual(shape, q, normal, x, y, z):
     """Residual vector (3) of a point, its offset along the voxel's direction, and its squared length."""
     (qx, qy, qz), (nx, ny, nz) = q, normal
@@ -285,7 +285,7 @@ def _residual(shape, q, normal, x, y, z):
     return (ex, ey, ez), along, ex * ex + ey * ey + ez * ez
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_curvature(voxels, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H):
     """Add the second derivatives of eᵀ exp(ξ) p at ξ = 0 to H (k, k), e the residual of each correspondence.
 

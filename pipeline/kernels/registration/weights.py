@@ -20,7 +20,7 @@ _NOISE_WIDTHS = 3.0  # times σ, the width of a plane at which half of its norma
 _UPRIGHT_COSINE = 0.5  # between a line and the lidar's vertical, at which the weight is halved
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weigh(voxels, points, T, correspondence, variance: float, weight):
     """Weights (N,) of all correspondences at the pose T: σ²/(variance of the residual) ≤ 1, 0 without one.
 
@@ -61,7 +61,7 @@ def weigh(voxels, points, T, correspondence, variance: float, weight):
             weight[i] = without_shape
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _plane_variance(cell, ex, ey, ez) -> float:
     """Variance of the fitted plane at (ex, ey, ez) from the mean, over that of a point on it."""
     out = cell[DIRECTION] * ex + cell[DIRECTION + 1] * ey + cell[DIRECTION + 2] * ez
@@ -70,7 +70,7 @@ def _plane_variance(cell, ex, ey, ez) -> float:
     return cell[MEAN_TERM] + cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * along2
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _surface_weight(cell, x, y, z, variance: float) -> float:
     """Weight of a plane that the ray (x, y, z) hits, as a surface rather than the points of one ring, 0 to 1."""
     out = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
@@ -80,7 +80,7 @@ def _surface_weight(cell, x, y, z, variance: float) -> float:
     return sine2 / (sine2 + edge) * width2 / (width2 + _NOISE_WIDTHS * _NOISE_WIDTHS * variance)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _upright_weight(cell, T, x, y, z) -> float:
     """Weight of a line by how far it runs across the rings, along the growing elevation of the ray, 0 to 1."""
     zx, zy, zz = T[0, 2], T[1, 2], T[2, 2]

@@ -11,7 +11,7 @@ HIT, NEAR = 2, 1  # score of a point in a cell with a surface, and in one beside
 APART_RAD = 0.1  # least angle between two distinct poses
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def draw_hits(means, origin, resolution_m: float, grid):
     """Score HIT where a surface point lies, NEAR in the eight cells around it.
 
@@ -27,7 +27,7 @@ def draw_hits(means, origin, resolution_m: float, grid):
         grid[row, column] = HIT
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def fill_pyramid(pyramid):
     """Fill level h of (levels, rows, columns) with the best score in the 2ʰ × 2ʰ cells that start at each cell."""
     levels, rows, columns = pyramid.shape
@@ -47,7 +47,7 @@ def fill_pyramid(pyramid):
                 pyramid[h, row, column] = best
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def search(
     pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float,
     apart_m: float, rival: float, answers: int,
@@ -88,7 +88,7 @@ def search(
     return found[:count]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def is_taken(
     taken, level: int, turn: int, dx: int, dy: int, resolution_m: float, turn_rad: float, apart_m: float
 ) -> bool:
@@ -102,7 +102,7 @@ def is_taken(
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def turned_cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
     """Column and row (2·turns + 1, N, 2) of every point under every turn of T."""
     yaw = math.atan2(T[1, 0], T[0, 0])
@@ -118,7 +118,7 @@ def turned_cells(points, T, origin, resolution_m: float, turns: int, turn_rad: f
     return cells
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _roots(pyramid, cells, shifts: int, least: float):
     """Heap of the largest windows: (−bound, level, turn, first shift along x, along y)."""
     top = pyramid.shape[0] - 1
@@ -133,7 +133,7 @@ def _roots(pyramid, cells, shifts: int, least: float):
     return heap
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: int, least: float):
     """Push the four windows of the next level that make up one."""
     half = 1 << level
@@ -146,7 +146,7 @@ def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: 
                 heapq.heappush(heap, (-bound, level, turn, x, y))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def score(layer, cells, dx: int, dy: int) -> int:
     """Score of the points, shifted by so many cells, in a layer; 0 for cells outside."""
     total = 0

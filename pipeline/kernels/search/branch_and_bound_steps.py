@@ -11,7 +11,7 @@ BEST, LIVE, FREE, USED, FOUND = range(5)  # of a queue: highest bound, windows, 
 _EARLY = 16  # points between two tests whether the rest can still reach the least score
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def mark_places(positions, origin, resolution_m: float, reach_m: float, grid):
     """Set the cells of ``grid`` (rows, columns) uint8 to 1 whose middle is within reach of a position (K, 2)."""
     reach = int(np.ceil(reach_m / resolution_m))
@@ -24,7 +24,7 @@ def mark_places(positions, origin, resolution_m: float, reach_m: float, grid):
                     grid[row, column] = 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def queue_of_all(layers, places, offsets, boxes, least: int, most: int):
     """The largest windows with a place in them and a bound of ``least``, ``most`` at most, in a queue.
 
@@ -49,7 +49,7 @@ def queue_of_all(layers, places, offsets, boxes, least: int, most: int):
     return windows, heads, held
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def split_best(
     layers, places, offsets, boxes, windows, heads, held, found, steps: int, resolution_m: float,
     turn_rad: float, least: int, apart_m: float, rival: float,
@@ -87,7 +87,7 @@ def split_best(
     return windows, taken
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _push(windows, heads, held, bound: int, level: int, turn: int, column: int, row: int):
     """Put a window into a queue; its array of windows, a larger one where it was full."""
     slot = held[FREE]
@@ -107,7 +107,7 @@ def _push(windows, heads, held, bound: int, level: int, turn: int, column: int, 
     return windows
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _pop(windows, heads, held):
     """Level, turn, column and row of the last window with the highest bound, which leaves the queue."""
     slot = heads[held[BEST]]
@@ -118,7 +118,7 @@ def _pop(windows, heads, held):
     return windows[slot, LEVEL], windows[slot, TURN], windows[slot, COLUMN], windows[slot, ROW]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _score(layer, offsets, box, x: int, y: int, least: int) -> int:
     """Score of the points with the lidar in a cell; −1 where it cannot reach the least, or a point lies outside.
 

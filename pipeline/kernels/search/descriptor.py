@@ -7,7 +7,7 @@ from scanchain.kernels.compiling import njit
 HEIGHTS = 64  # number of heights, one bit of a cell each
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def mark_heights(points, T, cell_m: float, masks):
     """Set the bit of every cube that holds a point.
 
@@ -26,7 +26,7 @@ def mark_heights(points, T, cell_m: float, masks):
             masks[row, column] |= np.uint64(1) << np.uint64(bit)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_heights(masks, counts):
     """Fill ``counts`` (S, S) uint8 with the number of occupied heights of each cell above its lowest one."""
     for row in range(masks.shape[0]):

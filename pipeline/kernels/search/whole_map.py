@@ -12,7 +12,7 @@ SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 _EARLY = 32  # points between two tests whether the rest can still reach the least score
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def score_cells(log_odds, limit: float, cells):
     """Score of a point in each cell: a surface, beside one, free, or unknown.
 
@@ -32,7 +32,7 @@ def score_cells(log_odds, limit: float, cells):
                 cells[row, column] = SURFACE
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def interleave(layer, level: int):
     """Cells (2ˡ, 2ˡ, rows, columns) of a layer at level l, by their place in its 2ˡ × 2ˡ blocks.
 
@@ -47,7 +47,7 @@ def interleave(layer, level: int):
     return blocks
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def find_room(cells, level: int, spans):
     """Windows (rows, columns) of 2ˡ × 2ˡ cells with room for the lidar; spans (rows, 2): first, past the last."""
     size = 1 << level
@@ -65,7 +65,7 @@ def find_room(cells, level: int, spans):
     return has_room
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def score_windows(blocks, level: int, has_room, spans, cells, first: int, least: float):
     """Windows with room that score at least so much under some headings: (K, 5) −bound, level, turn, column, row.
 
@@ -89,7 +89,7 @@ def score_windows(blocks, level: int, has_room, spans, cells, first: int, least:
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _score_heading(blocks, level: int, spans, cells, scores):
     """Score of the points in every window, under one heading: cells (N, 2). The innermost loop is vectorized."""
     size, rows, columns = 1 << level, blocks.shape[2], blocks.shape[3]
@@ -105,7 +105,7 @@ def _score_heading(blocks, level: int, spans, cells, scores):
                 of_row[column] += added[column]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def best_poses(
     pyramid, cells, windows, resolution_m: float, least: float, rival: float, apart_m: float, answers: int
 ):
@@ -137,7 +137,7 @@ def best_poses(
     return found[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _split(heap, pyramid, cells, level: int, turn: int, x: int, y: int, least: float):
     """Push those of the four windows of the next level that make up one which reach the least score."""
     half = 1 << level
@@ -152,7 +152,7 @@ def _split(heap, pyramid, cells, level: int, turn: int, x: int, y: int, least: f
                 heapq.heappush(heap, (-bound, level, turn, far_x, far_y))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def climb(cells, points, origin, resolution_m: float, pose, step_rad: float):
     """Move a pose (x, y, yaw), in place, uphill on the score of its points; returns their mean score.
 
@@ -175,7 +175,7 @@ def climb(cells, points, origin, resolution_m: float, pose, step_rad: float):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _mean_score(cells, points, origin, resolution_m: float, x: float, y: float, yaw: float) -> float:
     c, s = math.cos(yaw) / resolution_m, math.sin(yaw) / resolution_m
     left, low = (x - origin[0]) / resolution_m, (y - origin[1]) / resolution_m
@@ -188,7 +188,7 @@ def _mean_score(cells, points, origin, resolution_m: float, x: float, y: float, 
     return total / points.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def turned(points, resolution_m: float, turns: int):
     """Column and row (turns, N, 2) of points (N, 2), m, from the lidar's cell under headings 2π / turns apart."""
     cells = np.empty((turns, points.shape[0], 2), np.int32)
@@ -201,13 +201,13 @@ def turned(points, resolution_m: float, turns: int):
     return cells
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _is_room(cell: int) -> bool:
     """True for a cell that the lidar can be in."""
     return cell in (FREE, NEAR)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _is_taken(
     found, level: int, turn: int, x: int, y: int, resolution_m: float, turns: int, apart_m: float
 ) -> bool:
@@ -223,7 +223,7 @@ def _is_taken(
     return False
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _score(layer, cells, x: int, y: int, least: float) -> int:
     """Score of the points around a cell in a layer; given up once the rest cannot reach the least."""
     count = cells.shape[0]

@@ -9,7 +9,7 @@ from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
 _BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, table, chosen):
     """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
 
@@ -44,7 +44,7 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _keys(points, scale: float, low: float, high: float, keys):
     """Write the key of each point's voxel, EMPTY for squared ranges below low or above high."""
     planar = points.shape[1] == 2
@@ -57,7 +57,7 @@ def _keys(points, scale: float, low: float, high: float, keys):
         keys[i] = key if (low <= square) & (square <= high) else EMPTY
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def gather(points, chosen, out):
     """Copy the chosen rows of points (N, d) to ``out`` (M, d)."""
     for k in range(out.shape[0]):
@@ -65,7 +65,7 @@ def gather(points, chosen, out):
             out[k, axis] = points[chosen[k], axis]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def deskew(points, shares, twist):
     """Move each point, in place, to its position as seen by the lidar at one instant, usually the scan's middle.
 

@@ -9,25 +9,25 @@ _OFFSET = 1 << 20
 _LIMIT = (1 << 21) - 1
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def pack(ix: int, iy: int, iz: int) -> int:
     """One non-negative int64 for a voxel; unique for coordinates in [−2²⁰, 2²⁰), larger ones collide."""
     return (((ix + _OFFSET) & _LIMIT) << 42) | (((iy + _OFFSET) & _LIMIT) << 21) | ((iz + _OFFSET) & _LIMIT)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def key_of(x: float, y: float, z: float, scale: float) -> int:
     """Key of the voxel that holds a point; scale : voxels a meter."""
     return pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def unpack(key: int):
     """The voxel coordinates of a key, pack's inverse."""
     return (key >> 42) - _OFFSET, ((key >> 21) & _LIMIT) - _OFFSET, (key & _LIMIT) - _OFFSET
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def find(keys, key: int):
     """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs."""
     slot = first_slot(keys.size, key)
@@ -40,7 +40,7 @@ def find(keys, key: int):
         slot = (slot + 1) & (keys.size - 1)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def find_row(rows, keys, key: int) -> int:
     """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
 
@@ -56,7 +56,7 @@ def find_row(rows, keys, key: int) -> int:
         slot = (slot + 1) & (rows.size - 1)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def first_slot(slots: int, key: int) -> int:
     """The multiplicative hash of Knuth (1973, . 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)

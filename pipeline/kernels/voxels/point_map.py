@@ -8,7 +8,7 @@ from scanchain.kernels.voxels.hashing import find, key_of
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def add_points(T, points, max_range_m, voxel_m, slots, cells, sums, counts, used):
     """Move points by a pose and add each to the sum of its voxel, until the table is full.
 
@@ -40,7 +40,7 @@ def add_points(T, points, max_range_m, voxel_m, slots, cells, sums, counts, used
     return used, points.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def merge_voxels(old_sums, old_counts, voxel_m, slots, cells, sums, counts):
     """Put the voxels (M, d) of one table into another, empty one of the same or larger voxels; the rows taken."""
     d = old_sums.shape[1]
@@ -57,7 +57,7 @@ def merge_voxels(old_sums, old_counts, voxel_m, slots, cells, sums, counts):
     return used
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _row_of(point, scale, slots, cells, counts, used):
     """Rows taken, and the row of the point's voxel; −1 where it is new and there is no room."""
     key = key_of(point[0], point[1], point[2], scale)

@@ -44,7 +44,7 @@ class Voxels(NamedTuple):
     size_m: float
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def insert(voxels, points, T, tick: int, alone: float):
     """Add points (N, d), moved by T into the map's frame, and refit the voxels that have grown by enough.
 
@@ -73,7 +73,7 @@ def insert(voxels, points, T, tick: int, alone: float):
             voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _locate(voxels, points, T, moved, keys, rows):
     """Points moved by T, keys of their voxels, and rows of those found in the first slot of the table, else −1.
 
@@ -91,7 +91,7 @@ def _locate(voxels, points, T, moved, keys, rows):
             rows[i] = -1
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def move(T, points, i: int):
     """Point i moved by the pose T; z is 0 in 2D."""
     x, y = points[i, 0], points[i, 1]
@@ -105,7 +105,7 @@ def move(T, points, i: int):
     )
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def shape_of(cells, voxel: int):
     """Shape of a voxel, its mean and its direction.
 
@@ -116,7 +116,7 @@ def shape_of(cells, voxel: int):
     return cells[voxel, SHAPE], q, normal
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tick: int):
     """Copy to ``kept``, an empty map, the voxels within the radius of (x, y, z) and not older than the tick."""
     for voxel in range(voxels.used[0]):
@@ -133,7 +133,7 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
             kept.history[new, k] = voxels.history[voxel, k]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _voxel_at(voxels, key: int, tick: int) -> int:
     """Row of the voxel with that key; a new one is empty."""
     row = find_row(voxels.rows, voxels.keys, key)
@@ -149,7 +149,7 @@ def _voxel_at(voxels, key: int, tick: int) -> int:
     return voxel
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
     ix, iy, iz = unpack(voxels.keys[voxel])
     x -= (ix + 0.5) * voxels.size_m
@@ -168,7 +168,7 @@ def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
     moments[voxel, 9] += z * z
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
     """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
 
@@ -186,13 +186,13 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
         _fit_shape(sums, dimension, cell)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _fit_shape(m, dimension: int, cell) -> float:
     """Shape and direction of the points with the moments m (10,); returns the least variance within that, m²."""
     return _fit_2d(m, cell) if dimension == 2 else _fit_3d(m, cell)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
     """Moments of the 3ᵈ voxels around one, relative to its center, written to ``sums`` (10,)."""
     sums.fill(0.0)
@@ -217,7 +217,7 @@ def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
                 sums[9] += m[9] + 2.0 * z * m[3] + n * z * z
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fit_2d(m, cell):
     """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
     cell[SHAPE] = POINT
@@ -234,7 +234,7 @@ def _fit_2d(m, cell):
     return large
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fit_3d(m, cell):
     """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
 
