@@ -107,7 +107,6 @@ def run(
     from scanchain.runs.job import Job
     from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
-    from scanchain.viz.report.beside import Reporter
 
     def record(path: Path | None, **options: Any) -> Recorder:
         if ctx.obj is OWN_PROCESS and not plugins.foreign:
@@ -128,8 +127,8 @@ def run(
         checkpoint_s=checkpoint,
         command=tuple(sys.argv),
     )
-    with Reporter(write_report, beside=ctx.obj is OWN_PROCESS) as reporter, Terminal("scans") as terminal:
-        finished = run_log(job, record, terminal, reporter.write)
+    with Terminal("scans") as terminal:
+        finished = run_log(job, record, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     fails = finished.metrics.verdict.fails(strict=strict)
     if fails and not is_seen:

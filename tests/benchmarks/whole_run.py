@@ -115,7 +115,6 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     from scanchain.runs import processing, results, run
     from scanchain.runs.resume.journal import Journal
     from scanchain.runs.step_table import StepTable
-    from scanchain.viz.report.beside import Reporter
 
     watch = Stopwatch()
     watch.add("start and imports", time() - began)
@@ -130,7 +129,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("other results", processing, "write_results", "record_results")
     watch.over("other results", StepTable, "write")
     watch.over("other results", run, "_judge", "measure")
-    watch.over("report", Reporter, "write")
+    watch.over("report", run, "_report")
     open_recording = api.open_recorder
 
     def record(*arguments: Any, **options: Any) -> Any:

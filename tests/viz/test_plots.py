@@ -1,8 +1,14 @@
+import re
+from base64 import b64decode
+from io import BytesIO
+
 import numpy as np
 import pytest
 
 from scanchain import lie
 from scanchain.verdict import Kind, Stretch
+from scanchain.viz.pictures.axis import Axis, width_of
+from scanchain.viz.pictures.figure import SvgFigure, palette_of
 from scanchain.viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
@@ -88,3 +94,85 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch
     with pytest.raises(OSError, match="No space"):
         draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0))
     assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+def numbers_of(text):
+    return np.array(re.findall(r"-?[\d.]+", text), float)
+
+
+@pytest.mark.parametrize("is_upright", [False, True])
+def test_ticks_are_round_numbers_where_they_belong_that_do_not_touch(is_upright):
+    random, length = np.random.default_rng(4), 150.0 if is_upright else 260.0
+    for _ in range(300):
+        axis, low = Axis(), random.choice([-1.0, 1.0]) * 10.0 ** random.uniform(-4.0, 6.7)
+        size = abs(low) * 10.0 ** random.uniform(-4.0, 1.0)
+        axis.limit(low, low + size)
+        places, texts = zip(*axis.ticks(length, is_upright=is_upright), strict=True)
+        values = np.array([float(text.replace("−", "-")) for text in texts])
+        np.testing.assert_allclose(low + np.array(places) * size, values, atol=1e-6 * size)
+        steps = np.diff(values)
+        np.testing.assert_allclose(steps, steps[:1].sum(), rtol=1e-6)
+        room = length * np.diff(places)
+        assert (room > (8.0 if is_upright else max(map(width_of, texts)))).all()
+        assert len(values) >= (4 if is_upright else 1), (low, size)
+
+
+@pytest.mark.parametrize(
+    ("ends", "shown"),
+    [
+        ((0.05, 30.0), ["0.1", "1", "10"]),
+        ((3.0, 90.0), ["5", "10", "20", "50"]),
+        ((1.2, 1.9), ["1.2", "1.3", "1.4", "1.5", "1.6", "1.7", "1.8", "1.9"]),
+        ((1e-9, 1e9), ["1e-09", "1e-06", "0.001", "1", "1000", "1e+06", "1e+09"]),
+    ],
+)
+def test_a_logarithmic_axis_has_decades_and_where_they_are_few_more(ends, shown):
+    axis = Axis(is_logarithmic=True)
+    axis.limit(*ends)
+    ticks = axis.ticks(200.0, is_upright=True)
+    assert [text.replace("−", "-") for _, text in ticks] == shown
+    for place, text in ticks:
+        assert ends[0] * (ends[1] / ends[0]) ** place == pytest.approx(float(text.replace("−", "-")))
+
+
+@pytest.mark.parametrize("name", ["", "x", "y"])
+def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(name):
+    x, y = np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1.0, 10.0, 10.0, 100.0, 3.0])
+    figure = SvgFigure(logarithmic=name)
+    figure.line(x, y, "red")
+    drawn = re.search(r'<path d="([^"]*)" style="stroke: red', figure.svg())[1]
+    assert re.sub(r"[\d. -]", "", drawn) == "MLML"
+    places = numbers_of(drawn).reshape(-1, 2) / figure.extent
+    assert (places > 0.0).all() and (places < 1.0).all()
+    known = np.isfinite(x)
+    for column, (values, is_logarithmic) in enumerate(((x, name == "x"), (-y, name == "y"))):
+        shown = np.log(np.abs(values[known])) * np.sign(values[known]) if is_logarithmic else values[known]
+        np.testing.assert_allclose(np.corrcoef(shown, places[:, column])[0, 1], 1.0, atol=1e-6)
+
+
+def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
+    angle = np.linspace(0.0, 1.9 * np.pi, 100_000)
+    figure = SvgFigure.of_plan(np.full(2, -1.1), np.full(2, 1.1))
+    figure.line(np.cos(angle), np.sin(angle), "red")
+    end = np.array([np.cos(angle[-1]), np.sin(angle[-1])])
+    svg = figure.svg()
+    assert len(svg) < 150_000
+    points = numbers_of(re.search(r'd="(M[^"]*)" style="stroke: red', svg)[1]).reshape(-1, 2)
+    off = np.hypot(*(points / figure.extent * 2.2 - 1.1).T) - 1.0
+    assert np.abs(off).max() < 1e-4
+    np.testing.assert_allclose(points[-1], 129.6 * (1.0 + np.array([1.0, -1.0]) * end / 1.1), atol=0.1)
+
+
+def test_an_image_of_a_figure_has_its_colors_and_its_first_row_at_the_lower_corner():
+    pixels = np.random.default_rng(0).integers(0, 8, (5, 7)).astype(np.uint8)
+    palette = palette_of(("ff0000", "00ff00", "0000ff"), 8)
+    palette[:, 3] = np.arange(8) * 36
+    for is_downward in (False, True):
+        figure = SvgFigure.of_plan(np.zeros(2), np.array([7.0, 5.0]))
+        if is_downward:
+            figure.y.limit(5.0, 0.0)
+        figure.image(pixels, palette, np.zeros(2), np.array([7.0, 5.0]))
+        data = re.search(r"base64,([^\"]*)", figure.svg())[1]
+        seen = np.rint(255.0 * image.imread(BytesIO(b64decode(data)))).astype(np.uint8)
+        expected = palette[pixels if is_downward else pixels[::-1]]
+        assert np.array_equal(seen, expected)

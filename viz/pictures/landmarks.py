@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.study import Estimate, Study
-from scanchain.viz.pictures.figure import INK, SvgFigure, write_figure
+from scanchain.viz.pictures.figure import INK, SvgFigure, palette_of, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +25,8 @@ _FRAME = "#cccccc"
 _ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
+_ELLIPSE_WIDTH, _ELLIPSE_OPACITY = 0.6, 0.5
+_BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
 _TITLE = {"loc": "left", "fontsize": 11}
 
 
@@ -43,7 +45,7 @@ def draw_estimate(path: Path, study: Study) -> None:
         (panels[0], study.before, BEFORE, "before"),
         (panels[1], study.after, AFTER, "after"),
     ):
-        _draw_truth(axes, study, _TRUTH)
+        _draw_truth(axes, study)
         _draw_state(axes, estimate, color, title)
         accuracy = estimate.accuracy.poses_m
         error = f": poses {accuracy:.3g} m off" if np.isfinite(accuracy) else ""
@@ -56,29 +58,42 @@ def draw_estimate(path: Path, study: Study) -> None:
     write_figure(path, figure, dpi=150, bbox_inches="tight")
 
 
-def svg_before(study: Study, number: int) -> Markup:
-    """Trajectory and landmarks before optimization, for a page on which it is the ``number``-th problem."""
-    with SvgFigure.of_plan(f"before{number}", *_frame(study)) as figure:
-        _draw_truth(figure.axes, study, INK)
-        _draw_state(figure.axes, study.before, BEFORE, "before")
-        return figure.svg()
+def svg_before(study: Study) -> Markup:
+    """Trajectory and landmarks before optimization, for a page."""
+    return _svg(study, study.before, BEFORE).svg()
 
 
-def svg_after(study: Study, number: int) -> Markup:
+def svg_after(study: Study) -> Markup:
     """The same after it."""
-    with SvgFigure.of_plan(f"after{number}", *_frame(study)) as figure:
-        _draw_truth(figure.axes, study, INK)
-        _draw_state(figure.axes, study.after, AFTER, "after")
-        _draw_ellipses(figure.axes, study)
-        return figure.svg()
+    figure = _svg(study, study.after, AFTER)
+    x, y = _in_truth(study.after)[1].T
+    figure.ellipses(x, y, *_ellipses(study), AFTER, _ELLIPSE_WIDTH, _ELLIPSE_OPACITY)
+    return figure.svg()
 
 
-def svg_factor(method: MethodResult, number: int) -> Markup:
+def _svg(study: Study, estimate: Estimate, color: str) -> SvgFigure:
+    figure = SvgFigure.of_plan(*_frame(study))
+    (poses_x, poses_y), (x, y) = (each.T for each in _in_truth(estimate))
+    (true_x, true_y), (there_x, there_y) = study.true_poses.T, study.true_landmarks.T
+    figure.line(true_x, true_y, INK, 1.1, (4.0, 2.0))
+    figure.line(poses_x, poses_y, color, opacity=0.85)
+    figure.marks(there_x, there_y, "+", INK, 7.0, line=0.9)
+    figure.marks(x, y, "o", color, 4.0, line=0.9)
+    return figure
+
+
+def svg_factor(method: MethodResult) -> Markup:
     """Sparsity of a method's factor."""
-    with SvgFigure(f"{method.method}{number}", 4.4) as figure:
-        _draw_factor(figure.axes, method, "")
-        figure.axes.set_title("", loc="left")
-        return figure.svg()
+    size = len(method.factor.order)
+    low, high = np.zeros(2), np.full(2, float(size))
+    figure = SvgFigure.of_plan(low, high)
+    figure.x.limit(0.0, size, ticks=(0, size))
+    figure.y.limit(size, 0.0, ticks=(0, size))
+    figure.x.label, figure.y.label = f"{method.factor.nnz:,} nonzero", ""
+    figure.image(
+        np.rint(255.0 * _shades(method)).astype(np.uint8), palette_of(_BLUES), low, high, rendering="auto"
+    )
+    return figure.svg()
 
 
 def draw_factors(path: Path, studies: Sequence[Study]) -> None:
@@ -123,17 +138,17 @@ def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
     return lie.transform(T, state.poses[:, :2]), lie.transform(T, state.landmarks)
 
 
-def _draw_truth(axes: Axes, study: Study, color: str) -> None:
+def _draw_truth(axes: Axes, study: Study) -> None:
     axes.set_aspect("equal")
     axes.tick_params(labelsize=9, color=_FRAME)
     axes.set_xlabel("x [m]", fontsize=9)
     for spine in axes.spines.values():
         spine.set_color(_FRAME)
     if len(study.true_poses):
-        axes.plot(*study.true_poses.T, color=color, linewidth=1.1, linestyle=(0, (4, 2)), label="true trajectory")
+        axes.plot(*study.true_poses.T, color=_TRUTH, linewidth=1.1, linestyle=(0, (4, 2)), label="true trajectory")
     if np.isfinite(study.true_landmarks).any():
         axes.plot(
-            *study.true_landmarks.T, color=color, linestyle="none", marker="+", markersize=7,
+            *study.true_landmarks.T, color=_TRUTH, linestyle="none", marker="+", markersize=7,
             markeredgewidth=0.9, label="true landmarks", zorder=4,
         )  # fmt: skip
 
@@ -147,17 +162,22 @@ def _draw_state(axes: Axes, estimate: Estimate, color: str, when: str) -> None:
     )  # fmt: skip
 
 
-def _draw_ellipses(axes: Axes, study: Study) -> None:
-    """The 95 % ellipse of every landmark."""
-    from matplotlib.collections import EllipseCollection
-
+def _ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The 95 % ellipse of every landmark: half axes (N, 2) in meters, the longer first, and angle to x (N,)."""
     turn = study.after.T_truth_estimate[:2, :2]
     values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
-    axis_m = 2.0 * _ELLIPSE * np.sqrt(np.maximum(values, 0.0))
-    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    axes_m = _ELLIPSE * np.sqrt(np.maximum(values[:, ::-1], 0.0))
+    return axes_m, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+
+
+def _draw_ellipses(axes: Axes, study: Study) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    axes_m, angles_rad = _ellipses(study)
     ellipses = EllipseCollection(
-        axis_m[:, 1], axis_m[:, 0], angle, units="xy", offsets=_in_truth(study.after)[1],
-        offset_transform=axes.transData, facecolors="none", edgecolors=AFTER, linewidths=0.6, alpha=0.5, zorder=2,
+        2.0 * axes_m[:, 0], 2.0 * axes_m[:, 1], np.degrees(angles_rad), units="xy",
+        offsets=_in_truth(study.after)[1], offset_transform=axes.transData, facecolors="none", edgecolors=AFTER,
+        linewidths=_ELLIPSE_WIDTH, alpha=_ELLIPSE_OPACITY, zorder=2,
     )  # fmt: skip
     axes.add_collection(ellipses)
 
@@ -169,14 +189,16 @@ def _legend(figure: Figure) -> None:
     found = {}
     for axes in figure.axes:
         found |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    found["95 % ellipse of a landmark"] = Line2D([], [], color=AFTER, linewidth=0.6, alpha=0.5)
+    found["95 % ellipse of a landmark"] = Line2D(
+        [], [], color=AFTER, linewidth=_ELLIPSE_WIDTH, alpha=_ELLIPSE_OPACITY
+    )
     figure.legend(
         list(found.values()), list(found), loc="outside lower center", ncols=4, frameon=False, fontsize=9
     )
 
 
-def _draw_factor(axes: Axes, method: MethodResult, problem: str) -> None:
-    """Nonzero entries dark; a pixel that stands for many of them is as dark as they are dense."""
+def _shades(method: MethodResult) -> NDArray[np.float64]:
+    """Nonzero entries dark, up to 1; a pixel that stands for many of them is as dark as they are dense."""
     matrix = method.factor.matrix.tocoo()
     there = matrix.data != 0.0
     size = len(method.factor.order)
@@ -185,8 +207,13 @@ def _draw_factor(axes: Axes, method: MethodResult, problem: str) -> None:
         matrix.row[there], matrix.col[there], bins=pixels, range=[[-0.5, size - 0.5], [-0.5, size - 0.5]]
     )
     share = count / (size / pixels) ** 2
-    shade = np.where(count > 0, 0.30 + 0.70 * np.sqrt(np.minimum(share, 1.0)), 0.0)
-    axes.imshow(shade, cmap="Blues", vmin=0.0, vmax=1.0, extent=(0, size, size, 0), interpolation="antialiased")
+    return np.where(count > 0, 0.30 + 0.70 * np.sqrt(np.minimum(share, 1.0)), 0.0)
+
+
+def _draw_factor(axes: Axes, method: MethodResult, problem: str) -> None:
+    size = len(method.factor.order)
+    shades = _shades(method)
+    axes.imshow(shades, cmap="Blues", vmin=0.0, vmax=1.0, extent=(0, size, size, 0), interpolation="antialiased")
     axes.set_xticks([0, size])
     axes.set_yticks([0, size])
     axes.tick_params(labelsize=7, color=_FRAME, length=2)

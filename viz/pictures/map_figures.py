@@ -12,14 +12,19 @@ from scanchain import lie
 from scanchain.data import Points
 from scanchain.maps import SavedMap
 from scanchain.runs.overlay import Overlay
-from scanchain.viz.pictures.figure import INK, SvgFigure
-from scanchain.viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, Floats, PathLine
+from scanchain.viz.pictures.figure import INK, Floats, SvgFigure, palette_of
+from scanchain.viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, PathLine
 
 _POINTS = "#808893"
 _MAX_POINTS = 120_000
 _SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
 _LOWEST = 5.0  # percentile of the heights that is taken for the ground's
+_SHADES, _HEIGHTS = 6, 36  # numbers of opacities and of colors of heights; a PNG has 256 colors
+_VIRIDIS = (
+    "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c", "1fa088", "28ae80",
+    "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
+)  # fmt: skip
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
 _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
 
@@ -50,42 +55,37 @@ def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:
     return np.vstack(clouds)
 
 
-def map_picture(name: str, points: Points, low: Floats, high: Floats) -> Markup:
+def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        draw_points(figure, points, low, high, by_height=True)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    draw_points(figure, points, low, high, by_height=True)
+    return figure.svg()
 
 
-def path_over_map(
-    name: str, points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats
-) -> Markup:
+def path_over_map(points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats) -> Markup:
     """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        draw_points(figure, points, low, high)
-        for line in lines:
-            style = (0, (3, 3)) if line.is_dashed else "-"
-            x, y = line.positions[:, :2].T
-            figure.axes.plot(x, y, color=line.color, linewidth=line.width, linestyle=style)
-        for place, marker in ((0, "o"), (-1, "s")):
-            figure.axes.plot(*path[place, :2], marker=marker, markersize=4, color=INK)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    draw_points(figure, points, low, high)
+    for line in lines:
+        x, y = line.positions[:, :2].T
+        figure.line(x, y, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
+    for place, shape in ((0, "o"), (-1, "s")):
+        x, y = path[place, :2, None]
+        figure.marks(x, y, shape, INK, 5.0)
+    return figure.svg()
 
 
 def layers_picture(
-    name: str,
-    layers: Sequence[tuple[Points, str]],
-    outlines: Sequence[tuple[Floats, str]],
-    low: Floats,
-    high: Floats,
+    layers: Sequence[tuple[Points, str]], outlines: Sequence[tuple[Floats, str]], low: Floats, high: Floats
 ) -> Markup:
     """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        for points, color in layers:
-            draw_points(figure, points, low, high, color)
-        for outline, color in outlines:
-            figure.axes.plot(*np.vstack([outline, outline[:1]])[:, :2].T, color=color, linewidth=0.8)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    for points, color in layers:
+        draw_points(figure, points, low, high, color)
+    for outline, color in outlines:
+        x, y = np.vstack([outline, outline[:1]])[:, :2].T
+        figure.line(x, y, color, 0.8)
+    return figure.svg()
 
 
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
@@ -94,20 +94,18 @@ _VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes
 _GROUND_M = 0.5  # height above the lowest points below which points in space are ground, which hides walls
 
 
-def overlay_picture(name: str, overlay: Overlay) -> Markup:
+def overlay_picture(overlay: Overlay) -> Markup:
     """Points and paths of two passes over one place, seen from above; ground is left out."""
     half_m = _VIEW_M[overlay.before.shape[1]]
     before, after = _above_ground(overlay.before), _above_ground(overlay.after)
     drawn = np.concatenate([before, after])[:, :2] if len(before) + len(after) else overlay.place[None, :2]
     low = np.maximum(overlay.place[:2] - half_m, np.minimum(drawn.min(axis=0), overlay.place[:2]) - _MARGIN_M)
     high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
-    with SvgFigure.of_plan(name, low, high) as figure:
-        for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
-            draw_points(figure, points, low, high, color)
-            figure.axes.plot(path[:, 0], path[:, 1], color=color, linewidth=1.4)
-        figure.axes.set_xlim(low[0], high[0])
-        figure.axes.set_ylim(low[1], high[1])
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
+        draw_points(figure, points, low, high, color)
+        figure.line(path[:, 0], path[:, 1], color, 1.4)
+    return figure.svg()
 
 
 def _above_ground(points: Points) -> Points:
@@ -123,43 +121,42 @@ def draw_points(
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
-        image = _image(shown[inside], low, high, color, by_height=by_height)
-        corners = (low[0], high[0], low[1], high[1])
-        figure.axes.imshow(image, extent=corners, origin="lower", interpolation="none")
+        colors = _VIRIDIS if by_height and np.ptp(shown[inside, 2]) else (color.removeprefix("#"),)
+        figure.image(*_image(shown[inside], low, high, colors), low, high)
 
 
-def _image(points: Floats, low: Floats, high: Floats, color: str, *, by_height: bool) -> NDArray[np.uint8]:
-    """(H, W, 4), clear where nothing is, opacity by the number of points, color by the highest of them."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_rgba
-
+def _image(
+    points: Floats, low: Floats, high: Floats, colors: Sequence[str]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Pixels (H, W) and palette (K, 4): the color of the highest point, opacity by the number of points."""
     width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
     edge_m = (high[0] - low[0]) / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
-    points = points[np.argsort(points[:, 2])]
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
-    colors = np.array([to_rgba(color)])
-    if by_height and np.ptp(points[:, 2]):
-        bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
-        colors = colormaps["viridis"]((points[:, 2] - bottom) / max(top - bottom, 1e-9))
-    image = np.zeros((rows, columns, 4))
-    image[row, column] = colors
+    pixel = row * columns + column
     opacity = float(np.clip(_OPAQUE / len(points), *_OPACITIES))
-    counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
-    image[:, :, 3] = 1.0 - (1.0 - opacity) ** counts
-    return np.rint(255.0 * image).astype(np.uint8)
+    counts = np.minimum(np.bincount(pixel, minlength=rows * columns), _SHADES)
+    shades, highest = palette_of(colors, _HEIGHTS if len(colors) > 1 else 1), np.zeros(rows * columns, int)
+    if len(shades) > 1:
+        bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
+        share = np.clip((points[:, 2] - bottom) / max(top - bottom, 1e-9), 0.0, 1.0)
+        np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * share).astype(int))
+    palette = np.repeat(shades, _SHADES + 1, axis=0)
+    palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_SHADES + 1))), len(shades))
+    return (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8), palette
 
 
 def loops_picture(
-    name: str, trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
+    trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
     """The trajectory (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3)."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        figure.axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 1], color=_POINTS, linewidth=0.7)
-        for by, (_, color) in CLOSURES.items():
-            chosen = edges[rejected_by == by][:, :, :2]
-            gaps = np.full((len(chosen), 1, 2), np.nan)
-            lines = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2)
-            figure.axes.plot(lines[:, 0], lines[:, 1], color=color, linewidth=0.9)
-        figure.axes.plot(*trajectory.positions[0, :2], marker="o", markersize=4, color=INK)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    figure.line(trajectory.positions[:, 0], trajectory.positions[:, 1], _POINTS, 0.7)
+    for by, (_, color) in CLOSURES.items():
+        chosen = edges[rejected_by == by][:, :, :2]
+        gaps = np.full((len(chosen), 1, 2), np.nan)
+        x, y = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2).T
+        figure.line(x, y, color, 0.9)
+    x, y = trajectory.positions[0, :2, None]
+    figure.marks(x, y, "o", INK, 5.0)
+    return figure.svg()

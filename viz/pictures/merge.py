@@ -13,9 +13,9 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Points
 from scanchain.maps import open_saved_map
-from scanchain.viz.pictures.figure import SvgFigure
+from scanchain.viz.pictures.figure import Floats, SvgFigure
 from scanchain.viz.pictures.map_figures import draw_points
-from scanchain.viz.pictures.trajectory_figures import Floats, color_of
+from scanchain.viz.pictures.trajectory_figures import color_of
 
 _CLOSURES = "#3f9b2f"
 
@@ -57,13 +57,14 @@ def read_merge(directory: Path) -> DrawnMerge:
     return DrawnMerge(sessions, positions[between], saved.dimension, Config().maps.voxel_size_m)
 
 
-def picture(name: str, drawn: DrawnMerge, points: Points, low: Floats, high: Floats) -> Markup:
+def picture(drawn: DrawnMerge, points: Points, low: Floats, high: Floats) -> Markup:
     """Paths and closures over the map (M, 3), seen from above, within corners."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        draw_points(figure, points, low, high)
-        gaps = np.full((len(drawn.closures), 1, 3), np.nan)
-        x, y, _ = np.concatenate([drawn.closures, gaps], axis=1).reshape(-1, 3).T
-        figure.axes.plot(x, y, color=_CLOSURES, linewidth=0.5)
-        for session in drawn.sessions:
-            figure.axes.plot(*session.positions[:, :2].T, color=session.color, linewidth=1.2)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    draw_points(figure, points, low, high)
+    gaps = np.full((len(drawn.closures), 1, 3), np.nan)
+    x, y, _ = np.concatenate([drawn.closures, gaps], axis=1).reshape(-1, 3).T
+    figure.line(x, y, _CLOSURES, 0.5)
+    for session in drawn.sessions:
+        x, y = session.positions[:, :2].T
+        figure.line(x, y, session.color)
+    return figure.svg()

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from scanchain.runs.closures import BACK_END, VERIFICATION
-from scanchain.viz.pictures.figure import INK, SvgFigure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-Floats = NDArray[np.float64]
+from scanchain.viz.pictures.axis import Axis
+from scanchain.viz.pictures.figure import INK, Floats, SvgFigure, palette_of
 
 # Distinguishable on white and on black, also for most color-blind readers.
 _COLORS = (
@@ -62,9 +56,9 @@ class DrawnTrajectory:
     observability: Floats
 
     @property
-    def style(self) -> dict[str, Any]:
-        """For matplotlib."""
-        return {"color": self.color, "linestyle": (0, (3, 1.5)) if self.is_dashed else "-"}
+    def dashes(self) -> tuple[float, ...]:
+        """Of its line, in widths."""
+        return (3.0, 1.5) if self.is_dashed else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,151 +79,131 @@ def color_of(place: int) -> str:
 _MAX_POINTS = 1500  # largest number of points of a line
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _MARGIN = 0.25
-_FEW_DECADES = 60.0
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
-_DOTTED: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
-_TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (3, 3))}
+_THIN, _DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
+_TRUTH_WIDTH, _TRUTH_DASHES = 0.9, (3.0, 3.0)
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
 _BAR_INCHES = 0.65  # of a color bar and its numbers
+_WORST_TO_BEST = ("ff00ff", "00ffff")
+_MAX_DOTS = 3000
 
 
-def plan(
-    name: str, trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats
-) -> Markup:
+def plan(trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats) -> Markup:
     """Seen from above, within corners."""
-    with SvgFigure.of_plan(name, low, high) as figure:
-        _each(
-            figure.axes, trajectories, lambda trajectory: (trajectory.positions[:, 0], trajectory.positions[:, 1])
-        )
-        if truth is not None:
-            figure.axes.plot(*_decimated(truth)[:, :2].T, **_TRUTH)
-        figure.axes.grid(visible=True)
-        return figure.svg()
+    figure = SvgFigure.of_plan(low, high)
+    for trajectory in _known(trajectories, "positions"):
+        x, y = _decimated(trajectory.positions)[:, :2].T
+        figure.line(x, y, trajectory.color, dashes=trajectory.dashes)
+    if truth is not None:
+        x, y = _decimated(truth)[:, :2].T
+        figure.line(x, y, TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
+    figure.has_grid = True
+    return figure.svg()
 
 
-def height(
-    name: str, trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats
-) -> Markup:
+def height(trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats) -> Markup:
     """Height over the distance traveled, within corners."""
-    with SvgFigure(name) as figure:
-        _each(figure.axes, trajectories, lambda trajectory: (trajectory.distance_m, trajectory.positions[:, 2]))
-        if truth is not None:
-            steps_m = np.linalg.norm(np.diff(truth, axis=0), axis=1)
-            distance_m = np.append(0.0, np.cumsum(steps_m))
-            rows = np.linspace(0, len(truth) - 1, min(len(truth), _MAX_POINTS)).astype(int)
-            figure.axes.plot(distance_m[rows], truth[rows, 2], **_TRUTH)
-        figure.axes.set_ylim(low[2], high[2])
-        longest_m = np.median(
-            [trajectory.distance_m[-1] for trajectory in trajectories if len(trajectory.distance_m)]
-        )
-        figure.axes.set_xlim(0.0, 1.05 * max(float(longest_m), 1.0))
-        _label(figure.axes, "distance traveled [m]", "z [m]")
-        return figure.svg()
+    figure = SvgFigure()
+    for trajectory in _known(trajectories, "positions"):
+        z = _decimated(trajectory.positions)[:, 2]
+        figure.line(_decimated(trajectory.distance_m), z, trajectory.color, dashes=trajectory.dashes)
+    if truth is not None:
+        steps_m = np.linalg.norm(np.diff(truth, axis=0), axis=1)
+        distance_m = np.append(0.0, np.cumsum(steps_m))
+        rows = np.linspace(0, len(truth) - 1, min(len(truth), _MAX_POINTS)).astype(int)
+        figure.line(distance_m[rows], truth[rows, 2], TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
+    figure.y.limit(low[2], high[2])
+    longest_m = np.median([trajectory.distance_m[-1] for trajectory in trajectories if len(trajectory.distance_m)])
+    figure.x.limit(0.0, 1.05 * max(float(longest_m), 1.0))
+    return _labeled(figure, "distance traveled [m]", "z [m]")
 
 
-def error_over_distance(name: str, trajectories: Sequence[DrawnTrajectory]) -> Markup:
+def error_over_distance(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     """Position error over the distance, after alignment."""
-    with SvgFigure(name) as figure:
-        for trajectory in _known(trajectories, "error_m"):
-            known = np.isfinite(trajectory.error_m)
-            x, y = _windowed(trajectory.distance_m[known], trajectory.error_m[known])
-            figure.axes.plot(x, np.maximum(y, 1e-4), **trajectory.style)
-        _logarithmic(figure.axes, "y")
-        _label(figure.axes, "distance traveled [m]", "position error [m]")
-        return figure.svg()
+    figure = SvgFigure(logarithmic="y")
+    for trajectory in _known(trajectories, "error_m"):
+        known = np.isfinite(trajectory.error_m)
+        x, y = _windowed(trajectory.distance_m[known], trajectory.error_m[known])
+        figure.line(x, np.maximum(y, 1e-4), trajectory.color, dashes=trajectory.dashes)
+    return _labeled(figure, "distance traveled [m]", "position error [m]")
 
 
-def distribution(
-    name: str, trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str
-) -> Markup:
+def distribution(trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str) -> Markup:
     """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
-    with SvgFigure(name) as figure:
-        ends = []
-        for trajectory in _known(trajectories, key):
-            values = getattr(trajectory, key)
-            values = np.maximum(np.sort(unit_scale * values[np.isfinite(values)]), 1e-6)
-            _cumulative(figure.axes, trajectory, values)
-            ends.append(np.percentile(values, _SHOWN_SHARES))
-        figure.axes.set_xlim(0.9 * np.min(ends), 1.1 * np.max(ends))
-        _logarithmic(figure.axes, "x")
-        figure.axes.set_ylim(0.0, 100.0)
-        _label(figure.axes, label, "share below [%]")
-        return figure.svg()
+    figure, ends = SvgFigure(logarithmic="x"), []
+    for trajectory in _known(trajectories, key):
+        values = getattr(trajectory, key)
+        values = np.maximum(np.sort(unit_scale * values[np.isfinite(values)]), 1e-6)
+        _cumulative(figure, trajectory, values)
+        ends.append(np.percentile(values, _SHOWN_SHARES))
+    figure.x.limit(0.9 * np.min(ends), 1.1 * np.max(ends))
+    figure.y.limit(0.0, 100.0)
+    return _labeled(figure, label, "share below [%]")
 
 
-def time_per_scan(name: str, trajectories: Sequence[DrawnTrajectory]) -> Markup:
+def time_per_scan(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     """Milliseconds along the log."""
-    with SvgFigure(name) as figure:
-        for trajectory in _known(trajectories, "seconds"):
-            x, y = _windowed(np.arange(len(trajectory.seconds), dtype=np.float64), 1e3 * trajectory.seconds)
-            figure.axes.plot(x, y, **{**trajectory.style, "linewidth": 0.9})
-        _logarithmic(figure.axes, "y")
-        _label(figure.axes, "scan", "time of a scan [ms]")
-        return figure.svg()
+    figure = SvgFigure(logarithmic="y")
+    for trajectory in _known(trajectories, "seconds"):
+        x, y = _windowed(np.arange(len(trajectory.seconds), dtype=np.float64), 1e3 * trajectory.seconds)
+        figure.line(x, y, trajectory.color, 0.9, trajectory.dashes)
+    return _labeled(figure, "scan", "time of a scan [ms]")
 
 
-def consistency(name: str, trajectories: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Markup:
+def consistency(trajectories: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Markup:
     """Distribution of the NEES beside the one that exact covariances would give (dotted)."""
-    with SvgFigure(name) as figure:
-        for trajectory in _known(trajectories, "nees"):
-            values = np.sort(trajectory.nees[np.isfinite(trajectory.nees)])
-            _cumulative(figure.axes, trajectory, np.maximum(values, 1e-4))
-        shares = np.linspace(0.001, 0.999, 200)
-        ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
-        figure.axes.plot(ideal, 100.0 * shares, **_DOTTED)
-        _logarithmic(figure.axes, "x")
-        figure.axes.set_ylim(0.0, 100.0)
-        _label(figure.axes, "squared error over covariance (1 is exact on average)", "motions below [%]")
-        return figure.svg()
+    figure = SvgFigure(logarithmic="x")
+    for trajectory in _known(trajectories, "nees"):
+        values = np.sort(trajectory.nees[np.isfinite(trajectory.nees)])
+        _cumulative(figure, trajectory, np.maximum(values, 1e-4))
+    shares = np.linspace(0.001, 0.999, 200)
+    ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
+    figure.line(ideal, 100.0 * shares, INK, _THIN, _DOTS)
+    figure.y.limit(0.0, 100.0)
+    return _labeled(figure, "squared error over covariance (1 is exact on average)", "motions below [%]")
 
 
-def observability(name: str, trajectories: Sequence[DrawnTrajectory]) -> Markup:
+def observability(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     """Observability scan by scan; below 1 (dotted) a scan is degenerate."""
-    with SvgFigure(name) as figure:
-        for trajectory in _known(trajectories, "observability"):
-            x = np.arange(len(trajectory.observability), dtype=np.float64)
-            known = np.clip(trajectory.observability, _LOWEST, _HIGHEST)
-            figure.axes.plot(*_windowed(x, known, np.min), **trajectory.style)
-        figure.axes.axhline(1.0, **_DOTTED)
-        _logarithmic(figure.axes, "y")
-        _label(figure.axes, "scan", "observability")
-        return figure.svg()
+    figure = SvgFigure(logarithmic="y")
+    for trajectory in _known(trajectories, "observability"):
+        x = np.arange(len(trajectory.observability), dtype=np.float64)
+        known = np.clip(trajectory.observability, _LOWEST, _HIGHEST)
+        figure.line(*_windowed(x, known, np.min), trajectory.color, dashes=trajectory.dashes)
+    figure.level(1.0, _THIN, _DOTS)
+    return _labeled(figure, "scan", "observability")
 
 
-def innovations(
-    name: str, curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]
-) -> Markup:
+def innovations(curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]) -> Markup:
     """Innovations (N,) over their limits scan by scan, 1 (dotted) is a finding; stretches are shaded."""
-    with SvgFigure(name) as figure:
-        for first, last, color in stretches:
-            figure.axes.axvspan(first - 0.5, last + 0.5, color=color, alpha=0.2, linewidth=0.0)
-        for values, color in curves.values():
-            x = np.arange(len(values), dtype=np.float64)
-            shown = np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST)
-            figure.axes.plot(*_windowed(x, shown, np.max), color=color, linewidth=0.9)
-        figure.axes.axhline(1.0, **_DOTTED)
-        _label(figure.axes, "scan", "innovation / limit")
-        return figure.svg()
+    figure = SvgFigure()
+    for first, last, color in stretches:
+        figure.span(first - 0.5, last + 0.5, color, 0.2)
+    for values, color in curves.values():
+        x = np.arange(len(values), dtype=np.float64)
+        shown = np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST)
+        figure.line(*_windowed(x, shown, np.max), color, 0.9)
+    figure.level(1.0, _THIN, _DOTS)
+    return _labeled(figure, "scan", "innovation / limit")
 
 
-def observability_plan(name: str, trajectory: DrawnTrajectory) -> Markup:
-    """Observability on the trajectory from above, the worst scans on top."""
-    from matplotlib.colors import LogNorm
-
-    low, high = frame([trajectory], None)
-    order = np.argsort(-trajectory.observability)
-    with SvgFigure.of_plan(name, low, high, spare=_BAR_INCHES) as figure:
-        x, y = trajectory.positions[order, :2].T
-        size = float(np.clip(3000.0 / len(order), 4.0, 30.0))
-        dots = figure.axes.scatter(
-            x, y, c=np.clip(trajectory.observability[order], 1.0, _HIGHEST), s=size, cmap="cool_r", linewidths=0,
-            norm=LogNorm(1.0, _HIGHEST), rasterized=True,
-        )  # fmt: skip
-        bar = figure.figure.colorbar(dots, ax=figure.axes, pad=0.02, aspect=15, format=_plain)
-        bar.ax.minorticks_off()
-        bar.outline.set_visible(False)
-        figure.axes.grid(visible=True)
-        return figure.svg()
+def observability_plan(trajectory: DrawnTrajectory) -> Markup:
+    """Observability on the trajectory from above, the worst scans on top; of many the worst of successive ones."""
+    figure = SvgFigure.of_plan(*frame([trajectory], None), spare_inches=_BAR_INCHES)
+    values = np.nan_to_num(trajectory.observability, nan=_HIGHEST)
+    groups = np.array_split(np.arange(len(values)), min(len(values), _MAX_DOTS))
+    worst = np.array([group[np.argmin(values[group])] for group in groups])
+    order = worst[np.argsort(-values[worst])]
+    axis = Axis(is_logarithmic=True)
+    axis.limit(1.0, _HIGHEST)
+    palette = palette_of(_WORST_TO_BEST)
+    colors = palette[np.rint(255.0 * axis.fractions(np.clip(values[order], 1.0, _HIGHEST))).astype(int), :3]
+    size = float(np.sqrt(np.clip(3000.0 / len(values), 4.0, 30.0)))
+    x, y = trajectory.positions[order, :2].T
+    figure.dots(x, y, [f"#{bytes(color).hex()}" for color in colors], size)
+    figure.color_bar(palette, axis)
+    figure.has_grid = True
+    return figure.svg()
 
 
 def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> tuple[Floats, Floats]:
@@ -247,41 +221,17 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
     return [trajectory for trajectory in reversed(trajectories) if np.isfinite(getattr(trajectory, key)).any()]
 
 
-def _each(
-    axes: Axes, trajectories: Sequence[DrawnTrajectory], line: Callable[[DrawnTrajectory], tuple[Floats, Floats]]
-) -> None:
-    for trajectory in reversed(trajectories):
-        if len(trajectory.positions):
-            axes.plot(*(_decimated(values) for values in line(trajectory)), **trajectory.style)
-
-
-def _cumulative(axes: Axes, trajectory: DrawnTrajectory, ordered: Floats) -> None:
+def _cumulative(figure: SvgFigure, trajectory: DrawnTrajectory, ordered: Floats) -> None:
     """Per cent of the values below each."""
     rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), _MAX_POINTS)).astype(int))
-    axes.plot(ordered[rows], np.linspace(0.0, 100.0, len(ordered))[rows], **trajectory.style)
+    shares = np.linspace(0.0, 100.0, len(ordered))[rows]
+    figure.line(ordered[rows], shares, trajectory.color, dashes=trajectory.dashes)
 
 
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(visible=True)
-
-
-def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
-    """Plain numbers at 1, or at 1, 2 and 5 where there are few decades; so that labels have room."""
-    from matplotlib.ticker import LogLocator, NullLocator
-
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
-    axis.set_major_formatter(_plain)
-    axis.set_minor_locator(NullLocator())
-
-
-def _plain(value: float, _: float | None = None) -> str:
-    """A number of an axis without powers of ten."""
-    return f"{value:g}"
+def _labeled(figure: SvgFigure, x: str, y: str) -> Markup:
+    """The figure with a grid and names of its axes."""
+    figure.x.label, figure.y.label, figure.has_grid = x, y, True
+    return figure.svg()
 
 
 def _decimated(values: Floats) -> Floats:

@@ -35,6 +35,7 @@ from scanchain.words import counted
 
 _MAX_TRAJECTORIES = 60
 _MAX_POINTS = 1500  # largest number of points of a line
+_BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
@@ -165,21 +166,20 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 
 
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    with SvgFigure(name) as figure:
-        share = 100.0 * (np.arange(len(values)) + 1) / len(values)
-        figure.axes.step(values, share, where="post", color=color_of(0), marker="o", markersize=2.5)
-        figure.axes.set_xlim(0.0, _BEYOND * max(values) or 1.0)
-        figure.axes.set_ylim(0.0, 105.0)
-        figure.axes.set_xlabel(f"{name} [{unit}]")
-        figure.axes.set_ylabel("logs below [%]")
-        figure.axes.grid(visible=True)
-        return figure.svg()
+    figure, ordered = SvgFigure(), np.array(values)
+    share = 100.0 * (np.arange(len(values)) + 1) / len(values)
+    figure.steps(ordered, share, color_of(0))
+    figure.marks(ordered, share, "o", color_of(0), 3.5)
+    figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
+    figure.y.limit(0.0, 105.0)
+    figure.x.label, figure.y.label, figure.has_grid = f"{name} [{unit}]", "logs below [%]", True
+    return figure.svg()
 
 
 def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
     """Every trajectory from above, as far as a page can hold them."""
     drawings = [
-        Drawing(names[row.log], f"{row.run}", _trajectory(row.key, directory / row.run / "trajectory.tum"))
+        Drawing(names[row.log], f"{row.run}", _trajectory(directory / row.run / "trajectory.tum"))
         for row in done[:_MAX_TRAJECTORIES]
     ]
     text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
@@ -187,14 +187,14 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
         yield Section("Optimized trajectories, seen from above", text, drawings=tuple(drawings), is_small=True)
 
 
-def _trajectory(name: str, trajectory: Path) -> Markup:
+def _trajectory(trajectory: Path) -> Markup:
     positions = read_tum(trajectory).poses[:, :2, -1]
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
-    with SvgFigure(name, height_inches=3.6) as figure:
-        figure.axes.plot(*positions[rows].T, color=color_of(0))
-        figure.axes.plot(*positions[0], color=color_of(0), marker="o", markersize=4.0)
-        figure.axes.set_aspect("equal", adjustable="datalim")
-        figure.axes.set_xlabel("x [m]")
-        figure.axes.set_ylabel("y [m]")
-        figure.axes.grid(visible=True)
-        return figure.svg()
+    middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
+    half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
+    figure = SvgFigure.of_plan(middle - half, middle + half)
+    x, y = positions[rows].T
+    figure.line(x, y, color_of(0))
+    figure.marks(x[:1], y[:1], "o", color_of(0), 5.0)
+    figure.has_grid = True
+    return figure.svg()

@@ -52,7 +52,7 @@ def outline(cluster: Cluster) -> Matrix:
 def _sections(changes: Changes) -> Iterator[Section]:
     points = np.pad(changes.points, ((0, 0), (0, 3 - changes.dimension)))
     chips = tuple(Chip(_NAMES[label], _HEX[label]) for label in _ORDER)
-    plan = _picture("plan", points, changes, *extent(points))
+    plan = _picture(points, changes, *extent(points))
     drawing = Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
     yield Section("Where", _TEXT, chips=chips, drawings=(drawing,))
     if changes.clusters:
@@ -66,13 +66,13 @@ def _close_ups(points: Matrix, changes: Changes, clusters: Sequence[Cluster]) ->
         center = np.append(cluster.center[:2], 0.0)
         half = 0.5 * float(cluster.size_m[:2].max()) + _AROUND_M
         title = f"{cluster.number}: {cluster.kind}"
-        picture = _picture(f"cluster{cluster.number}", points, changes, center - half, center + half)
+        picture = _picture(points, changes, center - half, center + half)
         yield Drawing(title, counted(cluster.points, "point"), picture)
 
 
-def _picture(name: str, points: Matrix, changes: Changes, low: Matrix, high: Matrix) -> Markup:
+def _picture(points: Matrix, changes: Changes, low: Matrix, high: Matrix) -> Markup:
     layers = [(points[changes.labels == label], _HEX[label]) for label in _ORDER]
-    return layers_picture(name, layers, [(outline(each), INK) for each in changes.clusters], low, high)
+    return layers_picture(layers, [(outline(each), INK) for each in changes.clusters], low, high)
 
 
 def _grid(changes: Changes) -> Grid:

@@ -37,7 +37,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     drawing = Drawing(
         "Innovations",
         "Normalized innovations over their limits, largest of neighboring scans; above 1 (dotted) is a finding.",
-        innovations("innovations", curves, shaded),
+        innovations(curves, shaded),
     )
     drawings = [drawing]
     if overlay_file.exists():
@@ -47,7 +47,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
             f"{overlay.text}: the scans before it and after it, or of both passes of a loop, where the trajectory "
             "places them, seen from above. Where it is right, both show the same walls."
         )
-        drawings.append(Drawing("Worst place", caption, overlay_picture("overlay", overlay)))
+        drawings.append(Drawing("Worst place", caption, overlay_picture(overlay)))
     heads = (
         Head("finding"), Head("first"), Head("last"), Head("scans"), Head("start", "s"), Head("end", "s"),
         Head("size", "m"),

@@ -182,7 +182,7 @@ def _map_section(
     whole = {trajectory.name for trajectory in framing}
     corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
     drawings = tuple(
-        Drawing(trajectory.name, "", map_picture(f"map {trajectory.name}", points, *corners), chip(trajectory))
+        Drawing(trajectory.name, "", map_picture(points, *corners), chip(trajectory))
         for trajectory, points in maps
     )
     text = "The same points of the same scans, placed by the poses of each method."

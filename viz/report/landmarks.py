@@ -40,7 +40,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
             draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
         if len(studies) > 1:
             draw_factors(directory / "factors.png", studies)
-        sections = tuple(each for number, study in enumerate(studies) for each in _sections(study, number))
+        sections = tuple(each for study in studies for each in _sections(study))
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
         write_page(directory / REPORT_FILE, Page(title, names, (), (), (), sections))
@@ -48,7 +48,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
 
-def _sections(study: Study, number: int) -> Iterator[Section]:
+def _sections(study: Study) -> Iterator[Section]:
     """The estimate, then the linear solvers."""
     facts = [(fact.label, fact.value) for fact in study.facts]
     is_known = bool(len(study.true_poses) or np.isfinite(study.true_landmarks).any())
@@ -56,14 +56,13 @@ def _sections(study: Study, number: int) -> Iterator[Section]:
     chips = (Chip("before", BEFORE), Chip("after", AFTER), *truth)
     marks = "Circles: landmarks" + ("; crosses: true ones" if is_known else "")
     drawings = (
-        Drawing("Before optimization", f"{marks}.", svg_before(study, number)),
-        Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study, number)),
+        Drawing("Before optimization", f"{marks}.", svg_before(study)),
+        Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study)),
     )
     lines = (*facts, *accuracy_lines(study), ("A", size_of(study)))
     yield Section(study.name, facts=lines, chips=chips, drawings=drawings)
     factors = tuple(
-        Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method, number))
-        for method in study.methods
+        Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method)) for method in study.methods
     )
     text = "Drawn is where the factor of every method is not zero."
     yield Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)

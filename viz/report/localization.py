@@ -96,27 +96,24 @@ def _path(localized: LocalizedLog) -> Drawing:
         lie.lift_points(found.trajectory.poses[known][[0, -1], :-1, -1]) if len(known) else np.full((2, 3), np.nan)
     )
     margin = 0.02 * (high - low)
-    svg = path_over_map("path", points, ends, lines, low - margin, high + margin)
+    svg = path_over_map(points, ends, lines, low - margin, high + margin)
     return Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
 
 
 def _states(localized: LocalizedLog) -> Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    with SvgFigure("states", 2.0) as figure:
-        axes = figure.axes
-        axes.plot(found.traveled_m, found.sigma_m, color=INK, linewidth=0.9)
-        top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
-        for state, color in COLORS.items():
-            axes.fill_between(
-                found.traveled_m, 0.0, 1.1 * top, where=found.states == state, color=color, alpha=0.25, linewidth=0
-            )
-        axes.set_ylim(0.0, 1.1 * top)
-        axes.set_xlabel("path [m]")
-        axes.set_ylabel("sigma [m]")
-        count = counted(len(found.closures), "match with the map", "matches with the map")
-        return Drawing(
-            "Standard deviation of the position",
-            f"Behind it the state, in the colors above; {count} tried.",
-            figure.svg(),
-        )
+    figure, runs = SvgFigure(2.0), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
+    top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
+    for run in np.split(np.arange(len(found.states)), runs):
+        first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
+        figure.span(first_m, last_m, COLORS[MapState(str(found.states[run[0]]))], 0.25)
+    figure.line(found.traveled_m, found.sigma_m, INK, 0.9)
+    figure.y.limit(0.0, 1.1 * top)
+    figure.x.label, figure.y.label = "path [m]", "sigma [m]"
+    count = counted(len(found.closures), "match with the map", "matches with the map")
+    return Drawing(
+        "Standard deviation of the position",
+        f"Behind it the state, in the colors above; {count} tried.",
+        figure.svg(),
+    )

@@ -84,7 +84,7 @@ def _map_section(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> S
         Drawing(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
-            picture("merge", drawn, points, low, high),
+            picture(drawn, points, low, high),
         ),
         Drawing(
             "Interactive map",

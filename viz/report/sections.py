@@ -45,9 +45,9 @@ def trajectories_section(
 ) -> Section:
     """Trajectories from above, and their heights; ``framing`` are those that must fit in the axes."""
     corners = figures.frame(framing, truth)
-    drawings = [Drawing("Plan", "Seen from above.", figures.plan("plan", trajectories, truth, *corners))]
+    drawings = [Drawing("Plan", "Seen from above.", figures.plan(trajectories, truth, *corners))]
     if not is_planar:
-        height = figures.height("height", trajectories, truth, *corners)
+        height = figures.height(trajectories, truth, *corners)
         drawings.append(Drawing("Height", "Over the distance traveled.", height))
     chips = _legend(trajectories) if truth is None else (*map(chip, trajectories), _TRUTH_CHIP)
     return Section("Trajectories", text, chips, tuple(drawings))
@@ -63,11 +63,11 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
         f"Distance of each position from the true one after rigid alignment, against {truth_name}.",
         _legend(known),
         (
-            Drawing("Over the distance", _MEDIANS, figures.error_over_distance("error", known)),
+            Drawing("Over the distance", _MEDIANS, figures.error_over_distance(known)),
             Drawing(
                 "Distribution",
                 "Share of the scans with a smaller error.",
-                figures.distribution("errors", known, "error_m", 1.0, "position error [m]"),
+                figures.distribution(known, "error_m", 1.0, "position error [m]"),
             ),
         ),
     )
@@ -80,7 +80,7 @@ def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Sectio
         drawing = Drawing(
             "Distribution",
             "Share of the relations with a smaller error.",
-            figures.distribution("relations", known, "relation_error_m", 1.0, "error of a relation [m]"),
+            figures.distribution(known, "relation_error_m", 1.0, "error of a relation [m]"),
         )
         text = "Distance between the motion of a relation and that of the trajectory."
         yield Section("Error over relations", text, _legend(known), (drawing,))
@@ -95,11 +95,11 @@ def time_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
             "",
             _legend(known),
             (
-                Drawing("Along the log", _MEDIANS, figures.time_per_scan("time", known)),
+                Drawing("Along the log", _MEDIANS, figures.time_per_scan(known)),
                 Drawing(
                     "Distribution",
                     "Share of the scans that took less.",
-                    figures.distribution("times", known, "seconds", 1e3, "time of a scan [ms]"),
+                    figures.distribution(known, "seconds", 1e3, "time of a scan [ms]"),
                 ),
             ),
         )
@@ -114,13 +114,13 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
         "Observability",
         "Information along the least constrained direction over the minimum required, least of neighboring scans. "
         "Below 1 (dotted) a scan is degenerate.",
-        figures.observability("observability", reported),
+        figures.observability(reported),
     )
     whose = f" of {reported[0].name}" if len(reported) > 1 else ""
     where = Drawing(
         "Observability on the trajectory",
         f"The same, seen from above{whose}.",
-        figures.observability_plan("blind", reported[0]),
+        figures.observability_plan(reported[0]),
     )
     drawings = (*_consistency(trajectories, is_planar=is_planar), along, where)
     yield Section("Uncertainty", "", _legend(reported), drawings)
@@ -133,7 +133,7 @@ def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) ->
             "Covariance consistency",
             "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
             "they are too large, to the right too small.",
-            figures.consistency("nees", with_covariances, 3 if is_planar else 6),
+            figures.consistency(with_covariances, 3 if is_planar else 6),
         )
 
 
@@ -153,9 +153,7 @@ def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel
     rejected_by = np.array(table["rejected_by"].to_pylist())
     counts = Counter(rejected_by.tolist())
     low, high = figures.frame([trajectory], None)
-    picture = loops_picture(
-        f"loops {trajectory.name}", trajectory, trajectory.positions[ends], rejected_by, low, high
-    )
+    picture = loops_picture(trajectory, trajectory.positions[ends], rejected_by, low, high)
     yield Section(
         title,
         f"{len(ends):,} tried; each is a row of loops.parquet.",

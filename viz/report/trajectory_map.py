@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -68,10 +67,10 @@ def trajectory_section(
     low, high = surroundings(*figures.frame([trajectory], truth), [points])
     drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     above = "seen from above; dark is low, bright is high."
-    over_map = path_over_map("path", points, trajectory.positions, lines, low, high)
+    over_map = path_over_map(points, trajectory.positions, lines, low, high)
     drawings = (
         Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
-        *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture("map", points, low, high)),)),
+        *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
         Drawing(
             "Interactive map",
             f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
@@ -128,8 +127,9 @@ def _states(tables: Tables) -> NDArray[np.int64]:
     if tables.closures is None or not tables.closures.num_rows:
         return marks
     keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
-    chosen = tables.closures.filter(pc.field("rejected_by") == BACK_END)
-    for scan in {*chosen["target_scan"].to_pylist(), *chosen["source_scan"].to_pylist()}:
+    is_rejected = np.array(tables.closures["rejected_by"].to_pylist()) == BACK_END
+    ends = np.stack([tables.closures[name].to_numpy() for name in ("target_scan", "source_scan")])
+    for scan in np.unique(ends[:, is_rejected]).tolist():
         end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
         stretch = marks[scan:end]
         stretch[stretch < 0] = names.index(_DISPUTED)

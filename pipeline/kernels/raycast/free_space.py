@@ -94,6 +94,8 @@ def _sight(x, y, z, ranges_m, limits):
         return 0
     step_rad = 2.0 * np.pi / ranges_m.shape[1]
     margin = margin_m + margin_share * range_m
+    if ranges_m[row, column] < range_m - margin:
+        return 0
     half = max(int(np.ceil(0.5 * window_m / (range_m * step_rad))), 1)
     nearest_m, row_of_nearest = _least(ranges_m, row, column, half, range_m - margin)
     if nearest_m < range_m - margin:
@@ -119,8 +121,9 @@ def _least(ranges_m, row, column, half, enough_m):
     least_m, row_of_least = FAR, row
     for r in range(max(row - 1, 0), min(row + half, rows - 1) + 1):
         for c in range(column - half, column + half + 1):
-            if ranges_m[r, c % columns] < least_m:
-                least_m, row_of_least = ranges_m[r, c % columns], r
+            range_m = ranges_m[r, c + columns if c < 0 else c - columns if c >= columns else c]  # % is a division
+            if range_m < least_m:
+                least_m, row_of_least = range_m, r
                 if least_m < enough_m:
                     return least_m, row_of_least
     return least_m, row_of_least

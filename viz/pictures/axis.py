@@ -1,0 +1,124 @@
+"""An axis of a figure: its range, and as many ticks with round numbers as it has room for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FONT = 8.0  # height of text in points
+_DIGIT = 0.64  # width of a digit, of the height of text
+_GAP = 4.0  # least distance between two numbers in points
+_MARGIN = 0.05  # of the range of the values, on both sides of them
+_MOST = 9  # largest number of intervals between ticks
+_ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)  # steps between ticks, times a power of ten
+_FEW_DECADES = 60.0  # ratio of the ends of a logarithmic axis, below which 2 and 5 have ticks, too
+_TINY = 1e-9
+
+
+def width_of(text: str) -> float:
+    """Width of a number in points."""
+    return _DIGIT * FONT * len(text)
+
+
+def plain(value: float) -> str:
+    """A number without powers of ten."""
+    return f"{value:g}"
+
+
+class Axis:
+    """The range of what is drawn along one direction.
+
+    is_logarithmic : whether decades are equally long; only values above zero are drawn
+    """
+
+    def __init__(self, *, is_logarithmic: bool = False) -> None:
+        self.is_logarithmic = is_logarithmic
+        self.label = ""
+        self._least, self._greatest = np.inf, -np.inf
+        self._limits: tuple[float, float] | None = None
+        self._ticks: Sequence[float] = ()
+
+    def limit(self, low: float, high: float, ticks: Sequence[float] = ()) -> None:
+        """Set the range, downward or to the left where ``low`` is the greater, and, if given, the only ticks."""
+        self._limits, self._ticks = (float(low), float(high)), ticks
+
+    def include(self, values: NDArray[np.float64]) -> None:
+        """Widen the range by values, unless it is set; NaN have no place."""
+        known = values[np.isfinite(values) & ((values > 0.0) | (not self.is_logarithmic))]
+        self._least = float(known.min(initial=self._least))
+        self._greatest = float(known.max(initial=self._greatest))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """First and last value."""
+        if self._limits is not None:
+            return self._limits
+        low, high = (self._least, self._greatest) if self._least <= self._greatest else (1.0, 1.0)
+        if self.is_logarithmic:
+            low, high = (low, high) if high > low else (0.1 * low, 10.0 * high)
+            more = (high / low) ** _MARGIN
+            return low / more, high * more
+        spare = _MARGIN * (high - low) or _MARGIN * (abs(low) or 1.0)
+        return low - spare, high + spare
+
+    def fractions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Places of values along the axis, 0 at its first end, 1 at its last."""
+        low, high = self.ends
+        if self.is_logarithmic:
+            values = np.log(np.where(values > 0.0, values, np.nan))
+            low, high = float(np.log(low)), float(np.log(high))
+        return (values - low) / (high - low)
+
+    def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
+        """Fraction and number of each tick on an axis so many points long."""
+        low, high = min(self.ends), max(self.ends)
+        values = list(self._ticks) or self._decades(low, high) or _round_steps(low, high, length, is_upright)
+        texts = map(plain, values) if self._ticks or self.is_logarithmic else _fixed(values)
+        places = self.fractions(np.array(values, np.float64)).tolist()
+        return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
+
+    def _decades(self, low: float, high: float) -> list[float]:
+        """Powers of ten, where they are few their doubles and fivefolds, too; none on a linear axis."""
+        if not self.is_logarithmic:
+            return []
+        exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+        factors = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
+        every = exponents[:: -(-len(exponents) // _MOST)]
+        values = [float(f"{factor * 10.0**exponent:.0e}") for exponent in every for factor in factors]
+        within = [value for value in values if low <= value <= high]
+        return within if len(within) > 1 else []
+
+
+def _round_steps(low: float, high: float, length: float, is_upright: bool) -> list[float]:
+    """Multiples of the least round step whose numbers do not touch each other."""
+    most = int(np.clip(length / FONT / (2.0 if is_upright else 3.0), 1, _MOST))
+    for intervals in range(most, 0, -1):
+        values = _multiples(low, high, intervals)
+        room = length * _step(values) / (high - low) - _GAP
+        if is_upright or max(map(width_of, _fixed(values)), default=0.0) <= room:
+            return values
+    return _multiples(low, high, 1)
+
+
+def _multiples(low: float, high: float, intervals: int) -> list[float]:
+    """Multiples within a range of the least round step that makes so many intervals at most."""
+    least = (high - low) / intervals
+    power = 10.0 ** np.floor(np.log10(least))
+    step = next(factor * power for factor in _ROUND if factor * power >= least * (1.0 - _TINY))
+    first, last = int(np.ceil(low / step - _TINY)), int(np.floor(high / step + _TINY))
+    return [number * float(step) for number in range(first, last + 1)]
+
+
+def _step(values: Sequence[float]) -> float:
+    return values[1] - values[0] if len(values) > 1 else np.inf
+
+
+def _fixed(values: Sequence[float]) -> Iterator[str]:
+    """Multiples of a step as text, with as many decimals as the step has."""
+    step = _step(values) if len(values) > 1 else (abs(values[0]) if values else 0.0) or 1.0
+    digits = next(
+        (n for n in range(12) if abs(round(step * 10.0**n) - step * 10.0**n) < 1e-6 * step * 10.0**n), 12
+    )
+    return (f"{value + 0.0:.{digits}f}" for value in values)
