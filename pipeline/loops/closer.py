@@ -21,6 +21,8 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
 _KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
+_LARGE = 2000  # keyframes from which on the pass that was matched last goes before the nearest keyframe
+_ALONG = 10  # keyframes before and after the last target, among which the next one is
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
 
@@ -119,6 +121,7 @@ class ProximityCloser:
         self.search = search
         self.drift = Drift(config.drift)
         self.of_map = 0  # number of the first keyframes that belong to a map
+        self.target = -1  # anchor of the last submap that was matched, -1 where that failed
         self.target_in_map = -1  # anchor of the last submap of the map that was matched
 
     def close(
@@ -133,7 +136,7 @@ class ProximityCloser:
         if not old:
             return ()
         T_world, newest = graph.poses, len(keyframes) - 1
-        nearest, distance_m = nearest_position(T_world[:old], T_world[-1], connected[:old])
+        nearest, distance_m = self._next(T_world, old, connected)
         near, uncertainty_m = np.array([nearest]), None
         if self.of_map or distance_m > self.config.min_radius_m:
             near, uncertainty_m = self._near(graph, old, connected)
@@ -150,6 +153,7 @@ class ProximityCloser:
             keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
         )
         closure = verified.closure(target, newest)
+        self.target = target if closure.verdict is Verdict.ACCEPTED else -1
         if closure.verdict is Verdict.ACCEPTED or self.search is None:
             return (closure,)
         if not self.search.is_due(keyframes):
@@ -170,6 +174,20 @@ class ProximityCloser:
         reach_m = np.maximum(uncertainty_m, self.config.min_radius_m)
         near = np.flatnonzero(connected[:old] & (_distances_m(graph.poses, slice(old)) <= reach_m))
         return near[near < self.of_map] if (near < self.of_map).any() else near, uncertainty_m
+
+    def _next(self, T_world: Matrix, old: int, connected: NDArray[np.bool_]) -> tuple[int, float]:
+        """The nearest of the older keyframes, and its distance; in large graphs of the pass that was matched last.
+
+        So revisits of a place that was passed many times are not closed to another pass each: submaps are used
+        again, and the factor of the graph stays sparse.
+        """
+        if old >= _LARGE and self.target >= self.of_map:
+            begin, end = max(self.target - _ALONG, 0), min(self.target + _ALONG + 1, old)
+            distances_m = np.where(connected[begin:end], _distances_m(T_world, slice(begin, end)), np.inf)
+            along = int(np.argmin(distances_m))
+            if distances_m[along] <= self.config.min_radius_m:
+                return begin + along, float(distances_m[along])
+        return nearest_position(T_world[:old], T_world[-1], connected[:old])
 
     def _old(self, keyframes: Sequence[Keyframe]) -> int:
         """Number of the first keyframes that lie far enough back along the path to count as revisited."""
