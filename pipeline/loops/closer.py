@@ -21,7 +21,7 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
 _KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
-_LARGE = 2000  # keyframes from which on the pass that was matched last goes before the nearest keyframe
+_LARGE = 2000  # keyframes in space from which on the pass that was matched last goes before the nearest one
 _ALONG = 10  # keyframes before and after the last target, among which the next one is
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
@@ -178,10 +178,11 @@ class ProximityCloser:
     def _next(self, T_world: Matrix, old: int, connected: NDArray[np.bool_]) -> tuple[int, float]:
         """The nearest of the older keyframes, and its distance; in large graphs of the pass that was matched last.
 
-        So revisits of a place that was passed many times are not closed to another pass each: submaps are used
-        again, and the factor of the graph stays sparse.
+        So revisits of a place that was passed many times are not closed to another pass each, and its submaps are
+        used again. In the plane, where they are quick to build, a slip of odometry in a corridor would go on: the
+        keyframes after it would be closed to one pass before it that looks the same there.
         """
-        if old >= _LARGE and self.target >= self.of_map:
+        if old >= _LARGE and self.target >= self.of_map and T_world.shape[-1] == 4:
             begin, end = max(self.target - _ALONG, 0), min(self.target + _ALONG + 1, old)
             distances_m = np.where(connected[begin:end], _distances_m(T_world, slice(begin, end)), np.inf)
             along = int(np.argmin(distances_m))
