@@ -182,7 +182,7 @@ class ProximityCloser:
         used again. In the plane, where they are quick to build, a slip of odometry in a corridor would go on: the
         keyframes after it would be closed to one pass before it that looks the same there.
         """
-        if old >= _LARGE and self.target >= self.of_map and T_world.shape[-1] == 4:
+        if old >= _LARGE and self.target >= self.of_map and self.submaps.dimension == 3:
             begin, end = max(self.target - _ALONG, 0), min(self.target + _ALONG + 1, old)
             distances_m = np.where(connected[begin:end], _distances_m(T_world, slice(begin, end)), np.inf)
             along = int(np.argmin(distances_m))

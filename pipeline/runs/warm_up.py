@@ -6,7 +6,6 @@ one process is compiling the others wait for. Each part imports what it needs, a
 
 from __future__ import annotations
 
-import gc
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -109,20 +108,14 @@ def _straight_on(dimension: int) -> list[Keyframe]:
     """Keyframes of a lidar that drove straight on."""
     points = np.random.default_rng(0).uniform(2.0, 20.0, (_POINTS, dimension))
     points[:, 2:] *= 0.02  # into the slice of which the grid is drawn
-    poses = [lie.identity(dimension) for _ in range(_SCANS)]
-    for index, T_odom_lidar in enumerate(poses):
-        T_odom_lidar[0, -1] = _STEP_M * index
-    return [
-        Keyframe(index, index, index, _Held(points), T_odom_lidar, _STEP_M * index)
-        for index, T_odom_lidar in enumerate(poses)
-    ]
+    poses = np.tile(lie.identity(dimension), (_SCANS, 1, 1))
+    poses[:, 0, -1] = traveled_m = _STEP_M * np.arange(_SCANS)
+    return [Keyframe(k, k, k, _Held(points), poses[k], traveled_m[k]) for k in range(_SCANS)]
 
 
 def _located(keyframe: Keyframe, config: Config) -> Located:
-    points = keyframe.points
-    scan = Scan(
-        keyframe.index, keyframe.index, keyframe.index, points.astype(np.float32), np.empty(0, np.float32), 0, None
-    )
+    points, k = keyframe.points, keyframe.index
+    scan = Scan(k, k, k, points.astype(np.float32), np.empty(0, np.float32), 0, None)
     match = first_match(keyframe.T_odom_lidar, points, config.matching)
     prior = Prior(keyframe.T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
     tracked = Tracked(scan, points, points, keyframe.T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
@@ -144,6 +137,5 @@ def beside(dimension: int, cores: int) -> Sequence[Sequence[str]]:
 
 
 if __name__ == "__main__":
-    gc.disable()  # a compiler makes much that lasts, and this process ends soon
     for part in sys.argv[2:]:
         _PARTS[part](int(sys.argv[1]))
