@@ -17,6 +17,7 @@ from scanchain.simulation import SENSORS, Drive, information, plan, record
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Rays, Sensor
 from scanchain.simulation.solids import Solids
+from tests.benchmarks.backward_logs import play_backward
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log
@@ -38,7 +39,8 @@ class LogSpec:
 
     Attributes
     ----------
-    incident : "plain", "gap", "kidnapped", "carried" (kidnapped while no scan is recorded), "crowd" or "mounting"
+    incident : "plain", "gap", "kidnapped", "carried" (kidnapped while no scan is recorded), "crowd" or "mounting";
+        of a file "plain" or "backward"
     file, reference : of a real log, whose ``world`` is its name
     overrides : configuration of every run on it
     reference_m, reference_rad : error of a motion by the reference, infinite where it is no truth
@@ -67,10 +69,10 @@ class LogSpec:
 
     def paths(self, cache: Path) -> tuple[Path, Path | None]:
         """Log and reference; None where the log holds it."""
-        if self.file is not None:
+        if self.file is not None and self.incident == "plain":
             return self.file, self.reference
         path = cache / "logs" / f"{self.name.replace(' ', '_')}_{self.duration_s:g}s.mcap"
-        return path, path.with_suffix(".tum")
+        return path, path.with_suffix(self.reference.suffix if self.reference else ".tum")
 
     def open_shares(self, cache: Path) -> Matrix | None:
         """(K, 2) stamps in ns and the share of the returns that speak about the worst direction there."""
@@ -79,11 +81,14 @@ class LogSpec:
         return np.load(self.paths(cache)[0].with_suffix(".npy"))
 
     def make(self, cache: Path) -> None:
-        """Simulate the log unless it is there."""
+        """Simulate the log, or play it backward, unless it is there."""
         path = self.paths(cache)[0]
-        if self.file is not None or path.with_suffix(".npy").exists():
+        if path.exists() and (self.file is not None or path.with_suffix(".npy").exists()):
             return
         path.parent.mkdir(parents=True, exist_ok=True)
+        if self.file is not None and self.reference is not None:
+            play_backward(self.file, self.reference, path)
+            return
         drive = self.drive()
         record(drive, path, seed=self.seed, force=True)
         np.save(path.with_suffix(".npy"), _open_shares(drive))
@@ -135,7 +140,8 @@ class Case:
         """Row of the table."""
         d = f"{self.log.dimension}D"
         if self.log.file is not None:
-            return f"{d} real, low rate" if self.every > 1 else f"{d} real"
+            incident = "low rate" if self.every > 1 else self.log.incident
+            return f"{d} real" if incident == "plain" else f"{d} real, {incident}"
         low = self.log.incident == "plain" and self.rate_hz < 8.0
         return f"{d} {'low rate' if low else self.log.incident}"
 
@@ -310,12 +316,14 @@ def _real() -> list[Case]:
         log = LogSpec(name, dimension=2, file=file, reference=file.with_suffix(".relations"))
         log = replace(log, reference_m=0.05, reference_rad=np.radians(1.0))  # made by hand
         found += [Case(log, wheels) for wheels in WHEELS]
+        found += [Case(replace(log, incident="backward"), wheels) for wheels in WHEELS]
         cut = replace(log, world=f"{name} cut", overrides={"log__start_s": 300.0, "log__end_s": 700.0})
         found += [Case(cut, "no wheels"), Case(cut, "no wheels", 3), Case(cut, "wheels", 3)]
     csail = DATA / "2d/mit_csail.mcap"
     corrected = csail.with_name("mit_csail_corrected.tum")  # of another SLAM system
     log = LogSpec("csail", dimension=2, file=csail, reference=corrected, reference_m=np.inf)
-    found += [Case(log, "wheels"), Case(log, "no wheels")]
+    for each in (log, replace(log, incident="backward")):
+        found += [Case(each, "wheels"), Case(each, "no wheels")]
     for room in (1, 2):
         topic = {"log__ground_truth_topic": "/vrpn_client_node/jackal/pose"}
         file = DATA / f"2d/mocap_room_{room}.bag"  # stamps are 25 ms off, it turns by up to 2 rad/s
