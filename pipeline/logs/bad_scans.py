@@ -130,13 +130,17 @@ class ScanCounts:
                 f"{share} have the header stamp of the one before (the last {1e-9 * self.last_stamp_ns:.3f} s): "
                 "the times in the results do not tell scans apart; record with stamps"
             )
-        if self.copies > _MOST_COPIES * self.scans:
-            lines.append(
-                f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to "
-                "the last bit: where the driver was stuck, the poses stand still though the lidar may have moved "
-                "(scanchain doctor)"
-            )
         return [*lines, *self._odd_times()]
+
+    def copied(self) -> list[str]:
+        """A line where more than a few scans are copies."""
+        if self.copies <= _MOST_COPIES * self.scans:
+            return []
+        return [
+            f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to the "
+            "last bit: where the driver was stuck, the poses stand still though the lidar may have moved "
+            "(scanchain doctor)"
+        ]
 
     def _odd_times(self) -> list[str]:
         """A line where the point times of the first scans span next to nothing, or more than two periods."""

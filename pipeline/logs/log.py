@@ -97,6 +97,7 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
+    copies : a warning where scans that passed so far are copies of those before
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -143,6 +144,7 @@ class Log:
                 topic: transforms_reader(channel) for topic, channel in joint_topics(indexes).items()
             }
         self.scans_with_wheels = 0
+        self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -221,6 +223,7 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
+            self.copies = counts.copied()
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")

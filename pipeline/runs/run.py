@@ -104,7 +104,7 @@ def run(
                 source = str(job.ground_truth or log.ground_truth_topic)
                 truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
                 few = _few_scans(len(steps))
-                warnings = (*log.damage, *settings.without_effect, *done.warnings, *few, *note)
+                warnings = (*log.damage, *log.copies, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.final, done.judged,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,

@@ -489,7 +489,7 @@ def test_copies_of_scans_are_a_warning(tmp_path):
     ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 15) for k in range(20)]
     said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
     log, scans = read(write(tmp_path / "a.mcap", said))
-    (line,) = log.damage
+    (line,) = log.copies
     assert len(scans) == 20 and "4 of 20 scans of /scan are the one before once more" in line
 
 
