@@ -278,11 +278,10 @@ def tilt_rad(T_base_lidar: Pose) -> float:
 def turned_by(T_base_lidar: Pose) -> str:
     """Orientation of a lidar on its base as text, by the angles that are not zero; empty without any."""
     T = lie.lift(T_base_lidar)
-    roll, pitch, yaw = np.degrees(
-        [np.arctan2(T[2, 1], T[2, 2]), np.arcsin(np.clip(-T[2, 0], -1.0, 1.0)), lie.yaw(T)]
-    )
-    angles = {"roll": roll, "pitch": pitch, "yaw": yaw}
-    return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles.items() if abs(angle) > _TURNED_DEG)
+    pitch_rad = np.arcsin(np.clip(-T[2, 0], -1.0, 1.0))
+    angles_deg = np.degrees([np.arctan2(T[2, 1], T[2, 2]), pitch_rad, lie.yaw(T)]).tolist()
+    angles = zip(("roll", "pitch", "yaw"), angles_deg, strict=True)
+    return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > _TURNED_DEG)
 
 
 def in_plane(T_base_lidar: Pose) -> Pose:

@@ -60,7 +60,7 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     regression over the log; the standard deviations of what is left are learned from the log.
     """
     d, n = poses.shape[-1] - 1, len(poses)
-    check = WheelCheck(*(np.full(n, np.nan) for _ in range(3)))
+    check = WheelCheck(np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan))
     known = np.isfinite(wheel_poses[:, 0, 0])
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
