@@ -18,7 +18,8 @@ _FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
-_FEWEST_COPIED, _MOST_COPIES = 10, 0.01  # points of a scan that may be a copy; share of copies that is a warning
+_FEWEST_COPIED = 10  # least points of a scan that may be a copy
+_FEW_COPIES, _MOST_COPIES = 5, 0.01  # number and share of copies, up to which there is no warning
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
@@ -134,7 +135,7 @@ class ScanCounts:
 
     def copied(self) -> list[str]:
         """A line where more than a few scans are copies."""
-        if self.copies <= _MOST_COPIES * self.scans:
+        if self.copies <= max(_FEW_COPIES, _MOST_COPIES * self.scans):
             return []
         return [
             f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to the "
