@@ -248,6 +248,7 @@ class Slam:
         if scan == 1:  # only now is the motion known that distorted the first scan
             stored = self.points.add(located.first_points)
             self.keyframes[self.first] = replace(self.keyframes[self.first], stored=stored)
+            self.spans.replace(np.array([(stored.first, stored.count)]))
         self.lost_scans += tracked.state is State.LOST
         if not located.is_keyframe and not self.keeps_scans:
             return -1

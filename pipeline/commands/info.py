@@ -58,10 +58,16 @@ def _text(log: LogInfo) -> str:
         name = f"{topic.topic:<{width}}  {topic.type_name or 'no schema':<28}"
         lines.append(f"topic     {name}  {messages}  {topic.rate_hz:7.1f} Hz  {topic.encoding}")
     if log.lidar:
-        x, y = (row[-1] for row in log.T_base_lidar[:2])
+        import numpy as np
+
+        from scanchain.logs.mounting import turned_by
+
+        T_base_lidar = np.array(log.T_base_lidar)
+        place = ", ".join(f"{axis} {at_m:.3f} m" for axis, at_m in zip("xyz", T_base_lidar[:-1, -1], strict=False))
+        turned = turned_by(T_base_lidar)
         lines += [
             f"lidar     {log.lidar}: {log.dimension}D, {counted(log.scans, 'scan')}",
-            f"mounting  at x {x:.3f} m, y {y:.3f} m on {log.base_frame or 'the base'}"
+            f"mounting  at {place} on {log.base_frame or 'the base'}{turned and f', turned by {turned}'}"
             + (f" at first; {log.mount_motion}" if log.mount_motion else ""),
         ]
     if log.lidar or log.odometry:

@@ -18,6 +18,8 @@ _FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
+_FEWEST_COPIED = 10  # least points of a scan that may be a copy
+_FEW_COPIES, _MOST_COPIES = 5, 0.01  # number and share of copies, up to which there is no warning
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
@@ -76,13 +78,21 @@ def are_millimeters(range_m: float, config: PreprocessConfig) -> bool:
     return range_m > _FARTHEST_M and config.min_range_m <= 1e-3 * range_m <= config.max_range_m
 
 
+def _is_copy(points: RawPoints, last: RawPoints) -> bool:
+    """True if the points of a scan are those of the one before, to the last bit."""
+    if points.shape != last.shape or len(points) < _FEWEST_COPIED:
+        return False
+    return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
+
+
 class ScanCounts:
-    """Counts of scans left out, with stamps out of order, and without wheel odometry, for the report of a log."""
+    """Counts of scans left out, copied, with stamps out of order, and without wheels, for the report of a log."""
 
     def __init__(self, topic: str, odometry_topic: str) -> None:
         self.topic = topic
         self.odometry_topic = odometry_topic
-        self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = 0
+        self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
+        self.last_points: RawPoints = np.empty((0, 2), np.float32)
         self.first_complaint = ""
         self.last_stamp_ns: int | None = None
         self.spans_s: list[float] = []
@@ -98,6 +108,8 @@ class ScanCounts:
         """Count a scan that is passed on."""
         self.scans += 1
         self.without_wheels += scan.T_odom_base is None
+        self.copies += _is_copy(scan.points, self.last_points)
+        self.last_points = scan.points
         if self.last_stamp_ns is not None:
             self.backwards += scan.stamp_ns < self.last_stamp_ns
             self.repeated += scan.stamp_ns == self.last_stamp_ns
@@ -120,6 +132,16 @@ class ScanCounts:
                 "the times in the results do not tell scans apart; record with stamps"
             )
         return [*lines, *self._odd_times()]
+
+    def copied(self) -> list[str]:
+        """A line where more than a few scans are copies."""
+        if self.copies <= max(_FEW_COPIES, _MOST_COPIES * self.scans):
+            return []
+        return [
+            f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to the "
+            "last bit: where the driver was stuck, the poses stand still though the lidar may have moved "
+            "(scanchain doctor)"
+        ]
 
     def _odd_times(self) -> list[str]:
         """A line where the point times of the first scans span next to nothing, or more than two periods."""

@@ -97,6 +97,7 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
+    copies : a warning where scans that passed so far are copies of those before
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -128,6 +129,7 @@ class Log:
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
+        self.notes += self.mounting.out_of_plane if self.dimension == 2 else []
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
@@ -142,6 +144,7 @@ class Log:
                 topic: transforms_reader(channel) for topic, channel in joint_topics(indexes).items()
             }
         self.scans_with_wheels = 0
+        self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -220,6 +223,7 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
+            self.copies = counts.copied()
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
@@ -285,12 +289,14 @@ class Log:
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
         decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config)).decode
+        why = ""
         for message in decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             if isinstance(message.value, Returns | StampedPose):
                 last_ns = min(self.span.end_ns, whole_span(self.indexes).end_ns)
                 first_ns = message.value.stamp_ns
                 return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
-        raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood")
+            why = why or f" (the first: {message.value})"
+        raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood{why}")
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""

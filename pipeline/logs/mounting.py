@@ -30,6 +30,8 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
+TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
+_TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 _FULL_TURN_DEG = 360.0
 _MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
 
@@ -85,6 +87,19 @@ class Mounting(NamedTuple):
         if self.motion is not None:
             return "by transforms of /tf that change"
         return "by transforms of /tf, which do not change" if self.joints else "by static transforms"
+
+    @property
+    def out_of_plane(self) -> list[str]:
+        """Notes on a planar lidar whose plane is not that of the base as seen from above."""
+        tilted_rad = tilt_rad(self.T_base_lidar)
+        if tilted_rad > TILTED_RAD:
+            return [
+                f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
+                f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
+            ]
+        if is_upside_down(self.T_base_lidar):
+            return [f"the lidar hangs upside down {self.source}: its scans are mirrored"]
+        return []
 
     def at(self, joints: Sequence[StampedPose]) -> Pose:
         """T_base_lidar (4, 4) with these transforms of its joints."""
@@ -253,6 +268,20 @@ def root_frame(transforms: Sequence[StampedPose], frame: str) -> str:
 def is_upside_down(T_base_lidar: Pose) -> bool:
     """True if the lidar's z axis points downwards."""
     return bool(T_base_lidar[2, 2] < 0.0)
+
+
+def tilt_rad(T_base_lidar: Pose) -> float:
+    """Angle between a planar lidar's plane and that of the base, rad, 0 of one that hangs upside down."""
+    return float(np.arccos(np.clip(abs(T_base_lidar[2, 2]), 0.0, 1.0)))
+
+
+def turned_by(T_base_lidar: Pose) -> str:
+    """Orientation of a lidar on its base as text, by the angles that are not zero; empty without any."""
+    T = lie.lift(T_base_lidar)
+    pitch_rad = np.arcsin(np.clip(-T[2, 0], -1.0, 1.0))
+    angles_deg = np.degrees([np.arctan2(T[2, 1], T[2, 2]), pitch_rad, lie.yaw(T)]).tolist()
+    angles = zip(("roll", "pitch", "yaw"), angles_deg, strict=True)
+    return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > _TURNED_DEG)
 
 
 def in_plane(T_base_lidar: Pose) -> Pose:

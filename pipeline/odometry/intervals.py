@@ -30,12 +30,15 @@ class Intervals:
     def to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
 
-        By the stamps where these agree with the usual interval or with the times of the log, else as usual.
+        By the stamps where these agree with the usual interval or with the times of the log, else as usual; by the
+        log where stamps do not go on before an interval is usual.
         """
         if self.last_scan is None:
             return 0.0
         stamped_s, logged_s = _since(self.last_scan, scan)
-        if not self.usual_s or _are_alike(stamped_s, self.usual_s):
+        if not self.usual_s:
+            return stamped_s if stamped_s > 0.0 else logged_s
+        if _are_alike(stamped_s, self.usual_s):
             return stamped_s
         is_plausible = _are_alike(stamped_s, logged_s) and stamped_s < _LONGEST * self.usual_s
         return stamped_s if is_plausible else self.usual_s

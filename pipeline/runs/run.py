@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config, RecordingConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.logs import Log, open_log
+from scanchain.logs.mounting import turned_by
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
     POINTS_FILE,
@@ -104,7 +104,7 @@ def run(
                 source = str(job.ground_truth or log.ground_truth_topic)
                 truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
                 few = _few_scans(len(steps))
-                warnings = (*log.damage, *settings.without_effect, *done.warnings, *few, *note)
+                warnings = (*log.damage, *log.copies, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.final, done.judged,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
@@ -201,12 +201,12 @@ def _few_scans(count: int) -> tuple[str, ...]:
 
 def _heading(log: Log, config: Config, stopped: str) -> str:
     paths = ", ".join(str(path) for path in log.paths)
-    place = lie.lift(log.T_base_lidar)[:3, 3]
-    at = f"lidar at x {place[0]:.2f}, y {place[1]:.2f}, z {place[2]:.2f} m of {log.mounting.base_name}"
+    place, turned = log.T_base_lidar[:-1, -1], turned_by(log.T_base_lidar)
+    at = ", ".join(f"{axis} {value_m:.2f}" for axis, value_m in zip("xyz", place, strict=False))
+    mounting = f"lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"
     moving = " at the first scan, moving on it" if log.mounting.motion is not None else ""
-    known = "; ".join(
-        part for part in (_wheels(log, config), at + moving if place.any() or moving else "") if part
-    )
+    is_stated = bool(place.any() or turned or moving)
+    known = "; ".join(part for part in (_wheels(log, config), mounting + moving if is_stated else "") if part)
     return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
 
 

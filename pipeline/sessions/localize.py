@@ -167,7 +167,7 @@ def localize(
         found = localizer.finish()
         count = counted(len(found.states), "scan")
         stopped = (f"stopped by the user after {count}",) if progress.stopped else ()
-        warnings = (*stopped, *log.damage, *settings.without_effect)
+        warnings = (*stopped, *log.damage, *log.copies, *settings.without_effect)
         metrics = measure(found, prior, working_s() - started, warnings)
         localized = LocalizedLog(directory.path, prior, found, metrics)
         text = summary(localized, log)

@@ -24,6 +24,7 @@ _LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of wheels
 _LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
 _TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ is learned, and where a normal has it
 
+_LEAST_TURN_RAD = 1.0  # turns of the wheels over a log, below which their sense is not compared
 _GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
 
 _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands can do
@@ -41,11 +42,13 @@ class WheelCheck(NamedTuple):
     ----------
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
+    turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
     """
 
     innovation: Floats
     apart_m: Floats
     apart_rad: Floats
+    turn_ratio: float = np.nan
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
@@ -57,7 +60,7 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     regression over the log; the standard deviations of what is left are learned from the log.
     """
     d, n = poses.shape[-1] - 1, len(poses)
-    check = WheelCheck(*(np.full(n, np.nan) for _ in range(3)))
+    check = WheelCheck(np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan))
     known = np.isfinite(wheel_poses[:, 0, 0])
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
@@ -75,6 +78,7 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     if not len(checked):
         return check
     first, last, length_m = first[checked], last[checked], length_m[checked]
+    check = check._replace(turn_ratio=_turn_ratio(matched[:, d:], wheels[:, d:], first, last))
     inputs, outputs = np.column_stack([wheels, single_m]), matched - wheels
     innovation = np.zeros(len(checked))
     for part, apart, least in (
@@ -96,7 +100,7 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
     """(N,) change of the motion to each scan against what an acceleration can be, in standard deviations.
 
     The motion before is stretched by the time that passed, by the stamps, by the log or as usual, whichever agrees
-    best: stamps that jitter accelerate nothing. NaN for the first two scans.
+    best: stamps that jitter accelerate nothing. NaN for the first two scans, and where neither clock goes on.
     """
     n, d = len(poses), poses.shape[-1] - 1
     innovation = np.full(n, np.nan)
@@ -104,7 +108,9 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
         return innovation
     motions = lie.log(lie.between(poses[:-1], poses[1:]))
     clocks = [np.diff(clock) * 1e-9 for clock in (stamps_ns, log_times_ns)]
-    usual_s = float(np.median(clocks[0]))
+    usual_s = next((usual_s for clock in clocks if (usual_s := float(np.median(clock))) > 0.0), 0.0)
+    if not usual_s:
+        return innovation
     clocks.append(np.full(n - 1, usual_s))
     best = np.full(n - 2, np.inf)
     for interval_s in clocks:
@@ -132,6 +138,15 @@ def check_overlap(inlier_share: Floats) -> Floats:
     if n > _BEFORE:
         usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
     return inlier_share / np.maximum(usual, _LEAST_USUAL)
+
+
+def _turn_ratio(matched: Matrix, wheels: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> float:
+    """Turns (N, k) of the trajectory along those of the wheels, over these; NaN where the wheels turn little."""
+    if _lengths(wheels).sum() < _LEAST_TURN_RAD:
+        return np.nan
+    matched, wheels = _over(matched, first, last), _over(wheels, first, last)
+    turned_rad = np.maximum(_lengths(wheels), 1e-12)
+    return float(((matched * wheels).sum(axis=1) / turned_rad).sum() / turned_rad.sum())
 
 
 def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:

@@ -18,6 +18,7 @@ _LARGE_M = 1.0  # impossible change of the motion above which the trajectory is 
 _EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
+_OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
 
 
@@ -58,12 +59,15 @@ def judge(evidence: Evidence) -> Judged:
     reasons = list(_grave(evidence, stretches))
     if reasons:
         return Judged(Verdict.NOT_TRUSTWORTHY, "; ".join(reasons), stretches)
-    if stretches:
-        return Judged(Verdict.CHECK, _listed(stretches), stretches)
+    doubts = [*_opposed(evidence), *([_listed(stretches)] if stretches else [])]
+    if doubts:
+        return Judged(Verdict.CHECK, "; ".join(doubts), stretches)
     return Judged(Verdict.TRUSTWORTHY, f"no contradiction in {counted(len(evidence), 'scan')}{_by(evidence)}", ())
 
 
 def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    if len(evidence) == 1:
+        yield "one scan has no motion that could be checked"
     yield from _many_contradicted(evidence)
     yield from _mostly_predicted(evidence)
     jumps = [each for each in stretches if each.kind is Kind.ACCELERATION and (each.size_m or 0.0) > _LARGE_M]
@@ -82,6 +86,14 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
                 f"{loop.last:,} by {loop.size_m:.1f} m"
             )
             return
+
+
+def _opposed(evidence: Evidence) -> Iterator[str]:
+    if evidence.wheels.turn_ratio < _OPPOSED:
+        yield (
+            "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down that "
+            "/tf_static does not state so), or the wheels are"
+        )
 
 
 def _overlap(a: Stretch, b: Stretch) -> bool:

@@ -601,7 +601,7 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
     out = ["--rerun", "off", "--force", "--out", tmp_path / "a"]
     says(
         call("run", office, *out)[1].splitlines()[1],
-        "(wheel odometry /odom; lidar at x 0.15, y 0.00, z 0.00 m of the base)",
+        "(wheel odometry /odom; lidar at x 0.15, y 0.00 m of the base)",
     )
     _, output, _ = call("run", office, *out, "--odometry.prior", "constant-velocity")
     says(output.splitlines()[1], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")

@@ -280,6 +280,16 @@ def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path)
     assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
 
 
+def test_a_stuck_driver_is_told_from_one_that_publishes_too_often(tmp_path):
+    finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(min(k, 20)))))["duplicates"]
+    assert "19 of 40 scans" in finding.found and "20 of them in a row" in finding.found and not finding.remedy
+
+
+def test_a_planar_lidar_on_its_side_is_told(tmp_path):
+    tilted = transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, np.pi / 2)))
+    assert diagnose(saved(tmp_path, [tilted, *drive(mounted=False)]))["mounting"].severity == "warning"
+
+
 def test_a_rest_at_the_start_is_measured_and_may_be_skipped(tmp_path):
     rng = np.random.default_rng(0)
 

@@ -463,6 +463,36 @@ def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     assert np.linalg.det(T[:2, :2]) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("roll", "note"), [(0.0, None), (np.pi, "hangs upside down"), (np.pi / 2, "tilted by 90 deg on the base")]
+)
+def test_a_planar_lidar_that_is_not_level_is_noted(tmp_path, roll, note):
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, roll))), *office(2)[1:]]
+    notes = open_log(write(tmp_path / "a.mcap", said)).notes
+    assert [note in line for line in notes] == [True] if note else not notes
+
+
+def test_info_says_how_a_lidar_is_turned(tmp_path, capfd):
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, np.pi, 0.0))), *office(2)[1:]]
+    assert main(["info", str(write(tmp_path / "a.mcap", said))]) == 0
+    assert "mounting  at x 0.200 m, y 0.100 m on base_link, turned by yaw 180 deg\n" in capfd.readouterr().out
+
+
+def test_a_truth_that_is_named_does_not_hide_why_no_scan_can_be_read(tmp_path):
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [1.0] * 90, step=1.0)) for k in range(5)]
+    log = open_log(write(tmp_path / "a.mcap", said))
+    with pytest.raises(InputError, match=r"no message of /scan .* cover 14.3 turns: degrees\?"):
+        log.expected_stamps("/scan")
+
+
+def test_copies_of_scans_are_a_warning(tmp_path):
+    ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 13) for k in range(20)]
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
+    log, scans = read(write(tmp_path / "a.mcap", said))
+    (line,) = log.copies
+    assert len(scans) == 20 and "6 of 20 scans of /scan are the one before once more" in line
+
+
 def test_a_cloud_keeps_the_full_mounting(tmp_path):
     rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     said = [

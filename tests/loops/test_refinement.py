@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scanchain import lie
+from scanchain import Slam, lie
 from scanchain.data import Keyframe
 from scanchain.kernels.registration.icp import refine
 from scanchain.loops import refined
@@ -93,3 +93,13 @@ def test_the_kernel_is_one_alignment_after_the_other(least_share):
     naive_loops.refine(surfaces.voxels, points, starts, slow, prior, least_share, terms)
     np.testing.assert_allclose(fast, slow, atol=1e-9)
     assert (fast != shaken(truth, 0.05, 0.02)).any()
+
+
+def test_the_first_scan_of_a_log_that_begins_at_speed_stays_at_the_origin():
+    slam, times_s, velocity = Slam(dimension=2), 0.09 * np.arange(240) / 240, np.array([1.5, 0.0, 0.2])
+    for k in range(12):
+        T_world_beams = lie.pose_2d(-1.5, 0.2, 0.0) @ lie.exp((0.1 * k + times_s)[:, None] * velocity)
+        beams = np.array([seen_in_room(T)[beam] for beam, T in enumerate(T_world_beams)], np.float32)
+        slam.track(beams, 0.1 * k, times_s.astype(np.float32))
+    away_m, _ = lie.apart(np.eye(3), slam.finish().trajectory.poses[0])
+    assert away_m < 0.01

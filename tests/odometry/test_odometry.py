@@ -126,6 +126,14 @@ def test_a_drive_at_one_hertz_is_held_from_its_second_scan_on(town):
     assert away_m < 0.2
 
 
+def test_scans_without_stamps_are_predicted_by_the_times_of_the_log(office):
+    scans, T_base_lidar, _ = office
+    config = configured(2, {"odometry.prior": "constant-velocity"})
+    stamped = tracked(scans, T_base_lidar, config)
+    unstamped = tracked([replace(scan, stamp_ns=0) for scan in scans], T_base_lidar, config)
+    assert lie.apart(stamped[-1].T_odom_lidar, unstamped[-1].T_odom_lidar)[0] < 0.01
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_same_scans_give_bit_equal_poses(office, town, dimension):
     scans, T_base_lidar, _ = office if dimension == 2 else town

@@ -192,6 +192,28 @@ def test_stamps_that_jitter_and_step_back_accelerate_nothing():
     assert np.nanmax(check_velocity(log_times_ns, log_times_ns + jitter_ns, poses)) < 1.0
 
 
+def test_stamps_that_stand_still_are_replaced_by_the_times_of_the_log():
+    poses = chained(np.tile([2.0, 0.0, 0.0], (300, 1)), np.random.default_rng(0))
+    times_ns = (1e9 * INTERVAL_S * np.arange(301)).astype(np.int64)
+    with np.errstate(all="raise"):
+        assert np.nanmax(check_velocity(np.zeros_like(times_ns), times_ns, poses)) < 0.1
+        assert np.isnan(check_velocity(np.zeros_like(times_ns), np.zeros_like(times_ns), poses)).all()
+
+
+def test_a_single_scan_is_not_trustworthy():
+    assert judge(evidence(course()[0][:1])).verdict is Verdict.NOT_TRUSTWORTHY
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_wheels_that_turn_the_other_way_show_a_mirrored_lidar(dimension):
+    poses, _ = course(dimension)
+    motions = lie.log(lie.between(poses[:-1], poses[1:]))
+    motions[:, [1, -1]] *= -1.0
+    judged = judge(evidence(poses, wheels=wheels_of(chained(motions, np.random.default_rng(2)))))
+    assert judged.verdict is Verdict.CHECK and "mirrored" in judged.reason
+    assert "mirrored" not in judge(evidence(poses, wheels=wheels_of(poses))).reason
+
+
 def test_missing_scans_accelerate_nothing():
     poses = chained(np.tile([2.0, 0.0, 0.0], (300, 1)), np.random.default_rng(0))
     stamps_ns = (1e9 * INTERVAL_S * np.arange(301)).astype(np.int64)

@@ -498,6 +498,13 @@ def test_the_viewer_opens_on_observability_residual_and_loops_and_times_stand_be
     assert origins[0] == entities.LEGEND and entities.TIME in origins
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_scene_is_dark_in_a_light_viewer_too(dimension):
+    scene, _ = blueprint(dimension).root_container.contents
+    (color,) = scene.properties["Background"].color.as_arrow_array().to_pylist()
+    assert max(color >> shift & 0xFF for shift in (8, 16, 24)) < 32
+
+
 def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(tmp_path):
     steps = drive(60, 2)
     path = Trajectory(np.array([s.scan.stamp_ns for s in steps]), np.array([s.T_world_lidar for s in steps]))

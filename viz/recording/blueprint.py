@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from scanchain.viz.recording import entities
 from scanchain.viz.recording.shapes import Floats
 
+BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
 _PLAY_S = 30.0
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
 _FIRST = {"log10 observability": entities.OBSERVABILITY, "residual [m]": entities.RESIDUAL}
@@ -81,6 +82,7 @@ def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
         origin=entities.WORLD,
         name="seen from above" if dimension == 2 else "scene",
         overrides={entities.ODOMETRY: up_to_now(), entities.TRAJECTORY: up_to_now()},
+        background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(dimension, box),
     )

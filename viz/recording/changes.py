@@ -13,7 +13,7 @@ from scanchain.runs.directory import RECORDING_FILE
 from scanchain.sessions.change_files import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import eye
+from scanchain.viz.recording.blueprint import BACKGROUND, eye
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.sinks import open_stream, write_recording
 
@@ -40,6 +40,7 @@ def record_changes(directory: Path, changes: Changes) -> None:
     scene = rrb.Spatial3DView(
         origin=entities.WORLD,
         name="changes",
+        background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(changes.dimension, box),
     )

@@ -18,7 +18,7 @@ from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.compared_trajectories import read_trajectories
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import eye, time_panel, up_to_now, whole_log
+from scanchain.viz.recording.blueprint import BACKGROUND, eye, time_panel, up_to_now, whole_log
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import write_recording
 
@@ -98,6 +98,7 @@ def _blueprint(trajectories: Sequence[DrawnTrajectory], table: Table) -> rrb.Blu
         origin="world",
         name="trajectories and maps",
         overrides=overrides,
+        background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(table.dimension, box),
     )

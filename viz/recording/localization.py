@@ -14,7 +14,7 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.viz.pictures.map_figures import map_points
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import eye, time_panel, whole_log
+from scanchain.viz.recording.blueprint import BACKGROUND, eye, time_panel, whole_log
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import open_stream, write_recording
 
@@ -65,6 +65,7 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
     scene = rrb.Spatial3DView(
         origin=entities.WORLD,
         name="map",
+        background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(prior.dimension, box),
     )

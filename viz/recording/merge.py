@@ -13,7 +13,7 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RECORDING_FILE
 from scanchain.viz.pictures.merge import DrawnMerge, read_merge
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import eye
+from scanchain.viz.recording.blueprint import BACKGROUND, eye
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.sinks import write_recording
 
@@ -30,6 +30,7 @@ def record_merge(directory: Path) -> None:
     scene = rrb.Spatial3DView(
         origin=entities.WORLD,
         name="sessions over the map",
+        background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye(drawn.dimension, box),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from scanchain.data import Points, RawPoints
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import LEAST_S, Rest, Survey
+from scanchain.logs.mounting import TILTED_RAD, tilt_rad
 from scanchain.words import counted
 
 _MANY_LOST = 0.5
@@ -25,6 +26,7 @@ _STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _LONG_REST_S = 5.0
 _WHEELS_MOVE = 0.02  # least motion by the wheels that ends a rest: meters, or the sine of a turn
 _FEW_POINTS = 50
+_MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
 _OPEN = 0.003  # information about the weakest motion, below which matches are usually degenerate
 
 _VOXEL_M = 0.5  # at most one point in each, in 3D: else the ground near the lidar outweighs all else
@@ -192,6 +194,11 @@ def _duplicates(seen: Survey) -> Finding:
     if not same:
         return Finding("duplicates", Severity.OK, "no scan is the one before once more")
     found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
+    runs = [len(list(copies)) for _, copies in groupby(digests)]
+    if max(runs) > _MOST_COPIES:
+        found += f", {max(runs):,} of them in a row"
+        effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
+        return Finding("duplicates", Severity.WARNING, found, effect)
     effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
     every = round(len(digests) / (len(digests) - same))
     remedy = f"--every {every}" if every > 1 else ""
@@ -252,6 +259,9 @@ def _mounting(seen: Survey) -> Finding:
         effect = "trajectories are the lidar's, its motion on the robot included"
         effect += "; wheels are carried over to it by /tf" if seen.log.has_odometry else ""
         return Finding("mounting", Severity.NOTE, f"the lidar moves: {mounting.motion}", effect)
+    if seen.log.dimension == 2 and tilt_rad(mounting.T_base_lidar) > TILTED_RAD:
+        effect = "distances along the tilt are too short or too long, and walls are not where they seem to be"
+        return Finding("mounting", Severity.WARNING, mounting.out_of_plane[0], effect)
     if np.array_equal(seen.log.T_base_lidar, np.eye(seen.log.dimension + 1)):
         return Finding("mounting", Severity.OK, f"lidar frame {frame}: at the robot's origin, or not stated")
     return Finding(
