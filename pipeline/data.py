@@ -26,6 +26,7 @@ Matrix = NDArray[np.float64]
 _set = object.__setattr__  # of a record that checks itself
 
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
+MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
 
 _WHOLE = (
     ("index", "the number of the scan, from 0", 0),
@@ -49,6 +50,7 @@ class Scan:
     dropped : returns removed because they were NaN, infinite or out of range
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
     waited_s : seconds that the reader of the log made its consumer wait for this scan
+    is_copy : whether its points are those of the scan before in the log, to the last bit
 
     Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
     """
@@ -61,6 +63,7 @@ class Scan:
     dropped: int
     T_odom_base: Pose | None
     waited_s: float = 0.0
+    is_copy: bool = False
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that what was checked stays so."""

@@ -11,4 +11,5 @@ STRETCH_COLORS = {
     Kind.LOOPS: "#0f9bb5",
     Kind.OVERLAP: "#b7791f",
     Kind.DISCONNECTED: "#6b7280",
+    Kind.COPIES: "#4d7c0f",
 }

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import RawPoints, Scan
+from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
@@ -19,7 +19,7 @@ _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
 _FEWEST_COPIED = 10  # least points of a scan that may be a copy
-_FEW_COPIES, _MOST_COPIES = 5, 0.01  # number and share of copies, up to which there is no warning
+_COPIES_SHARE = 0.01  # of the scans, up to which copies are no warning
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
@@ -92,7 +92,7 @@ class ScanCounts:
         self.topic = topic
         self.odometry_topic = odometry_topic
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
-        self.last_points: RawPoints = np.empty((0, 2), np.float32)
+        self._last_points: RawPoints = np.empty((0, 2), np.float32)
         self.first_complaint = ""
         self.last_stamp_ns: int | None = None
         self.spans_s: list[float] = []
@@ -104,12 +104,16 @@ class ScanCounts:
         self.bad += 1
         self.first_complaint = self.first_complaint or complaint
 
+    def repeats(self, points: RawPoints) -> bool:
+        """True if the points of a scan are those of the one before."""
+        last, self._last_points = self._last_points, points
+        return _is_copy(points, last)
+
     def take(self, scan: Scan) -> None:
         """Count a scan that is passed on."""
         self.scans += 1
         self.without_wheels += scan.T_odom_base is None
-        self.copies += _is_copy(scan.points, self.last_points)
-        self.last_points = scan.points
+        self.copies += scan.is_copy
         if self.last_stamp_ns is not None:
             self.backwards += scan.stamp_ns < self.last_stamp_ns
             self.repeated += scan.stamp_ns == self.last_stamp_ns
@@ -135,7 +139,7 @@ class ScanCounts:
 
     def copied(self) -> list[str]:
         """A line where more than a few scans are copies."""
-        if self.copies <= max(_FEW_COPIES, _MOST_COPIES * self.scans):
+        if self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
             return []
         return [
             f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to the "

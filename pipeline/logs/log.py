@@ -213,7 +213,7 @@ class Log:
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, recorded, waited_s=working_s() - requested_s)
+                scan = self._scan(index, message, recorded, counts, waited_s=working_s() - requested_s)
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
@@ -231,7 +231,9 @@ class Log:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
-    def _scan(self, index: int, message: Decoded, poses: PosesAtScan, *, waited_s: float) -> Scan:
+    def _scan(
+        self, index: int, message: Decoded, poses: PosesAtScan, counts: ScanCounts, *, waited_s: float
+    ) -> Scan:
         returns = message.value
         assert isinstance(returns, Returns)
         return Scan(
@@ -243,6 +245,7 @@ class Log:
             dropped=returns.dropped,
             T_odom_base=self._wheels(index, poses),
             waited_s=waited_s,
+            is_copy=counts.repeats(returns.points),
         )
 
     def _mounting_notes(self) -> list[str]:

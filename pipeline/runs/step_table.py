@@ -40,6 +40,7 @@ class StepRow(msgspec.Struct, frozen=True):
     timing: Timing
     T_odom_base: Pose | None = None
     starts_segment: bool = False
+    is_copy: bool = False
 
 
 class StepTable:
@@ -71,6 +72,7 @@ class StepTable:
             step.timing,
             scan.T_odom_base,
             step.starts_segment,
+            scan.is_copy,
         )
         self.add(row)
         return row
@@ -160,6 +162,7 @@ class StepTable:
             "state": self.texts(steps["state"]),
             "reason": self.texts(steps["reason"]),
             "starts_segment": steps["starts_segment"],
+            "is_copy": steps["is_copy"],
             "keyframe": steps["keyframe"],
             **{f"{stage}_s": steps["timing"][:, k] for k, stage in enumerate(STAGES)},
         }
@@ -187,6 +190,7 @@ class StepTable:
             "timing": [[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in rows],
             "has_wheels": [row.T_odom_base is not None for row in rows],
             "starts_segment": [row.starts_segment for row in rows],
+            "is_copy": [row.is_copy for row in rows],
             "match_reason": [self._code(row.match.reason) for row in rows],
             **{name: [getattr(row.match, _FIELDS.get(name, name)) for row in rows] for name in _OF_MATCH},
         }.items():
@@ -243,6 +247,7 @@ _NOTES = {
     "null where there is nothing to compare",
     "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
     "starts_segment": "true if the motion from the scan before is unknown: a new map begins there",
+    "is_copy": "true if the scan is the one before once more, to the last bit",
     "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
     "keyframe": "number in the graph, -1 if none was made",
 }
@@ -253,7 +258,7 @@ def _layout(size: int, k: int) -> np.dtype[np.void]:
     pose = (np.float64, (size, size))
     whole = dict.fromkeys(("index", "stamp_ns", "log_time_ns", "scan_points", "dropped", "keyframe"), np.int64)
     codes = dict.fromkeys(("state", "reason", "match_reason"), np.int32)
-    flags = dict.fromkeys(("has_wheels", "starts_segment", "converged", "at_minimum"), np.bool_)
+    flags = dict.fromkeys(("has_wheels", "starts_segment", "is_copy", "converged", "at_minimum"), np.bool_)
     counts = dict.fromkeys(("points", "inliers", "iterations"), np.int64)
     numbers = dict.fromkeys(("residual_m", "fit", "cost_m2", "degeneracy_eigenvalue", "observability"), np.float64)
     arrays = {
@@ -283,6 +288,7 @@ def _row(packed: np.void, texts: Sequence[str]) -> StepRow:
         timing=Timing(*packed["timing"].tolist()),
         T_odom_base=packed["T_odom_base"] if packed["has_wheels"] else None,
         starts_segment=bool(packed["starts_segment"]),
+        is_copy=bool(packed["is_copy"]),
     )
 
 

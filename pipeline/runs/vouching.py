@@ -55,7 +55,8 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
         is_lost=states == State.LOST,
         is_degenerate=states == State.DEGENERATE,
         fit=steps["fit"].to_numpy(),
-        starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
+        starts_segment=_flags(steps, "starts_segment"),
+        is_copy=_flags(steps, "is_copy"),
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
@@ -76,12 +77,20 @@ def evidence_of_trajectory(
         is_degenerate=unknown,
         fit=np.full(n, np.nan),
         starts_segment=unknown,
+        is_copy=unknown,
         points=points,
         wheels=check_wheels(trajectory.poses, wheels),
         velocity=check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses),
         overlap=np.full(n, np.nan),
         closures=_no_closures(trajectory.poses),
     )
+
+
+def _flags(steps: pa.Table, name: str) -> NDArray[np.bool_]:
+    """(N,) of a column; False where an older run has none."""
+    if name not in steps.column_names:
+        return np.zeros(len(steps), np.bool_)
+    return np.asarray(steps[name].to_numpy(zero_copy_only=False))
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:

@@ -11,7 +11,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from scanchain.data import LEAST_FIT, Matrix
+from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
 from scanchain.verdict.checks import Floats, WheelCheck
 from scanchain.verdict.loops import Closures, contradicting_groups
 
@@ -23,6 +23,7 @@ _SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
 _KNOWN = 0.5  # least share of its scans that the wheels are compared at
+_RESTING_M = 0.05  # distance from copies to the next scan, within which the lidar rested
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
 
 
@@ -37,6 +38,7 @@ class Kind(StrEnum):
     LOOPS = "loop closures disagree"
     DISCONNECTED = "disconnected"
     OVERLAP = "overlap lost"
+    COPIES = "copies of one scan"
 
 
 class Stretch(Struct, frozen=True):
@@ -80,6 +82,7 @@ class Evidence:
     is_lost, is_degenerate : states; False where unknown
     fit : as in ``Match``; NaN where unknown
     starts_segment : scans whose motion from the one before is unknown
+    is_copy : scans that are the one before once more, to the last bit
     points : valid returns
     wheels, velocity, overlap : checks
     closures : those that verification accepted
@@ -91,6 +94,7 @@ class Evidence:
     is_degenerate: NDArray[np.bool_]
     fit: Floats
     starts_segment: NDArray[np.bool_]
+    is_copy: NDArray[np.bool_]
     points: NDArray[np.int64]
     wheels: WheelCheck
     velocity: Floats
@@ -126,6 +130,7 @@ def find_stretches(evidence: Evidence) -> list[Stretch]:
         *_of_wheels(evidence),
         *_of_acceleration(evidence),
         *_of_overlap(evidence),
+        *_of_copies(evidence),
         *_of_loops(evidence),
         *_of_segments(evidence),
     ]
@@ -189,6 +194,20 @@ def _of_overlap(evidence: Evidence) -> Iterator[Stretch]:
     is_marked = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
     for part in merged(is_marked):
         yield _stretch(evidence, Kind.OVERLAP, part.start, part.stop - 1, int(is_marked[part].sum()))
+
+
+def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
+    """Stretches over which the driver was stuck, by what follows: a scan elsewhere, or none.
+
+    Simulated scans without noise are copies at rest, and the next one is still there.
+    """
+    positions = evidence.poses[:, :-1, -1]
+    for part in merged(evidence.is_copy, 0):
+        if part.stop - part.start <= MOST_COPIES or evidence.is_held_by_wheels[part].all():
+            continue
+        is_last = part.stop == len(evidence)
+        if is_last or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
+            yield _stretch(evidence, Kind.COPIES, part.start, part.stop - 1, part.stop - part.start)
 
 
 def _of_loops(evidence: Evidence) -> Iterator[Stretch]:

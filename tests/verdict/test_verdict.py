@@ -72,6 +72,7 @@ def evidence(poses, *, wheels=None, closures=(), **changes):
         "is_degenerate": np.zeros(n, bool),
         "fit": np.full(n, 0.9),
         "starts_segment": np.zeros(n, bool),
+        "is_copy": np.zeros(n, bool),
         "points": np.full(n, 500),
         "overlap": np.ones(n),
     }
@@ -202,6 +203,19 @@ def test_stamps_that_stand_still_are_replaced_by_the_times_of_the_log():
 
 def test_a_single_scan_is_not_trustworthy():
     assert judge(evidence(course()[0][:1])).verdict is Verdict.NOT_TRUSTWORTHY
+
+
+def test_a_driver_that_was_stuck_is_a_stretch_unless_the_lidar_rested_or_wheels_agree():
+    poses, _ = course()
+    stuck = poses.copy()
+    stuck[501:521] = poses[500]
+    (stretch,) = judge(evidence(stuck, is_copy=marked(501, 520))).stretches[:1]
+    assert (stretch.kind, stretch.first, stretch.last) == (Kind.COPIES, 501, 520)
+    assert Kind.COPIES in {each.kind for each in judge(evidence(poses, is_copy=marked(N - 20, N - 1))).stretches}
+    rested = np.concatenate([poses[:500], np.repeat(poses[500:501], 21, axis=0), poses[501:]])[:N]
+    for calm, last, wheels in ((rested, 519, None), (poses, 505, None), (poses, 520, wheels_of(poses))):
+        judged = judge(evidence(calm, is_copy=marked(501, last), wheels=wheels))
+        assert judged.verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

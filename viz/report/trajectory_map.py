@@ -30,6 +30,7 @@ _OVER_ALL = (
     Kind.WHEELS,
     Kind.ACCELERATION,
     Kind.DISCONNECTED,
+    Kind.COPIES,
 )  # drawn over the states of single scans
 _COLORS = {
     State.DEGENERATE: STRETCH_COLORS[Kind.DEGENERATE],

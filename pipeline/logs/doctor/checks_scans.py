@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import PreprocessConfig
-from scanchain.data import Points, RawPoints
+from scanchain.data import MOST_COPIES, Points, RawPoints
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import LEAST_S, Rest, Survey
@@ -26,7 +26,6 @@ _STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _LONG_REST_S = 5.0
 _WHEELS_MOVE = 0.02  # least motion by the wheels that ends a rest: meters, or the sine of a turn
 _FEW_POINTS = 50
-_MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
 _OPEN = 0.003  # information about the weakest motion, below which matches are usually degenerate
 
 _VOXEL_M = 0.5  # at most one point in each, in 3D: else the ground near the lidar outweighs all else
@@ -195,7 +194,7 @@ def _duplicates(seen: Survey) -> Finding:
         return Finding("duplicates", Severity.OK, "no scan is the one before once more")
     found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
     runs = [len(list(copies)) for _, copies in groupby(digests)]
-    if max(runs) > _MOST_COPIES:
+    if max(runs) > MOST_COPIES:
         found += f", {max(runs):,} of them in a row"
         effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
         return Finding("duplicates", Severity.WARNING, found, effect)
