@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 import weakref
 from dataclasses import dataclass
 from io import FileIO
@@ -52,16 +53,17 @@ class PointStore:
             del self.waiting[: self.file.write(self.waiting)]
 
     def read(self, first: int, count: int) -> NDArray[np.float32]:
-        """(count, d) points from one row on. Raises InputError where the file has lost them."""
-        self.flush()
-        self.file.seek(first * self._row_bytes)
+        """(count, d) points from one row on, in any thread. Raises InputError where the file has lost them."""
         result = np.empty((count, self.dimension), _NUMBER)
         rest = result.reshape(-1).view(np.uint8).data
-        while rest:
-            size = self.file.readinto(rest)
-            if not size:
-                raise InputError(f"{self.file.name}: ends before point {first + count}; run again")
-            rest = rest[size:]
+        with self.lock:
+            self.flush()
+            self.file.seek(first * self._row_bytes)
+            while rest:
+                size = self.file.readinto(rest)
+                if not size:
+                    raise InputError(f"{self.file.name}: ends before point {first + count}; run again")
+                rest = rest[size:]
         return result
 
     def reopen(self, path: Path) -> None:
@@ -81,7 +83,7 @@ class PointStore:
 
     def _take(self, file: FileIO) -> None:
         """Use a file, which is closed when the store is garbage-collected."""
-        self.file = file
+        self.file, self.lock = file, threading.Lock()
         weakref.finalize(self, file.close)
 
     @property

@@ -74,10 +74,10 @@ def _empty(room: int, voxel_size_m: float, least: int = _LEAST) -> Voxels:
     capacity = _capacity(room, least)
     return Voxels(
         rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),
-        keys=np.zeros(capacity, np.int64),
-        moments=np.zeros((capacity, 10)),
-        cells=np.zeros((capacity, CELL)),
-        history=np.zeros((capacity, 3), np.int32),
+        keys=np.empty(capacity, np.int64),
+        moments=np.empty((capacity, 10)),
+        cells=np.empty((capacity, CELL)),
+        history=np.empty((capacity, 3), np.int32),
         used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )

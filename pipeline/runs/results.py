@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -53,15 +54,23 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """Everything known after the last scan of a log: the input of the files of a run directory."""
+    """Everything known after the last scan of a log: the input of the files of a run directory.
+
+    ``drawn`` is the cloud as it is drawn in a thread beside, while the files without it are written.
+    """
 
     log: Log
     config: Config
     steps: StepTable
     result: SlamResult
     final: tuple[FinalClosure, ...]
-    cloud: Cloud
+    drawn: Future[Cloud]
     grid: OccupancyGrid
+
+    @property
+    def cloud(self) -> Cloud:
+        """The cloud, waited for."""
+        return self.drawn.result()
 
 
 class Output(NamedTuple):
@@ -99,9 +108,6 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
     Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
     Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
     Output(GRAPH_FILE, _write_graph),
-    Output("map.ply", lambda path, r: write_ply(path, r.cloud.points)),
-    Output("map.pcd", lambda path, r: write_pcd(path, r.cloud.points), lambda config: config.maps.write_pcd),
-    Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
     Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
     Output(
         "loops.parquet",
@@ -109,6 +115,9 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
     ),
     Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory, r.log.T_base_lidar)),
     Output(MAP_FOLDER, _write_saved_map, lambda config: config.outputs.map),
+    Output("map.ply", lambda path, r: write_ply(path, r.cloud.points)),
+    Output("map.pcd", lambda path, r: write_pcd(path, r.cloud.points), lambda config: config.maps.write_pcd),
+    Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
     Output(  # after the maps, which it reads
         "results.mcap",
         lambda path, r: write_results_mcap(path, r.log, r.steps, r.result),
@@ -121,7 +130,10 @@ def results_of(
     log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[FinalClosure, ...]
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
-    return Results(log, config, steps, result, final, cloud_of(result, config), grid_of(result, config.maps))
+    beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
+    drawn = beside.submit(cloud_of, result, config)
+    beside.shutdown(wait=False)
+    return Results(log, config, steps, result, final, drawn, grid_of(result, config.maps))
 
 
 def write_results(folder: Path, results: Results) -> None:

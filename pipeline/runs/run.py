@@ -70,8 +70,15 @@ def run(
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
-    started, compiled_before_s = working_s(), compiled_s()
     job.check_logs()
+    with Hashing(job.logs) as hashing:  # from the beginning on: while the log is opened a core is idle
+        return _run(job, record, progress, report, hashing)
+
+
+def _run(
+    job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None], hashing: Hashing
+) -> Finished:
+    started, compiled_before_s = working_s(), compiled_s()
     truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
@@ -91,7 +98,7 @@ def run(
     started -= 0.0 if left is None else left.checkpoint.run_s
     _tell_beginning(job, left, progress)
     compiling = announcing_compilation(progress.say, beside(log.dimension, threads()))
-    with directory, Hashing(job.logs) as hashing, compiling:
+    with directory, compiling:
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:

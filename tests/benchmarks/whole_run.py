@@ -6,8 +6,9 @@
 reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock,
 from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
 ``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
-which take turns. The stages are those of one more run, in the main thread and beside it; it imports rather more at
-its start than others do. With ``--cold`` one more run compiles all kernels.
+which take turns, with Python's bytecode on disk as after any installation. The stages are those of one more run,
+in the main thread and beside it; it imports rather more at its start than others do. With ``--cold`` one more run
+compiles all kernels.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def timed(*module_and_words: str, **environment: str) -> tuple[float, str]:
     answer = subprocess.run(
         [sys.executable, "-m", *module_and_words],
         cwd=ROOT,
-        env=os.environ | environment,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": ""} | environment,
         capture_output=True,
         text=True,
         check=True,

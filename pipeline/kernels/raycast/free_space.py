@@ -66,6 +66,7 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
     enough : points that so many scans saw are not tested again
     seen, seen_through : (N,) int32, changed in place
     """
+    reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
     for s in range(spans.shape[0]):
         for i in range(spans[s, 0], spans[s, 1]):
             if seen[i] >= enough:
@@ -75,7 +76,7 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
                 T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
                 T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
                 T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-                ranges_m, limits,
+                ranges_m, reach_m, window_m, margin_m, margin_share, level_m, level_share,
             )  # fmt: skip
             if sight > 0:
                 seen[i] += 1
@@ -84,9 +85,8 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
 
 
 @njit(inline="always")
-def _sight(x, y, z, ranges_m, limits):
+def _sight(x, y, z, ranges_m, reach_m, window_m, margin_m, margin_share, level_m, level_share):
     """1 where a point in the lidar's frame was seen, −1 where it lies in free space, else 0."""
-    reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
     if x * x + y * y + z * z > reach_m * reach_m:
         return 0
     row, column, range_m = _bin_of(x, y, z, ranges_m.shape)

@@ -86,6 +86,7 @@ _CLASSES = Classes(
         (Relocalizer, "searched"): lambda relocalizer: None,
         (PlaceCloser, "recognizer"): lambda closer: None,
         (PointStore, "file"): lambda store: None,
+        (PointStore, "lock"): lambda store: None,
         (PointStore, "waiting"): lambda store: bytearray(),
         (Odometry, "matcher"): lambda odometry: create_matcher(odometry.config.matching),
     },
