@@ -13,18 +13,24 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numba
 from llvmlite import binding as llvm
-from numba import config, types  # pyright: ignore[reportPrivateImportUsage]
+from numba import config, jit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.environment import Environment
 from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import NoPythonSupportedFeatureValidation
+from numba.core.target_extension import jit_registry
+from numba.core.typed_passes import (
+    InlineOverloads,
+    NopythonRewrites,
+    NoPythonSupportedFeatureValidation,
+)
 
 try:
     import fcntl
@@ -33,6 +39,7 @@ except ImportError:  # Windows: processes that compile the same kernel at once d
 
 _PATIENCE_S = 120.0  # after which a kernel is compiled here too, whatever the other process is at
 _POLL_S = 0.01
+_OVERLOADS = "generic"  # Numba's key of the decorator for them, which it looks for before that of the processor
 _ENVIRONMENT = "_ZN08NumbaEnv"  # begin of the name of the variable that Numba sets of each function it has loaded
 
 
@@ -53,11 +60,15 @@ class _Quiet(CPUDispatcher):
     _cache: Any
 
     def compile(self, sig: Any) -> Any:
-        is_collecting = gc.isenabled()
+        is_collecting, is_first = gc.isenabled(), _OVERLOADS not in jit_registry
         gc.disable()
+        if is_first:
+            jit_registry[_OVERLOADS] = _overload
         try:
             return super().compile(sig)
         finally:
+            if is_first:
+                del jit_registry[_OVERLOADS]
             if is_collecting:
                 gc.enable()
 
@@ -72,6 +83,7 @@ class Kernel(_Quiet):
         inner = {**options, "no_cpython_wrapper": True}
         self.inner = _Quiet(function, targetoptions=inner, pipeline_class=_InnerCompiler)
         self.inner._cache = _InnerCache(function)
+        self.inner._compiler._customize_flags = _Flags
         self._compiler = _EntryCompiler(self.inner, self._compiler)
 
     def compile_inner(self, *arguments: Any) -> None:
@@ -84,6 +96,15 @@ class Kernel(_Quiet):
     @property
     def _numba_type_(self) -> types.Dispatcher:
         return types.Dispatcher(self.inner)
+
+
+class _Flags(Flags):
+    """Options of a compilation, compared at each call that Numba resolves, without a property for each option."""
+
+    _DEFAULTS = MappingProxyType({name: option.default for name, option in Flags.options.items()})
+
+    def values(self) -> dict[str, Any]:
+        return {**self._DEFAULTS, **self._values}
 
 
 class _InnerLibrary(JITCodeLibrary):
@@ -118,14 +139,23 @@ class _IntoInnerLibrary(FunctionPass):
         return False
 
 
+_NEEDLESS = (InlineOverloads, NopythonRewrites)  # of expressions of whole arrays, which kernels are without
+
+
 class _InnerCompiler(CompilerBase):
     """Numba's compiler, which hands its code to a library of our own."""
 
     def define_pipelines(self) -> list[Any]:
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.passes = [each for each in passes.passes if each[0] not in _NEEDLESS]
         passes.add_pass_after(_IntoInnerLibrary, NoPythonSupportedFeatureValidation)
         passes.finalize()
         return [passes]
+
+
+def _overload(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.jit`` of a function that NumPy's and Python's own are compiled as, here as kernels that kernels call."""
+    return jit(**{**options, "no_cfunc_wrapper": True}, pipeline_class=_InnerCompiler)
 
 
 class _EntryLibrary(JITCodeLibrary):
