@@ -153,7 +153,8 @@ class _InnerCompiler(CompilerBase):
 
 def _overload(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.jit`` of Numba's function for one of NumPy's or Python's, compiled as kernels that kernels call."""
-    return jit(**{**options, "no_cfunc_wrapper": True}, pipeline_class=_InnerCompiler)
+    options["no_cfunc_wrapper"] = True
+    return jit(**options, pipeline_class=_InnerCompiler)
 
 
 class _EntryLibrary(JITCodeLibrary):
