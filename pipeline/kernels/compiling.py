@@ -59,6 +59,7 @@ class _Quiet(CPUDispatcher):
     """A function that is compiled without collecting garbage: a compiler makes much that lasts."""
 
     _cache: Any
+    _compiler: Any
 
     def compile(self, sig: Any) -> Any:
         is_collecting, is_first = gc.isenabled(), _OVERLOADS not in jit_registry
