@@ -6,6 +6,7 @@ one process is compiling the others wait for. Each part imports what it needs, a
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -137,5 +138,6 @@ def beside(dimension: int, cores: int) -> Sequence[Sequence[str]]:
 
 
 if __name__ == "__main__":
+    gc.disable()  # a process that compiles and ends
     for part in sys.argv[2:]:
         _PARTS[part](int(sys.argv[1]))

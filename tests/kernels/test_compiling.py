@@ -11,6 +11,8 @@ from time import perf_counter
 import numpy as np
 import pytest
 from numba import config, njit
+from numba.core.codegen import CPUCodeLibrary
+from numba.core.compiler import Flags
 
 from scanchain import lie
 from scanchain.__main__ import main
@@ -254,6 +256,28 @@ def body(kernel):
     code = kernel.inspect_llvm(kernel.signatures[0])
     begin = code.index("define linkonce_odr i32")
     return code[begin : code.index("\n}", begin)]
+
+
+def test_functions_of_numpy_are_optimized_in_the_kernels_alone_and_numba_stays_as_it_is(tmp_path, monkeypatch):
+    optimized, optimize = [], CPUCodeLibrary._optimize_final_module
+
+    def remembered(library):
+        optimized.append(library.name)
+        optimize(library)
+
+    monkeypatch.setattr(CPUCodeLibrary, "_optimize_final_module", remembered)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    zeros = compiling.njit()(lambda n: np.zeros((n, n), np.int16))
+    assert zeros(2).tolist() == [[0, 0], [0, 0]] and not any("np_zeros" in name for name in optimized)
+    assert njit(lambda n: np.zeros((n, n, n), np.int16))(1).shape == (1, 1, 1)
+    assert any("np_zeros" in name for name in optimized)
+
+
+def test_options_of_a_compilation_are_those_of_numba():
+    plain = Flags()
+    plain.release_gil = True
+    ours = compiling._Flags(plain)
+    assert ours == plain and plain == ours.copy() and hash(ours) == hash(plain) and ours != Flags()
 
 
 def test_a_kernel_is_pickled_by_its_name():

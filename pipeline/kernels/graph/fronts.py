@@ -159,8 +159,21 @@ def lay_out_blocks(
         row, column = scalar_start[block_rows[b]], scalar_start[block_columns[b]]
         rows = fronts.rows[fronts.row_start[f] : fronts.row_start[f + 1]]
         offset[at], height[at], width[at] = kept, sizes[block_rows[b]], sizes[block_columns[b]]
-        top[at] = np.searchsorted(rows, min(row, column))
-        left[at] = np.searchsorted(rows, max(row, column))
+        top[at] = _index_of(min(row, column), rows)
+        left[at] = _index_of(max(row, column), rows)
         turned[at] = 1 if row > column else 0
         kept += height[at] * width[at]
     return Blocks(start, offset, height, width, top, left, turned)
+
+
+@njit(nogil=True)
+def _index_of(row: int, rows: _Index) -> int:
+    """Where the row is among rows in ascending order."""
+    low, high = 0, rows.size
+    while low < high:
+        middle = (low + high) // 2
+        if rows[middle] < row:
+            low = middle + 1
+        else:
+            high = middle
+    return low

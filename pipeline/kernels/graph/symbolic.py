@@ -92,9 +92,10 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
         while child != -1:
             end = _join(rows[begin[child] : begin[child + 1]], j, mark, rows, end)
             child = sibling[child]
-        rows[begin[j] : end].sort()
         begin[j + 1] = end
-    return begin, rows[: begin[n]]
+    rows = rows[: begin[n]]
+    _sort_columns(begin, rows)
+    return begin, rows
 
 
 @njit(nogil=True)
@@ -106,6 +107,28 @@ def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
             rows[end] = i
             end += 1
     return end
+
+
+@njit(nogil=True)
+def _sort_columns(begin: _Index, rows: _Index):
+    """Bring the rows of every column into ascending order: a list of the columns of every row, read row by row."""
+    n = begin.size - 1
+    following, columns = np.zeros(n + 1, np.int64), np.empty(rows.size, np.int64)
+    for q in range(rows.size):
+        following[rows[q] + 1] += 1
+    for i in range(n):
+        following[i + 1] += following[i]
+    for j in range(n):
+        for q in range(begin[j], begin[j + 1]):
+            columns[following[rows[q]]] = j
+            following[rows[q]] += 1
+    at = begin.copy()
+    q = 0
+    for i in range(n):
+        while q < following[i]:
+            rows[at[columns[q]]] = i
+            at[columns[q]] += 1
+            q += 1
 
 
 @njit(nogil=True)
