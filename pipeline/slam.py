@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
-from scanchain.loops import LoopCloser, refined, spread
+from scanchain.loops import ClosureTable, LoopCloser, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
@@ -66,7 +66,7 @@ class SlamResult:
     trajectory: Trajectory
     odometry: Trajectory
     keyframes: tuple[Keyframe, ...]
-    closures: tuple[Closure, ...]
+    closures: Sequence[Closure]
     graph: PoseGraph
     state: GraphState
     components: NDArray[np.int64]
@@ -109,7 +109,7 @@ class Slam:
         self.closer = LoopCloser(config, self.dimension, is_live=is_live)
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
-        self.closures: list[Closure] = []
+        self.closures = ClosureTable()
         self.stamps_ns: list[int] = []
         self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
         self.T_odom_last = lie.identity(self.dimension)
@@ -225,7 +225,7 @@ class Slam:
             trajectory=Trajectory(stamps_ns, corrected),
             odometry=Trajectory(stamps_ns, odometry),
             keyframes=tuple(self.keyframes),
-            closures=tuple(self.closures),
+            closures=self.closures,
             graph=self.graph,
             state=state,
             components=self.closer.segments.components(self.graph),
@@ -327,7 +327,7 @@ class Slam:
         taken = tuple(
             self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
         )
-        self.closures += taken
+        self.closures.extend(taken)
         return taken
 
     def _add(self, closure: Closure) -> Closure:
