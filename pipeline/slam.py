@@ -37,6 +37,7 @@ from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
+from scanchain.processes import return_freed_memory
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
@@ -50,6 +51,7 @@ _WORK_PER_KEYFRAME = 1e6  # most multiplications that factoring a large graph ma
 _LAG = 200  # number of the last keyframes that follow new closures while a large graph waits for that
 _LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
 _TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
+_EDGES_TAKEN_AFTER = 0.05  # the same of one that refines the inlier set, which takes fifty times as long
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -386,7 +388,8 @@ class Slam:
             rejection = self._rejection_of_large(size)
         if not is_large or not self.is_live:
             return self._optimize(rejection)
-        due = len(self.keyframes) + int(_TAKEN_AFTER * len(self.keyframes))
+        share = _EDGES_TAKEN_AFTER if rejection == "edges" and not is_urgent else _TAKEN_AFTER
+        due = len(self.keyframes) + int(share * len(self.keyframes))
         self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)
         self._begin_waiting(rejection)
         return None
@@ -407,6 +410,8 @@ class Slam:
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
+        if len(self.keyframes) >= _LARGE:
+            return_freed_memory()
         self._begin_waiting(rejection)
         return state
 

@@ -7,6 +7,7 @@ from threading import Thread
 from scanchain.config import GraphConfig
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.processes import return_freed_memory
 
 
 class BackgroundOptimization:
@@ -43,5 +44,6 @@ class BackgroundOptimization:
             graph = self.before.copy()
             graph.optimize(self.config, initialize="given", rejection=self.rejection)
             self._optimized = graph
+            return_freed_memory()
         except Exception as error:  # raised where the result is asked for
             self._error = error

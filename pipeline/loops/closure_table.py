@@ -52,7 +52,7 @@ class ClosureTable(Sequence[Closure]):
             if name in _TEXTS:
                 value = self._code(str(value))
             if name not in columns:
-                columns[name] = GrowingArray(np.shape(value), np.asarray(value).dtype)
+                columns[name] = GrowingArray(np.shape(value), np.asarray(value).dtype.type)
             columns[name].append(value)
 
     def _code(self, text: str) -> int:

@@ -21,7 +21,7 @@ class Fronts(NamedTuple):
     factor_start : (F + 1,) into the factor's values; front f keeps pivots × rows of them, row-major
     children : (F,) fronts that hand their update matrix to this one
     place : like ``rows``: row of the parent front that an update row falls on
-    stack_size : most scalars of update matrices waiting at one time
+    stack_size : most scalars of update matrices, their upper triangles, waiting at one time
     widest : most rows of a front
     """
 
@@ -112,7 +112,7 @@ def _walk(
         for _ in range(children[f]):
             top -= 1
             depth -= waiting[top]
-        waiting[top] = (height - pivots[f]) ** 2
+        waiting[top] = triangle(height - pivots[f])
         depth += waiting[top]
         top += 1
         deepest = max(deepest, depth)
@@ -124,6 +124,12 @@ def _walk(
                 at += 1
             place[q] = at - row_start[parent[f]]
     return widest, deepest
+
+
+@njit(nogil=True)
+def triangle(size: int) -> int:
+    """Number of scalars on and above the diagonal of a square matrix."""
+    return size * (size + 1) // 2
 
 
 @njit(nogil=True)

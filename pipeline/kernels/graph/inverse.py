@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.graph.fronts import Blocks, Fronts
+from scanchain.kernels.graph.fronts import Blocks, Fronts, triangle
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
@@ -29,10 +29,12 @@ def selected_inverse(
         height, pivots = fronts.row_start[f + 1] - fronts.row_start[f], fronts.pivots[f]
         rest = height - pivots
         Z = work[: height * height].reshape(height, height)
-        depth -= rest * rest
+        depth -= triangle(rest)
+        at = depth
         for a in range(rest):
-            for c in range(rest):
-                Z[pivots + a, pivots + c] = stack[depth + a * rest + c]
+            for c in range(a, rest):
+                Z[pivots + a, pivots + c] = Z[pivots + c, pivots + a] = stack[at]
+                at += 1
         start = fronts.factor_start[f]
         for a in range(pivots - 1, -1, -1):
             _fill_row(Z, a, factor[start + a * height : start + (a + 1) * height])
@@ -42,9 +44,9 @@ def selected_inverse(
         while child != -1:
             place = fronts.place[fronts.row_start[child] + fronts.pivots[child] : fronts.row_start[child + 1]]
             for a in range(place.size):
-                for b in range(place.size):
-                    stack[depth + a * place.size + b] = Z[place[a], place[b]]
-            depth += place.size**2
+                for b in range(a, place.size):
+                    stack[depth] = Z[place[a], place[b]]
+                    depth += 1
             child = sibling[child]
 
 
