@@ -112,7 +112,7 @@ class Slam:
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
         self.closures = ClosureTable()
-        self.stamps_ns: list[int] = []
+        self.stamps_ns = GrowingArray((), np.int64)
         self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
         self.T_odom_last = lie.identity(self.dimension)
         self.T_world_odom = lie.identity(self.dimension)
@@ -214,7 +214,7 @@ class Slam:
             self._take_over(self.beside)
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
-        stamps_ns = np.array(self.stamps_ns, np.int64)
+        stamps_ns = self.stamps_ns.rows.copy()
         odometry = self.odometry_poses.rows.copy()
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
         corrected = spread(state.poses[self.first :], numbers, odometry)

@@ -142,8 +142,7 @@ class SparseCholesky:
     @property
     def entries(self) -> int:
         """Stored entries of the factor, explicit zeros included."""
-        pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
-        return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
+        return int(self._fronts.factor_start[-1])
 
     @property
     def work(self) -> float:
@@ -263,6 +262,4 @@ def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
     row_start = np.concatenate([[0], np.cumsum(lengths)])
     along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
     columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
-    first = fronts.factor_start[front] + within * widths[front] + within
-    values = factor[np.repeat(first, lengths) + along]
-    return csr_matrix((values, columns, row_start), shape=(count, count))
+    return csr_matrix((factor.copy(), columns, row_start), shape=(count, count))

@@ -47,10 +47,11 @@ def factorize(
         if failed >= 0:
             return int(fronts.rows[row0 + failed])
         rest = height - pivots
-        start = fronts.factor_start[f]
+        at = fronts.factor_start[f]
         for a in range(pivots):
             for c in range(a, height):
-                factor[start + a * height + c] = front[a, c]
+                factor[at + c - a] = front[a, c]
+            at += height - a
         for a in range(rest):
             for c in range(a, rest):
                 stack[depth + c - a] = front[pivots + a, pivots + c]
@@ -70,14 +71,15 @@ def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, lo
     for f in path:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
-        rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
+        rows, at = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
         local[:height].fill(0.0)
         for a in range(pivots):
-            row = factor[start + a * height : start + (a + 1) * height]
-            value = (x[rows[a]] + local[a]) / row[a]
+            row, below = factor[at : at + height - a], local[a:height]
+            value = (x[rows[a]] + below[0]) / row[0]
             x[rows[a]] = value
-            for b in range(a + 1, height):
-                local[b] -= row[b] * value
+            for b in range(1, height - a):
+                below[b] -= row[b] * value
+            at += height - a
         for b in range(pivots, height):
             x[rows[b]] += local[b]
     solve_upper(fronts, factor, path, x, local)
@@ -89,16 +91,17 @@ def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Arr
     for f in path[::-1]:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
-        rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
+        rows, at = fronts.rows[row0 : row0 + height], fronts.factor_start[f + 1]
         for b in range(height):
             local[b] = x[rows[b]]
         for a in range(pivots - 1, -1, -1):
-            row = factor[start + a * height : start + (a + 1) * height]
-            value = local[a]
-            for b in range(a + 1, height):
-                value -= row[b] * local[b]
-            local[a] = value / row[a]
-            x[rows[a]] = local[a]
+            at -= height - a
+            row, below = factor[at : at + height - a], local[a:height]
+            value = below[0]
+            for b in range(1, height - a):
+                value -= row[b] * below[b]
+            below[0] = value / row[0]
+            x[rows[a]] = below[0]
 
 
 @njit(nogil=True)

@@ -18,7 +18,7 @@ class Fronts(NamedTuple):
     row_start : (F + 1,) into ``rows``
     rows : scalar position in the elimination order of every row of every front
     pivots : (F,) number of scalar columns that the front eliminates
-    factor_start : (F + 1,) into the factor's values; front f keeps pivots × rows of them, row-major
+    factor_start : (F + 1,) into the factor's values; front f keeps the rows of its pivots, from the diagonal on
     children : (F,) fronts that hand their update matrix to this one
     place : like ``rows``: row of the parent front that an update row falls on
     stack_size : most scalars of update matrices, their upper triangles, waiting at one time
@@ -78,7 +78,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
         for q in range(begin[last], begin[last + 1]):
             height += sizes[rows[q]]
         row_start[f + 1] = row_start[f] + height
-        factor_start[f + 1] = factor_start[f] + pivots[f] * height
+        factor_start[f + 1] = factor_start[f] + triangle(height) - triangle(height - pivots[f])
     scalar_rows, place = np.empty(row_start[count], np.int64), np.full(row_start[count], -1, np.int64)
     children = np.zeros(count, np.int64)
     for f in range(count):
