@@ -409,9 +409,9 @@ class Slam:
         return "edges" if disagree else "gnc"
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
-        state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
         if len(self.keyframes) >= _LARGE:
             return_freed_memory()
+        state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
         self._begin_waiting(rejection)
         return state
 

@@ -42,8 +42,8 @@ class BackgroundOptimization:
     def _optimize(self) -> None:
         try:
             graph = self.before.copy()
+            return_freed_memory()
             graph.optimize(self.config, initialize="given", rejection=self.rejection)
             self._optimized = graph
-            return_freed_memory()
         except Exception as error:  # raised where the result is asked for
             self._error = error
