@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -56,6 +57,12 @@ def _family(pid: int) -> list[int]:
             for thread in Path(f"/proc/{each}/task").iterdir():
                 family += map(int, (thread / "children").read_text().split())
     return family
+
+
+def return_freed_memory() -> None:
+    """Return memory that was freed to the system; glibc retains it between what is in use."""
+    with suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def available_mib() -> float:

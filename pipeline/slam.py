@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,11 +32,12 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
-from scanchain.loops import LoopCloser, refined, spread
+from scanchain.loops import ClosureTable, LoopCloser, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
+from scanchain.processes import return_freed_memory
 from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
@@ -50,6 +51,7 @@ _WORK_PER_KEYFRAME = 1e6  # most multiplications that factoring a large graph ma
 _LAG = 200  # number of the last keyframes that follow new closures while a large graph waits for that
 _LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
 _TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
+_EDGES_TAKEN_AFTER = 0.05  # the same of one that refines the inlier set, which takes fifty times as long
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -66,7 +68,7 @@ class SlamResult:
     trajectory: Trajectory
     odometry: Trajectory
     keyframes: tuple[Keyframe, ...]
-    closures: tuple[Closure, ...]
+    closures: Sequence[Closure]
     graph: PoseGraph
     state: GraphState
     components: NDArray[np.int64]
@@ -109,8 +111,8 @@ class Slam:
         self.closer = LoopCloser(config, self.dimension, is_live=is_live)
         self.graph = PoseGraph(self.dimension)
         self.keyframes: list[Keyframe] = []
-        self.closures: list[Closure] = []
-        self.stamps_ns: list[int] = []
+        self.closures = ClosureTable()
+        self.stamps_ns = GrowingArray((), np.int64)
         self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
         self.T_odom_last = lie.identity(self.dimension)
         self.T_world_odom = lie.identity(self.dimension)
@@ -212,7 +214,7 @@ class Slam:
             self._take_over(self.beside)
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
-        stamps_ns = np.array(self.stamps_ns, np.int64)
+        stamps_ns = self.stamps_ns.rows.copy()
         odometry = self.odometry_poses.rows.copy()
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
         corrected = spread(state.poses[self.first :], numbers, odometry)
@@ -225,7 +227,7 @@ class Slam:
             trajectory=Trajectory(stamps_ns, corrected),
             odometry=Trajectory(stamps_ns, odometry),
             keyframes=tuple(self.keyframes),
-            closures=tuple(self.closures),
+            closures=self.closures,
             graph=self.graph,
             state=state,
             components=self.closer.segments.components(self.graph),
@@ -328,7 +330,7 @@ class Slam:
         taken = tuple(
             self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
         )
-        self.closures += taken
+        self.closures.extend(taken)
         return taken
 
     def _add(self, closure: Closure) -> Closure:
@@ -387,7 +389,8 @@ class Slam:
             rejection = self._rejection_of_large(size)
         if not is_large or not self.is_live:
             return self._optimize(rejection)
-        due = len(self.keyframes) + int(_TAKEN_AFTER * len(self.keyframes))
+        share = _EDGES_TAKEN_AFTER if rejection == "edges" and not is_urgent else _TAKEN_AFTER
+        due = len(self.keyframes) + int(share * len(self.keyframes))
         self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)
         self._begin_waiting(rejection)
         return None
@@ -407,6 +410,8 @@ class Slam:
         return "edges" if disagree else "gnc"
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
+        if len(self.keyframes) >= _LARGE:
+            return_freed_memory()
         state = self.graph.optimize(self.config.graph, initialize="given", rejection=rejection).state
         self._begin_waiting(rejection)
         return state

@@ -7,6 +7,7 @@ from threading import Thread
 from scanchain.config import GraphConfig
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.processes import return_freed_memory
 
 
 class BackgroundOptimization:
@@ -41,6 +42,7 @@ class BackgroundOptimization:
     def _optimize(self) -> None:
         try:
             graph = self.before.copy()
+            return_freed_memory()
             graph.optimize(self.config, initialize="given", rejection=self.rejection)
             self._optimized = graph
         except Exception as error:  # raised where the result is asked for

@@ -83,7 +83,12 @@ class BetweenProblem:
         return BetweenProblem(self.edges[kept], measurements, information, self.variable < 0, self.is_point)
 
     def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
-        """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k)."""
+        """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k).
+
+        The factor of this one is given up: two of a long log would take the most memory of all.
+        """
+        if "cholesky" in vars(self):
+            self.cholesky.release()
         sparse = self.restricted(kept)
         sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
         return sparse

@@ -70,7 +70,8 @@ def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> 
     B = np.stack([_changed(twists, unit, sign) - twists for unit in np.eye(len(drift))], axis=-1)  # ∂Z/∂drift
     d = twists.shape[1] - len(drift) + 1
     B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
-    slope, curvature, V = left_out.quadratic(B)
+    slope, curvature = left_out.quadratic(B)
+    V = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)])
     slope, curvature = slope - _prior(len(drift)) * drift, curvature + np.diag(_prior(len(drift)))
     errors, noise = left_out.errors[left_out.edges], left_out.covariances
     best, most = np.zeros(len(drift)), 0.0

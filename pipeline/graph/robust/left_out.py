@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import edge_covariances, inverse_blocks, responses
+from scanchain.graph.covariance import difference_covariance, edge_covariances, inverse_blocks, responses
 from scanchain.graph.robust.groups import apart
 
 _MOST = 30  # largest number of loop edges that are looked at
@@ -26,7 +27,6 @@ class LeftOut:
     errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
     covariances : (L, k, k) of their residuals, by their own noise and the graph without them
     predicted : (O, k, k) covariances of what the graph predicts of odometry
-    shifts : (O, L, k, k) ∂e of each by a right twist on the measurement of each odometry edge
     """
 
     problem: BetweenProblem
@@ -37,7 +37,6 @@ class LeftOut:
     jacobians: Matrix
     covariances: Matrix
     predicted: Matrix
-    shifts: Matrix
 
     @classmethod
     def at(
@@ -54,31 +53,26 @@ class LeftOut:
         covariances = np.linalg.pinv(problem.information[edges], hermitian=True)
         joint = edge_covariances(factored, inverse_blocks(factored))[np.cumsum(kept)[odometry] - 1]
         J = jacobians[odometry]
-        pull = np.swapaxes(J, 1, 2) @ problem.information[odometry]
-        shifts = np.empty((len(odometry), len(edges), *covariances.shape[1:]))
-        begin, end = problem.edges[odometry].T
         for place, edge in enumerate(edges):
-            i, j = problem.edges[edge]
-            moved = responses(factored, i, j)
-            covariances[place] += jacobians[edge] @ (moved[j] - moved[i]) @ jacobians[edge].T
-            shifts[:, place] = jacobians[edge] @ np.swapaxes(moved[end] - moved[begin], 1, 2) @ pull
-        return cls(
-            problem,
-            factored,
-            edges,
-            odometry,
-            errors,
-            jacobians,
-            covariances,
-            J @ joint @ np.swapaxes(J, 1, 2),
-            shifts,
-        )
+            joint_of_edge = difference_covariance(factored, *problem.edges[edge])
+            covariances[place] += jacobians[edge] @ joint_of_edge @ jacobians[edge].T
+        predicted = J @ joint @ np.swapaxes(J, 1, 2)
+        return cls(problem, factored, edges, odometry, errors, jacobians, covariances, predicted)
 
-    def quadratic(self, twists: Matrix) -> tuple[NDArray[np.float64], Matrix, Matrix]:
-        """Slope b (p,), curvature A (p, p), and V (L, k, p) of right twists τ (O, k, p) on the odometry.
+    def shifts(self, twists: Matrix) -> Iterator[Matrix]:
+        """∂e (O, k, p) of each of these loop edges, by right twists (O, k, p) on the measurements of odometry."""
+        problem, odometry = self.problem, self.odometry
+        pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ problem.information[odometry]
+        begin, end = problem.edges[odometry].T
+        for edge in self.edges:
+            moved = responses(self.factored, *problem.edges[edge])
+            yield self.jacobians[edge] @ np.swapaxes(moved[end] - moved[begin], 1, 2) @ pull @ twists
 
-        With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ and these edges' residuals by V δ; the cost of the kept
-        edges changes by δᵀAδ − 2 bᵀδ, where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
+    def quadratic(self, twists: Matrix) -> tuple[NDArray[np.float64], Matrix]:
+        """Slope b (p,) and curvature A (p, p) of right twists τ (O, k, p) on the odometry.
+
+        With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
+        where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
         """
         problem, odometry, packing = self.problem, self.odometry, self.factored.packing
         weighted = problem.information[odometry] @ twists
@@ -90,4 +84,4 @@ class LeftOut:
         g = packing.rows(whole[problem.free])
         A = np.einsum("oap,oaq->pq", twists, weighted) - g.T @ self.factored.cholesky.solve(g)
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
-        return b, A, (self.shifts @ twists[:, None]).sum(axis=0)
+        return b, A

@@ -92,7 +92,8 @@ def next_slip(
     """
     u = directions(left_out.problem.information[left_out.odometry], measured)
     tried = [*slips, *_stretches(len(u), slips)]
-    own, redundancy, bent, V = (_means(each, tried) for each in _edge_by_edge(left_out, u))
+    own, redundancy, bent = (_means(each, tried) for each in _edge_by_edge(left_out, u))
+    V = np.stack([_means(shift[..., 0], tried) for shift in left_out.shifts(u[..., None])], axis=1)
     count = np.array([slip.count for slip in tried])
     claimed = own / count
     sizes = np.array([slip.size_m for slip in tried])
@@ -108,7 +109,7 @@ def next_slip(
         slip, one = tried[index], slice(index, index + 1)
         twists = np.zeros((*u.shape, 1))
         twists[slip.edges, :, 0] = u[slip.edges] / slip.count
-        b, A, _ = left_out.quadratic(twists)
+        b, A = left_out.quadratic(twists)
         falls = _largest_falls(left_out, V[one], prior + A[0], b - prior * sizes[one], worth[one], price)
         gain, size_m = float(falls[0][0]), float(falls[1][0])
         if gain > most:
@@ -117,14 +118,14 @@ def next_slip(
     return most, best
 
 
-def _edge_by_edge(left_out: LeftOut, u: Matrix) -> tuple[Vector, Vector, Vector, Matrix]:
-    """Of each edge along its twist u (O, k): uᵀΩu (O,), redundancy (O,), uᵀΩe (O,), and ∂e of the loop edges."""
+def _edge_by_edge(left_out: LeftOut, u: Matrix) -> tuple[Vector, Vector, Vector]:
+    """Of each edge along its twist u (O, k): uᵀΩu (O,), redundancy (O,) and uᵀΩe (O,)."""
     pull = (left_out.problem.information[left_out.odometry] @ u[..., None])[..., 0]
     own = (u * pull).sum(axis=1)
     known = (pull * (left_out.predicted @ pull[..., None])[..., 0]).sum(axis=1)
     redundancy = 1.0 - known / np.maximum(own, np.finfo(np.float64).tiny)
     bent = (pull * left_out.errors[left_out.odometry]).sum(axis=1)
-    return own, redundancy, bent, (left_out.shifts @ u[:, None, :, None])[..., 0]
+    return own, redundancy, bent
 
 
 def _means(each: Matrix, stretches: list[Slip]) -> Matrix:

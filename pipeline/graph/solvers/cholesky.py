@@ -130,9 +130,7 @@ class SparseCholesky:
         places[order] = np.cumsum(sizes) - sizes
         self._blocks = fronts.lay_out_blocks(self._fronts, places, pattern.sizes, pattern.rows, pattern.columns)
         self._places = np.repeat(places - pattern.starts, pattern.sizes) + np.arange(pattern.scalars)
-        self._factor = np.zeros(int(self._fronts.factor_start[-1]))
-        self._stack = np.empty(self._fronts.stack_size)
-        self._work = np.empty(self._fronts.widest**2)
+        self._factor: NDArray[np.float64] | None = None
         self._floor = np.empty(pattern.scalars)
         self._every_front = np.arange(len(self._fronts.pivots))
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
@@ -144,8 +142,7 @@ class SparseCholesky:
     @property
     def entries(self) -> int:
         """Stored entries of the factor, explicit zeros included."""
-        pivots, heights = self._fronts.pivots, np.diff(self._fronts.row_start)
-        return int((pivots * heights - pivots * (pivots - 1) // 2).sum())
+        return int(self._fronts.factor_start[-1])
 
     @property
     def work(self) -> float:
@@ -155,12 +152,26 @@ class SparseCholesky:
     def factorize(self, values: NDArray[np.float64]) -> None:
         """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
         self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
-        failed = cholesky.factorize(
-            self._fronts, self._blocks, values, self._floor, self._factor, self._stack, self._work
-        )
+        if self._factor is None:
+            self._factor = np.empty(int(self._fronts.factor_start[-1]))
+        failed = cholesky.factorize(self._fronts, self._blocks, values, self._floor, self._factor, *self._room())
         if failed >= 0:
             scalar = int(np.flatnonzero(self._places == failed)[0])
             raise SingularMatrixError(int(np.searchsorted(self.pattern.starts, scalar, side="right") - 1), scalar)
+
+    def release(self) -> None:
+        """Free the memory of the factor, until the next ``factorize``."""
+        self._factor = None
+
+    @property
+    def factor(self) -> NDArray[np.float64]:
+        """Values of the last factor, laid out by fronts."""
+        assert self._factor is not None, "nothing was factored since the last release"
+        return self._factor
+
+    def _room(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Stack and work of the kernels."""
+        return np.empty(self._fronts.stack_size), np.empty(self._fronts.widest**2)
 
     def solve(self, right_side: Matrix) -> Matrix:
         """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
@@ -184,7 +195,7 @@ class SparseCholesky:
         for column in range(columns.shape[1]):
             x = np.zeros(self.pattern.scalars)
             x[places] = columns[:, column]
-            cholesky.solve(self._fronts, self._factor, path, x, local)
+            cholesky.solve(self._fronts, self.factor, path, x, local)
             result[:, column] = x[places]
         return result
 
@@ -200,13 +211,13 @@ class SparseCholesky:
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
         x = noise.copy()
-        cholesky.solve_upper(self._fronts, self._factor, self._every_front, x, np.empty(self._fronts.widest))
+        cholesky.solve_upper(self._fronts, self.factor, self._every_front, x, np.empty(self._fronts.widest))
         return x[self._places]
 
     def inverse_blocks(self) -> NDArray[np.float64]:
         """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)
-        inverse.selected_inverse(self._fronts, self._blocks, self._factor, result, self._stack, self._work)
+        inverse.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
 
 
@@ -238,7 +249,7 @@ def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64])
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
     """U of the last factorization, A = Uᵀ U, in the order of elimination, with explicit zeros of the fill-in."""
-    return front_rows(cholesky._fronts, cholesky._factor)
+    return front_rows(cholesky._fronts, cholesky.factor)
 
 
 def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
@@ -251,6 +262,4 @@ def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
     row_start = np.concatenate([[0], np.cumsum(lengths)])
     along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
     columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
-    first = fronts.factor_start[front] + within * widths[front] + within
-    values = factor[np.repeat(first, lengths) + along]
-    return csr_matrix((values, columns, row_start), shape=(count, count))
+    return csr_matrix((factor.copy(), columns, row_start), shape=(count, count))

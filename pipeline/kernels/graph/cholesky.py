@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.graph.fronts import Blocks, Fronts
+from scanchain.kernels.graph.fronts import Blocks, Fronts, triangle
 
 _Array = NDArray[np.float64]
 _PANEL = 32  # pivots eliminated before the rest of the front is touched
@@ -41,20 +41,21 @@ def factorize(
             top -= 1
             child = waiting[top]
             first, end = fronts.row_start[child] + fronts.pivots[child], fronts.row_start[child + 1]
-            depth -= (end - first) ** 2
-            _extend_add(front, fronts.place[first:end], stack[depth : depth + (end - first) ** 2], runs)
+            depth -= triangle(end - first)
+            _extend_add(front, fronts.place[first:end], stack[depth : depth + triangle(end - first)], runs)
         failed = _eliminate(front, pivots, floor[fronts.rows[row0] :])
         if failed >= 0:
             return int(fronts.rows[row0 + failed])
         rest = height - pivots
-        start = fronts.factor_start[f]
+        at = fronts.factor_start[f]
         for a in range(pivots):
             for c in range(a, height):
-                factor[start + a * height + c] = front[a, c]
+                factor[at + c - a] = front[a, c]
+            at += height - a
         for a in range(rest):
             for c in range(a, rest):
-                stack[depth + a * rest + c] = front[pivots + a, pivots + c]
-        depth += rest * rest
+                stack[depth + c - a] = front[pivots + a, pivots + c]
+            depth += rest - a
         waiting[top] = f
         top += 1
     return -1
@@ -70,14 +71,15 @@ def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, lo
     for f in path:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
-        rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
+        rows, at = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
         local[:height].fill(0.0)
         for a in range(pivots):
-            row = factor[start + a * height : start + (a + 1) * height]
-            value = (x[rows[a]] + local[a]) / row[a]
+            row, below = factor[at : at + height - a], local[a:height]
+            value = (x[rows[a]] + below[0]) / row[0]
             x[rows[a]] = value
-            for b in range(a + 1, height):
-                local[b] -= row[b] * value
+            for b in range(1, height - a):
+                below[b] -= row[b] * value
+            at += height - a
         for b in range(pivots, height):
             x[rows[b]] += local[b]
     solve_upper(fronts, factor, path, x, local)
@@ -89,16 +91,17 @@ def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Arr
     for f in path[::-1]:
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
-        rows, start = fronts.rows[row0 : row0 + height], fronts.factor_start[f]
+        rows, at = fronts.rows[row0 : row0 + height], fronts.factor_start[f + 1]
         for b in range(height):
             local[b] = x[rows[b]]
         for a in range(pivots - 1, -1, -1):
-            row = factor[start + a * height : start + (a + 1) * height]
-            value = local[a]
-            for b in range(a + 1, height):
-                value -= row[b] * local[b]
-            local[a] = value / row[a]
-            x[rows[a]] = local[a]
+            at -= height - a
+            row, below = factor[at : at + height - a], local[a:height]
+            value = below[0]
+            for b in range(1, height - a):
+                value -= row[b] * below[b]
+            below[0] = value / row[0]
+            x[rows[a]] = below[0]
 
 
 @njit(nogil=True)
@@ -117,8 +120,8 @@ def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
 
 @njit(nogil=True)
 def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: NDArray[np.int64]) -> None:
-    """Add a child's update matrix, row by row, in runs of columns that are neighbors in the front too."""
-    size, count = place.size, 0
+    """Add a child's update matrix, its upper triangle, in runs of columns that are neighbors in the front too."""
+    size, count, start = place.size, 0, 0
     for b in range(size):
         if b == 0 or place[b] != place[b - 1] + 1:
             runs[count] = b
@@ -128,12 +131,13 @@ def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: N
     for a in range(size):
         if runs[first_run + 1] <= a:
             first_run += 1
-        row, source = front[place[a]], update[a * size : (a + 1) * size]
+        row, source = front[place[a]], update[start : start + size - a]
+        start += size - a
         for q in range(first_run, count):
             b0, b1 = max(runs[q], a), runs[q + 1]
             target = row[place[b0] : place[b0] + b1 - b0]
             for b in range(b1 - b0):
-                target[b] += source[b0 + b]
+                target[b] += source[b0 - a + b]
 
 
 @njit(nogil=True)

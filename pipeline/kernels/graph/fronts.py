@@ -18,10 +18,10 @@ class Fronts(NamedTuple):
     row_start : (F + 1,) into ``rows``
     rows : scalar position in the elimination order of every row of every front
     pivots : (F,) number of scalar columns that the front eliminates
-    factor_start : (F + 1,) into the factor's values; front f keeps pivots × rows of them, row-major
+    factor_start : (F + 1,) into the factor's values; front f keeps the rows of its pivots, from the diagonal on
     children : (F,) fronts that hand their update matrix to this one
     place : like ``rows``: row of the parent front that an update row falls on
-    stack_size : most scalars of update matrices waiting at one time
+    stack_size : most scalars of update matrices, their upper triangles, waiting at one time
     widest : most rows of a front
     """
 
@@ -78,7 +78,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
         for q in range(begin[last], begin[last + 1]):
             height += sizes[rows[q]]
         row_start[f + 1] = row_start[f] + height
-        factor_start[f + 1] = factor_start[f] + pivots[f] * height
+        factor_start[f + 1] = factor_start[f] + triangle(height) - triangle(height - pivots[f])
     scalar_rows, place = np.empty(row_start[count], np.int64), np.full(row_start[count], -1, np.int64)
     children = np.zeros(count, np.int64)
     for f in range(count):
@@ -112,7 +112,7 @@ def _walk(
         for _ in range(children[f]):
             top -= 1
             depth -= waiting[top]
-        waiting[top] = (height - pivots[f]) ** 2
+        waiting[top] = triangle(height - pivots[f])
         depth += waiting[top]
         top += 1
         deepest = max(deepest, depth)
@@ -124,6 +124,12 @@ def _walk(
                 at += 1
             place[q] = at - row_start[parent[f]]
     return widest, deepest
+
+
+@njit(nogil=True)
+def triangle(size: int) -> int:
+    """Number of scalars on and above the diagonal of a square matrix."""
+    return size * (size + 1) // 2
 
 
 @njit(nogil=True)

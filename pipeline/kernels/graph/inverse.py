@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.graph.fronts import Blocks, Fronts
+from scanchain.kernels.graph.fronts import Blocks, Fronts, triangle
 
 _Array = NDArray[np.float64]
 _Index = NDArray[np.int64]
@@ -29,22 +29,25 @@ def selected_inverse(
         height, pivots = fronts.row_start[f + 1] - fronts.row_start[f], fronts.pivots[f]
         rest = height - pivots
         Z = work[: height * height].reshape(height, height)
-        depth -= rest * rest
+        depth -= triangle(rest)
+        at = depth
         for a in range(rest):
-            for c in range(rest):
-                Z[pivots + a, pivots + c] = stack[depth + a * rest + c]
-        start = fronts.factor_start[f]
+            for c in range(a, rest):
+                Z[pivots + a, pivots + c] = Z[pivots + c, pivots + a] = stack[at]
+                at += 1
+        at = fronts.factor_start[f + 1]
         for a in range(pivots - 1, -1, -1):
-            _fill_row(Z, a, factor[start + a * height : start + (a + 1) * height])
+            at -= height - a
+            _fill_row(Z, a, factor[at : at + height - a])
         for b in range(blocks.start[f], blocks.start[f + 1]):
             _take_block(Z, blocks, b, inverse)
         child = first_child[f]
         while child != -1:
             place = fronts.place[fronts.row_start[child] + fronts.pivots[child] : fronts.row_start[child + 1]]
             for a in range(place.size):
-                for b in range(place.size):
-                    stack[depth + a * place.size + b] = Z[place[a], place[b]]
-            depth += place.size**2
+                for b in range(a, place.size):
+                    stack[depth] = Z[place[a], place[b]]
+                    depth += 1
             child = sibling[child]
 
 
@@ -69,19 +72,19 @@ def _families(fronts: Fronts) -> tuple[_Index, _Index]:
 
 @njit(nogil=True)
 def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
-    """Fill row and column a of Z from those beyond it; upper is row a of U in the columns of the front."""
-    height = upper.size
+    """Fill row and column a of Z from those beyond it; upper is row a of U from the diagonal on."""
+    height = a + upper.size
     row = Z[a]
     row[a + 1 :].fill(0.0)
     for m in range(a + 1, height):
-        weight, below = upper[m] / upper[a], Z[m]
+        weight, below = upper[m - a] / upper[0], Z[m]
         for c in range(a + 1, height):
             row[c] -= weight * below[c]
-    total = 1.0 / upper[a]
+    total = 1.0 / upper[0]
     for m in range(a + 1, height):
         Z[m, a] = row[m]
-        total -= upper[m] * row[m]
-    row[a] = total / upper[a]
+        total -= upper[m - a] * row[m]
+    row[a] = total / upper[0]
 
 
 @njit(nogil=True)

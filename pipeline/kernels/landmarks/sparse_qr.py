@@ -175,14 +175,15 @@ def _place_children(
 @njit()
 def _keep(front: _Array, columns: _Index, pivots: int, factor: _Array, z: _Array) -> None:
     """Store the rows of R that belong to the pivots; zeros where the front has too few rows."""
-    width = columns.size
+    width, at = columns.size, 0
     for a in range(pivots):
         if a < front.shape[0]:
-            factor[a * width + a : (a + 1) * width] = front[a, a:width]
+            factor[at : at + width - a] = front[a, a:width]
             z[columns[a]] = front[a, width]
         else:
-            factor[a * width + a : (a + 1) * width] = 0.0
+            factor[at : at + width - a] = 0.0
             z[columns[a]] = 0.0
+        at += width - a
 
 
 @njit()
@@ -190,13 +191,14 @@ def back_substitute(fronts: Fronts, factor: _Array, z: _Array) -> None:
     """Solve R x = z in place; z (n,) in the order of the columns. A zero on the diagonal gives infinities."""
     for f in range(fronts.pivots.size - 1, -1, -1):
         column0 = fronts.row_start[f]
-        width, start = fronts.row_start[f + 1] - column0, fronts.factor_start[f]
+        width, at = fronts.row_start[f + 1] - column0, fronts.factor_start[f + 1]
         for a in range(fronts.pivots[f] - 1, -1, -1):
-            row = factor[start + a * width : start + (a + 1) * width]
-            total = z[fronts.rows[column0 + a]]
-            for c in range(a + 1, width):
-                total -= row[c] * z[fronts.rows[column0 + c]]
-            z[fronts.rows[column0 + a]] = total / row[a]
+            at -= width - a
+            row, columns = factor[at : at + width - a], fronts.rows[column0 + a : column0 + width]
+            total = z[columns[0]]
+            for c in range(1, width - a):
+                total -= row[c] * z[columns[c]]
+            z[columns[0]] = total / row[0]
 
 
 @njit()

@@ -18,6 +18,7 @@ from scanchain.graph.robust.slips import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
+from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
@@ -72,7 +73,7 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        Since, BackgroundOptimization, PointStore, StoredPoints,
+        Since, ClosureTable, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],

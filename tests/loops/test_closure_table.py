@@ -1,0 +1,57 @@
+"""Closures in columns come back as they were."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from scanchain.data import Closure, Match, Proposal, Verdict
+from scanchain.loops import ClosureTable
+
+
+def closures(k):
+    rng = np.random.default_rng(k)
+    size = 3 if k == 3 else 4
+    for source in range(40):
+        match = Match(
+            T_target_source=rng.normal(size=(size, size)),
+            information=rng.normal(size=(k, k)),
+            cost=rng.normal(),
+            inliers=source,
+            points=2 * source,
+            iterations=source % 7,
+            residual_m=rng.normal(),
+            fit=rng.normal(),
+            at_minimum=source % 2 == 0,
+            converged=source % 3 == 0,
+            reason=f"reason {source % 5}",
+            degeneracy_eigenvalue=rng.normal(),
+            observability=np.inf,
+            degeneracy_direction=rng.normal(size=k),
+        )
+        verdict = Verdict.REJECTED if source % 4 else Verdict.ACCEPTED
+        yield Closure(source // 2, source, match, rng.random(), verdict, f"overlap {source % 6}", Proposal.PLACE)
+
+
+def same(a, b):
+    return type(a) is type(b) and all(
+        same(x, y) if isinstance(x, Match) else type(x) is type(y) and np.array_equal(x, y)
+        for x, y in ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    )
+
+
+@pytest.mark.parametrize("k", [3, 6])
+def test_closures_come_back_bit_by_bit_and_in_their_types(k):
+    given = [replace(each, chi2_before=float(each.source)) for each in closures(k)]
+    table = ClosureTable()
+    table.extend(given[:17])
+    table.extend(given[17:])
+    assert len(table) == len(given)
+    assert all(same(a, b) for a, b in zip(given, table, strict=True))
+    assert same(table[-1], given[-1]) and [each.source for each in table[3:9:2]] == [3, 5, 7]
+
+
+def test_an_empty_table_holds_nothing():
+    assert not ClosureTable() and list(ClosureTable()) == []
+    with pytest.raises(IndexError, match="closure 0 of 0"):
+        ClosureTable()[0]
