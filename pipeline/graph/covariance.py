@@ -48,14 +48,14 @@ def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
 
 
 def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
-    """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by k solves with the factor of H."""
+    """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by the factor of H."""
     return difference_covariances(problem, np.array([[i, j]]))[0, 0]
 
 
 def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) -> Matrix:
     """Cov(ξ_j − ξ_i, ξ_b − ξ_a), (P, P, k, k), at [(a, b), (i, j)], of the left twists of pairs (P, 2) of poses.
 
-    By P k solves with the factor of H, each as far as it concerns these poses.
+    By the factor of H, as far as it concerns these poses.
     """
     k, count = problem.freedom, len(pairs)
     ends = problem.variable[pairs]
@@ -67,10 +67,8 @@ def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) ->
         moves[i, :, pair] -= np.eye(k)
     kept = np.arange(k) < problem.pattern.sizes[variables, None]
     packed = moves[:-1][kept].reshape(-1, count * k)
-    moves[...] = 0.0
-    moves[:-1][kept] = problem.cholesky.solve_part(packed, variables).reshape(-1, count, k)
-    moved = np.ascontiguousarray(moves.transpose(2, 0, 1, 3))
-    return moved[:, place[:, 1]] - moved[:, place[:, 0]]
+    joint = problem.cholesky.covariance_of(packed, variables).reshape(count, k, count, k)
+    return np.ascontiguousarray(joint.transpose(2, 0, 1, 3))
 
 
 def inverse_blocks(problem: BetweenProblem) -> Matrix:

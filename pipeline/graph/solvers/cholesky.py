@@ -176,28 +176,31 @@ class SparseCholesky:
     def solve(self, right_side: Matrix) -> Matrix:
         """Solution x of A x = b by the last factor; b is (scalars,) or (scalars, m)."""
         columns = right_side[:, None] if right_side.ndim == 1 else right_side
-        return self._solve(columns, self._places, self._every_front).reshape(right_side.shape)
+        result, local = np.empty_like(columns), np.empty(self._fronts.widest)
+        for column in range(columns.shape[1]):
+            x = np.zeros(self.pattern.scalars)
+            x[self._places] = columns[:, column]
+            cholesky.solve_lower(self._fronts, self.factor, self._every_front, x, local)
+            cholesky.solve_upper(self._fronts, self.factor, x, local)
+            result[:, column] = x[self._places]
+        return result.reshape(right_side.shape)
 
-    def solve_part(self, right_side: Matrix, variables: NDArray[np.int64]) -> Matrix:
-        """The part of these variables (v,) of the solution of A x = b, where b is zero but for them.
+    def covariance_of(self, B: Matrix, variables: NDArray[np.int64]) -> Matrix:
+        """Bᵀ A⁻¹ B (m, m), by the last factor: of x = Bᵀ y, where A is the information of y.
 
-        right_side, result : (s, m) of all their scalars, in their order. To the bit as ``solve`` has it, by the
-        fronts between these variables and the roots of the elimination tree alone.
+        B : (s, m) the scalars of these variables (v,), in their order; it is zero for the others
+        With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
+        the elimination tree alone.
         """
         sizes = self.pattern.sizes[variables]
         within = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         places = self._places[np.repeat(self.pattern.starts[variables], sizes) + within]
-        return self._solve(right_side, places, self._path(places))
-
-    def _solve(self, columns: Matrix, places: NDArray[np.int64], path: NDArray[np.int64]) -> Matrix:
-        """Solutions (s, m) at these places of the elimination order, of which the path has all fronts."""
-        result, local = np.empty_like(columns), np.empty(self._fronts.widest)
-        for column in range(columns.shape[1]):
-            x = np.zeros(self.pattern.scalars)
-            x[places] = columns[:, column]
-            cholesky.solve(self._fronts, self.factor, path, x, local)
-            result[:, column] = x[places]
-        return result
+        path, local = self._path(places), np.empty(self._fronts.widest)
+        C = np.zeros((B.shape[1], self.pattern.scalars))
+        C[:, places] = B.T
+        for x in C:
+            cholesky.solve_lower(self._fronts, self.factor, path, x, local)
+        return np.asarray(np.einsum("is,js->ij", C, C))
 
     def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
         """Fronts that eliminate these places, and all that follow from them, ascending."""
@@ -211,7 +214,7 @@ class SparseCholesky:
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution (scalars,) of U x = z by the last factor: of covariance A⁻¹ for white noise z of variance 1."""
         x = noise.copy()
-        cholesky.solve_upper(self._fronts, self.factor, self._every_front, x, np.empty(self._fronts.widest))
+        cholesky.solve_upper(self._fronts, self.factor, x, np.empty(self._fronts.widest))
         return x[self._places]
 
     def inverse_blocks(self) -> NDArray[np.float64]:

@@ -62,11 +62,11 @@ def factorize(
 
 
 @njit(nogil=True)
-def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
-    """Solve Uᵀ U x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars.
+def solve_lower(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
+    """Solve Uᵀ x = b in place; x (n,) is ordered as the elimination, local : fronts.widest scalars.
 
-    path : fronts that are visited, ascending, with each its parent: all of them, or where b is zero in the rest,
-        those alone whose part of x is wanted; the rest of x stays as it is
+    path : fronts that are visited, ascending, with each its parent: all of them, or those that begin where b is
+        not zero; x is zero in the rest
     """
     for f in path:
         row0 = fronts.row_start[f]
@@ -82,13 +82,12 @@ def solve(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, lo
             at += height - a
         for b in range(pivots, height):
             x[rows[b]] += local[b]
-    solve_upper(fronts, factor, path, x, local)
 
 
 @njit(nogil=True)
-def solve_upper(fronts: Fronts, factor: _Array, path: NDArray[np.int64], x: _Array, local: _Array) -> None:
-    """Solve U x = b in place; arguments as of ``solve``."""
-    for f in path[::-1]:
+def solve_upper(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> None:
+    """Solve U x = b in place; arguments as of ``solve_lower``."""
+    for f in range(fronts.pivots.size - 1, -1, -1):
         row0 = fronts.row_start[f]
         height, pivots = fronts.row_start[f + 1] - row0, fronts.pivots[f]
         rows, at = fronts.rows[row0 : row0 + height], fronts.factor_start[f + 1]
