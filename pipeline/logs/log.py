@@ -129,7 +129,6 @@ class Log:
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
-        self.notes += self.mounting.out_of_plane if self.dimension == 2 else []
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
@@ -251,13 +250,18 @@ class Log:
     def _mounting_notes(self) -> list[str]:
         """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
         mounting = self.mounting
-        if mounting.motion is None:
-            return [mounting.note] if mounting.note else []
-        if self.dimension == 2 and mounting.motion.leaves_plane:
-            raise self._out_of_plane(str(mounting.motion))
-        moves = f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion included"
-        wheels = "; wheels are carried over to it by /tf at the stamp of each scan" if self.has_odometry else ""
-        return [*([mounting.note] if mounting.note else []), moves + wheels]
+        notes = [mounting.note] if mounting.note else []
+        if mounting.motion is not None:
+            if self.dimension == 2 and mounting.motion.leaves_plane:
+                raise self._out_of_plane(str(mounting.motion))
+            moves = (
+                f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion included"
+            )
+            wheels = (
+                "; wheels are carried over to it by /tf at the stamp of each scan" if self.has_odometry else ""
+            )
+            notes.append(moves + wheels)
+        return [*notes, *(mounting.out_of_plane if self.dimension == 2 else [])]
 
     def _out_of_plane(self, motion: str) -> InputError:
         return InputError(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -9,7 +12,7 @@ import rerun.blueprint as rrb
 from scanchain.viz.recording import entities
 from scanchain.viz.recording.shapes import Floats
 
-BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
+_BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
 _PLAY_S = 30.0
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
 _FIRST = {"log10 observability": entities.OBSERVABILITY, "residual [m]": entities.RESIDUAL}
@@ -37,10 +40,12 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),  # there are few at first
     )
     state = rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole)
+    growing = {entities.ODOMETRY: up_to_now(), entities.TRAJECTORY: up_to_now()}
+    world = scene("seen from above" if dimension == 2 else "scene", dimension, box, growing)
     verdict = rrb.TextDocumentView(origin=entities.VERDICT, name="verdict")
     side = rrb.Vertical(verdict, *_plots(_FIRST), loops, state, tabs, row_shares=[3, 3, 3, 3, 2, 5])
     return rrb.Blueprint(
-        rrb.Horizontal(_scene(dimension, box), side, column_shares=[5, 3]),
+        rrb.Horizontal(world, side, column_shares=[5, 3]),
         time_panel(scans),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -76,19 +81,21 @@ def time_panel(scans: int) -> rrb.TimePanel:
     return rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S))
 
 
-def _scene(dimension: int, box: Floats | None) -> rrb.Spatial3DView:
-    """The world."""
+def scene(
+    name: str, dimension: int, box: Floats | None, overrides: Mapping[Any, Any] | None = None
+) -> rrb.Spatial3DView:
+    """The world, dark whatever the viewer is; box : (2, 3) corners of what is to be seen."""
     return rrb.Spatial3DView(
         origin=entities.WORLD,
-        name="seen from above" if dimension == 2 else "scene",
-        overrides={entities.ODOMETRY: up_to_now(), entities.TRAJECTORY: up_to_now()},
-        background=BACKGROUND,
+        name=name,
+        overrides=overrides,
+        background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye(dimension, box),
+        eye_controls=_eye(dimension, box),
     )
 
 
-def eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
+def _eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole trajectory."""
     low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
     center = 0.5 * (low + high)

@@ -13,7 +13,7 @@ from scanchain.runs.directory import RECORDING_FILE
 from scanchain.sessions.change_files import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import BACKGROUND, eye
+from scanchain.viz.recording.blueprint import scene
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.sinks import open_stream, write_recording
 
@@ -37,15 +37,9 @@ def record_changes(directory: Path, changes: Changes) -> None:
     messages += [_boxes(changes, label) for label in (Label.APPEARED, Label.VANISHED)]
     messages.append(_arrows(changes))
     box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else None
-    scene = rrb.Spatial3DView(
-        origin=entities.WORLD,
-        name="changes",
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye(changes.dimension, box),
-    )
     text = rrb.TextDocumentView(origin="summary", name="summary")
-    layout = rrb.Blueprint(rrb.Horizontal(scene, text, column_shares=[3, 1]), collapse_panels=True)
+    world = scene("changes", changes.dimension, box)
+    layout = rrb.Blueprint(rrb.Horizontal(world, text, column_shares=[3, 1]), collapse_panels=True)
     write_recording(directory / RECORDING_FILE, stream, layout, messages)
 
 

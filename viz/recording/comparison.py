@@ -18,7 +18,7 @@ from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.compared_trajectories import read_trajectories
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import BACKGROUND, eye, time_panel, up_to_now, whole_log
+from scanchain.viz.recording.blueprint import scene, time_panel, up_to_now, whole_log
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import write_recording
 
@@ -94,16 +94,9 @@ def _blueprint(trajectories: Sequence[DrawnTrajectory], table: Table) -> rrb.Blu
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
     ends = [trajectory.positions for trajectory in trajectories[:1]]
     box = np.array([ends[0].min(axis=0), ends[0].max(axis=0)]) if ends else None
-    scene = rrb.Spatial3DView(
-        origin="world",
-        name="trajectories and maps",
-        overrides=overrides,
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye(table.dimension, box),
-    )
+    world = scene("trajectories and maps", table.dimension, box, overrides)
     return rrb.Blueprint(
-        rrb.Vertical(scene, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1]),
+        rrb.Vertical(world, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1]),
         time_panel(table.scans),
         rrb.SelectionPanel(state="collapsed"),
     )

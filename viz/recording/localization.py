@@ -14,7 +14,7 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.viz.pictures.map_figures import map_points
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import BACKGROUND, eye, time_panel, whole_log
+from scanchain.viz.recording.blueprint import scene, time_panel, whole_log
 from scanchain.viz.recording.messages import Message, Times
 from scanchain.viz.recording.sinks import open_stream, write_recording
 
@@ -62,15 +62,9 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
         rrb.TimeSeriesView(origin=_SIGMA, name="standard deviation of the position", axis_x=whole_log()),
         rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole_log()),
     )
-    scene = rrb.Spatial3DView(
-        origin=entities.WORLD,
-        name="map",
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye(prior.dimension, box),
-    )
+    world = scene("map", prior.dimension, box)
     layout = rrb.Blueprint(
-        rrb.Horizontal(scene, side, column_shares=[5, 2]), time_panel(len(found.states)), collapse_panels=True
+        rrb.Horizontal(world, side, column_shares=[5, 2]), time_panel(len(found.states)), collapse_panels=True
     )
     write_recording(path, stream, layout, messages)
 

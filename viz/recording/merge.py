@@ -13,7 +13,7 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RECORDING_FILE
 from scanchain.viz.pictures.merge import DrawnMerge, read_merge
 from scanchain.viz.recording import entities, shapes
-from scanchain.viz.recording.blueprint import BACKGROUND, eye
+from scanchain.viz.recording.blueprint import scene
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.sinks import write_recording
 
@@ -27,14 +27,8 @@ def record_merge(directory: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.send_recording_name(directory.name.partition(".partial-")[0])
     box = np.array([drawn.positions.min(axis=0), drawn.positions.max(axis=0)])
-    scene = rrb.Spatial3DView(
-        origin=entities.WORLD,
-        name="sessions over the map",
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye(drawn.dimension, box),
-    )
-    layout = rrb.Blueprint(scene, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+    world = scene("sessions over the map", drawn.dimension, box)
+    layout = rrb.Blueprint(world, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
     write_recording(directory / RECORDING_FILE, stream, layout, list(_messages(directory, drawn)))
 
 

@@ -174,7 +174,7 @@ def lay_out_blocks(
 
 @njit(nogil=True)
 def _index_of(row: int, rows: _Index) -> int:
-    """Where the row is among rows in ascending order."""
+    """Index of a row among rows in ascending order."""
     low, high = 0, rows.size
     while low < high:
         middle = (low + high) // 2

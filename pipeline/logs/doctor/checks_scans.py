@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -189,11 +189,11 @@ def _rings(seen: Survey) -> Finding:
 
 def _duplicates(seen: Survey) -> Finding:
     digests = [scan.digest for scan in seen.scans]
-    same = sum(before == after for before, after in pairwise(digests))
+    runs = [len(list(copies)) for _, copies in groupby(digests)]
+    same = len(digests) - len(runs)
     if not same:
         return Finding("duplicates", Severity.OK, "no scan is the one before once more")
     found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
-    runs = [len(list(copies)) for _, copies in groupby(digests)]
     if max(runs) > MOST_COPIES:
         found += f", {max(runs):,} of them in a row"
         effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
