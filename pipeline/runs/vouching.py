@@ -49,14 +49,17 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
     states = np.array(steps["state"].to_pylist())
     stamps_ns, log_times_ns = steps["stamp_ns"].to_numpy(), steps["log_time_ns"].to_numpy()
     wheels = _poses(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
+    is_copy = np.zeros(len(poses), np.bool_)
+    if "is_copy" in steps.column_names:  # older runs have none
+        is_copy = steps["is_copy"].to_numpy(zero_copy_only=False)
     return Evidence(
         seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
         poses=poses,
         is_lost=states == State.LOST,
         is_degenerate=states == State.DEGENERATE,
         fit=steps["fit"].to_numpy(),
-        starts_segment=_flags(steps, "starts_segment"),
-        is_copy=_flags(steps, "is_copy"),
+        starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
+        is_copy=is_copy,
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
@@ -84,13 +87,6 @@ def evidence_of_trajectory(
         overlap=np.full(n, np.nan),
         closures=_no_closures(trajectory.poses),
     )
-
-
-def _flags(steps: pa.Table, name: str) -> NDArray[np.bool_]:
-    """(N,) of a column; False where an older run has none."""
-    if name not in steps.column_names:
-        return np.zeros(len(steps), np.bool_)
-    return np.asarray(steps[name].to_numpy(zero_copy_only=False))
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:
