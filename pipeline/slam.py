@@ -45,13 +45,12 @@ _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _UPDATE_GROWTH = 0.02  # the same of a large graph, for an optimization that keeps the verdicts
-_JUDGED_GROWTH = 1.0  # the same, for GNC over all closures
 _CONTRADICTING = 10.0  # times the χ² limit of a loop edge, from which on a closure contradicts a large graph
-_WORK_PER_KEYFRAME = 1e6  # most multiplications that factoring a large graph may take for each keyframe since
+_WORK_PER_KEYFRAME = 1e6  # multiplications to optimize all of a large graph, at most, for each keyframe since
 _LAG = 200  # number of the last keyframes that follow new closures while a large graph waits for that
 _LARGE = 2000  # number of keyframes of a log from which on its graph is optimized less often, and live beside
 _TAKEN_AFTER = 0.005  # share by which the graph grows until an optimization beside is taken over
-_EDGES_TAKEN_AFTER = 0.05  # the same of one that refines the inlier set, which takes fifty times as long
+_EXPLAINED_TAKEN_AFTER = 0.05  # the same of one that explains closures or refines the inlier set, which takes long
 _LARGE_INNOVATION = 10.0  # times loops.edge_sigma_m, from which on a closure is optimized in soon
 
 
@@ -122,7 +121,7 @@ class Slam:
         self.joins_segment = False
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
         self.lost_scans = 0
-        self.optimized_at = self.judged_at = 0
+        self.optimized_at = self.updated_at = self.judged_at = self.explained_at = 0
         self.contradicting_closures = 0  # of the waiting ones
         self.smoothed_at, self.new_closures = 0, 0
         self.contradiction = _CONTRADICTING * rejection_limit(config.graph.robust_scale, self.graph.freedom)
@@ -377,7 +376,7 @@ class Slam:
         size = len(self.keyframes) - self.first
         is_large = size >= _LARGE
         if is_large and not is_urgent:
-            enough = max(enough, _UPDATE_GROWTH * size, self.graph.work / _WORK_PER_KEYFRAME)
+            enough = max(enough, _UPDATE_GROWTH * size)
         elif not self.moves_map:
             enough = max(enough, _GROWTH * size)
         if not self.waiting_closures or grown < enough or self.beside is not None:
@@ -389,7 +388,8 @@ class Slam:
             rejection = self._rejection_of_large(size)
         if not is_large or not self.is_live:
             return self._optimize(rejection)
-        share = _EDGES_TAKEN_AFTER if rejection == "edges" and not is_urgent else _TAKEN_AFTER
+        is_long = rejection in ("edges", "explained") and not is_urgent
+        share = _EXPLAINED_TAKEN_AFTER if is_long else _TAKEN_AFTER
         due = len(self.keyframes) + int(share * len(self.keyframes))
         self.beside = BackgroundOptimization(self.graph, self.config.graph, rejection, due)
         self._begin_waiting(rejection)
@@ -403,11 +403,15 @@ class Slam:
             self._follow_graph()
 
     def _rejection_of_large(self, size: int) -> OutlierRejection:
-        """An update, or where the graph has grown much or most new closures disagree, a new verdict on all."""
+        """Of the last keyframes, of all where the work for it is within bounds, or at first a verdict on all."""
+        count = len(self.keyframes)
         disagree = self.contradicting_closures > 0.5 * self.waiting_closures
-        if len(self.keyframes) - self.judged_at < (_GROWTH if disagree else _JUDGED_GROWTH) * size:
-            return "retained"
-        return "edges" if disagree else "gnc"
+        if not self.judged_at:
+            return "edges" if disagree else "gnc"
+        if disagree and count - self.explained_at >= _GROWTH * size:
+            return "explained"
+        is_within = (count - self.updated_at) * _WORK_PER_KEYFRAME >= self.graph.work
+        return "retained" if is_within else "recent"
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         if len(self.keyframes) >= _LARGE:
@@ -425,11 +429,14 @@ class Slam:
 
     def _begin_waiting(self, rejection: OutlierRejection) -> None:
         """All closures so far are taken into account: wait for the next."""
-        if rejection != "retained":
-            self.judged_at = len(self.keyframes)
+        count = self.optimized_at = len(self.keyframes)
+        if rejection not in ("retained", "recent"):
+            self.explained_at = count
+        if rejection not in ("recent", "explained"):
+            self.updated_at = count
+            self.judged_at = self.judged_at if rejection == "retained" else count
         self.waiting_closures = self.contradicting_closures = self.new_closures = 0
-        self.moves_map, self.optimized_at = False, len(self.keyframes)
-        self.joins_segment = False
+        self.moves_map = self.joins_segment = False
         self._follow_graph()
 
     def _follow_graph(self) -> None:

@@ -1,4 +1,4 @@
-"""Errors of odometry that explain loop edges which contradict it: a systematic drift, and slips."""
+"""Errors of odometry that explain loop edges which contradict it: a systematic drift, slips and jumps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from scanchain.graph.optimization import Solved, solve
 from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
 from scanchain.graph.robust.graduation import Graduated
 from scanchain.graph.robust.groups import apart
+from scanchain.graph.robust.jumps import loosened, next_jump
+from scanchain.graph.robust.jumps import price_of as price_of_jumps
 from scanchain.graph.robust.left_out import LeftOut
+from scanchain.graph.robust.losses import rejection_limit
 from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
 
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
@@ -32,10 +35,12 @@ class Explanation:
     ----------
     drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
     slips : stretches of odometry that are too short by more than their edges say
+    jumps : edges of odometry, in the order of the poses, whose motion is wrong altogether
     """
 
     drift: NDArray[np.float64]
     slips: tuple[Slip, ...] = ()
+    jumps: tuple[int, ...] = ()
 
     @classmethod
     def none(cls, freedom: int) -> Explanation:
@@ -46,19 +51,30 @@ class Explanation:
         self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> tuple[Matrix, Matrix]:
         """Measurements (E, d+1, d+1) and their information (E, k, k), drift and slips taken out of odometry."""
-        if not self.drift.any() and not self.slips:
+        if not self.drift.any() and not self.slips and not self.jumps:
             return measured, information
         odometry = odometry_of(edges, is_loop)
         measured, information = measured.copy(), information.copy()
         slipped = without_slips(measured[odometry], information[odometry], self.slips)
         measured[odometry] = corrected(slipped, self.drift, _sign(edges[odometry]))
         information[odometry] = rescaled(information[odometry], self.drift)
+        lost = odometry[list(self.jumps)]
+        information[lost] = loosened(information[lost])
         return measured, information
 
-    def cost(self, measured: Matrix, information: Matrix, price: float) -> float:
-        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry."""
+    def with_later(self, other: Explanation, before: int) -> Explanation:
+        """The same with slips and jumps of another, of the edges of odometry that come after so many."""
+        slips = (replace(slip, first=slip.first + before) for slip in other.slips)
+        return replace(self, slips=(*self.slips, *slips), jumps=(*self.jumps, *(j + before for j in other.jumps)))
+
+    def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
+        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry.
+
+        nominal : price where the noise model is right
+        """
         of_slips = sum(price_of(slip, measured, information) for slip in self.slips)
-        return of_slips + penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
+        of_jumps = float(price_of_jumps(information[list(self.jumps)], price, nominal).sum())
+        return of_slips + of_jumps + penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
 
 
 def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -90,6 +106,9 @@ def corrections(
         lines.append(
             f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between {noun} {first:,} and {last:,}"
         )
+    for jump in explanation.jumps:
+        first, last = sorted(names[edges[jump]].tolist())
+        lines.append(f"corrected by loop closures: a jump between {noun} {first:,} and {last:,}")
     return lines
 
 
@@ -113,11 +132,18 @@ class Explainer:
         is_loop: NDArray[np.bool_],
         config: GraphConfig,
         rejection: Graduated,
+        *,
+        jumps: bool = False,
     ) -> None:
-        """problem_of : the problem under an explanation; measured, information : of all edges, as added."""
+        """problem_of : the problem under an explanation; measured, information : of all edges, as added.
+
+        jumps : whether to look for jumps rather than for a drift, which is one of all odometry
+        """
         self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
         self._measured, self._information = measured, information
         self._rejection: Graduated = rejection
+        self._jumps = jumps
+        self._nominal = rejection_limit(config.robust_scale, measured.shape[-1] * (measured.shape[-1] - 1) // 2)
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
@@ -133,29 +159,38 @@ class Explainer:
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
         price = best.solved.minimum.price
-        for explanation in self._candidates(best):
-            trial = self._solved(explanation, best.solved.poses, "given")
+        for explanation, poses in self._candidates(best):
+            trial = self._solved(explanation, poses, "given")
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
-    def _candidates(self, best: Explained) -> list[Explanation]:
+    def _candidates(self, best: Explained) -> list[tuple[Explanation, Matrix]]:
+        """Explanations, and poses to begin with."""
         problem, now, price = best.problem, best.explanation, best.solved.minimum.price
+        poses = best.solved.poses
         kept = best.solved.minimum.weights > REJECTED_WEIGHT
         rejected = np.flatnonzero(~kept)
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
         odometry = odometry_of(problem.edges, self._is_loop)
-        left_out = LeftOut.at(problem, best.solved.poses, odometry, kept)
-        found: list[tuple[float, Explanation]] = []
-        if now.drift.any() or len(rejected) > FEWEST:
+        left_out = LeftOut.at(problem, poses, odometry, kept)
+        found: list[tuple[float, Explanation, Matrix]] = []
+        if not self._jumps and (now.drift.any() or len(rejected) > FEWEST):
             gain, change = drift_step(left_out, _sign(problem.edges[odometry]), now.drift, price)
             found.append(
-                (gain - (0.0 if now.drift.any() else FEWEST * price), replace(now, drift=now.drift + change))
+                (
+                    gain - (0.0 if now.drift.any() else FEWEST * price),
+                    replace(now, drift=now.drift + change),
+                    poses,
+                )
             )
         gain, slips = next_slip(left_out, self._measured[odometry], now.slips, price)
-        found.append((gain, replace(now, slips=slips)))
+        found.append((gain, replace(now, slips=slips), poses))
+        if self._jumps:
+            gain, edge, twist = next_jump(left_out, now.jumps, price, self._nominal)
+            found.append((gain, replace(now, jumps=(*now.jumps, edge)), left_out.moved(poses, edge, twist)))
         found.sort(key=lambda each: -each[0])
-        return [explanation for gain, explanation in found if gain > _SETTLED * price]
+        return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
 
     def _solved(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         problem = self._problem_of(explanation)
@@ -166,5 +201,7 @@ class Explainer:
         """Cost of a minimum at this price of a loop edge, and of its explanation."""
         minimum, odometry = explained.solved.minimum, odometry_of(explained.problem.edges, self._is_loop)
         kept = minimum.weights > REJECTED_WEIGHT
-        own = explained.explanation.cost(self._measured[odometry], self._information[odometry], price)
+        own = explained.explanation.cost(
+            self._measured[odometry], self._information[odometry], price, self._nominal
+        )
         return float(minimum.estimate.chi2[kept].sum()) + price * int((~kept).sum()) + own

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -28,13 +29,16 @@ from scanchain.graph.observability import (
     own_equations,
     weakly_joined,
 )
-from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
-from scanchain.graph.robust.graduation import OutlierRejection
+from scanchain.graph.robust.graduation import Graduated, OutlierRejection
 from scanchain.graph.robust.slips import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
+from scanchain.graph.solvers.minimizer import Evaluation
 from scanchain.words import counted
+
+_LAST = 0.1  # share of the poses that are the last ones, among which errors of odometry are looked for
 
 
 class PoseGraph:
@@ -59,7 +63,7 @@ class PoseGraph:
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
         self.since = Since(0, 0)
-        self.work = 0.0  # multiplications that factoring H took in the last optimization
+        self.work = 0.0  # multiplications that the factorizations of the last optimization took
         self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
@@ -108,8 +112,13 @@ class PoseGraph:
         """Stretches of odometry that loop edges show to be off by more than their edges say."""
         return self._explanation.slips
 
+    @property
+    def jumps(self) -> tuple[int, ...]:
+        """Edges of odometry, in the order of the poses, whose motion loop edges show to be wrong altogether."""
+        return self._explanation.jumps
+
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
-        """``drift`` and ``slips`` in words, a line each; ``names`` (K,) number the poses for the reader."""
+        """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
         edges = self.edges[odometry_of(self.edges, self.is_loop)]
         return corrections(self._explanation, edges, names, noun)
 
@@ -122,7 +131,8 @@ class PoseGraph:
         """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
         explanation, new = self._explanation, slice(first, None)
         before = int((~self.is_loop[:first]).sum())
-        if any(slip.edges.stop > before for slip in explanation.slips):
+        ends = (*explanation.jumps, *(slip.edges.stop - 1 for slip in explanation.slips))
+        if any(end >= before for end in ends):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(
@@ -247,7 +257,9 @@ class PoseGraph:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
         rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization;
-            "retained" is cheapest: it begins with the inliers at hand and judges new edges by these
+            "retained" is cheapest: it begins with the inliers at hand and judges new edges by these; "recent"
+            does so with the last poses alone, all others held, and "explained" refines the inliers there and looks
+            for errors of odometry that explain why loop edges disagree
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
@@ -256,17 +268,13 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            explained = self._explained(problem, config, initialize, rejection)
+            if rejection in ("recent", "explained"):
+                solved = self._optimize_last(config, explains=rejection == "explained")
+            else:
+                solved = self._optimize_all(problem, config, initialize, rejection)
         except SingularMatrixError as error:
             raise self._singular(error, problem) from error
-        solved, minimum = explained.solved, explained.solved.minimum
-        self._problem, self._explanation = explained.problem, explained.explanation
-        self._poses.replace(solved.poses)
-        self._weight.replace(minimum.weights)
-        self._factor_is_now = False
-        edges = len(self.edges)
-        self.since = Since(self.since.judged if rejection == "retained" else edges, edges)
-        self.work = self._problem.cholesky.work
+        minimum = solved.minimum
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -284,15 +292,52 @@ class PoseGraph:
 
         Of the loop edges to them those are in force whose χ² is small there, until all are optimized again.
         """
-        chosen = np.flatnonzero((self.edges >= first).any(axis=1))
-        poses, ends = np.unique(self.edges[chosen], return_inverse=True)
-        edges, is_loop = ends.reshape(-1, 2), self.is_loop[chosen]
-        measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
-        is_held = (poses < first) | self.fixed[poses]
-        problem = BetweenProblem(edges, measured, information, is_held, self.is_point[poses])
-        solved = solve(problem, self.poses[poses], is_loop, config, "given", Since(len(chosen), len(chosen)))
+        end = _End.of(self, first)
+        solved = solve(
+            end.problem_of(Explanation.none(self.freedom)),
+            self.poses[end.poses],
+            end.is_loop,
+            config,
+            "given",
+            Since(len(end.edges), len(end.edges)),
+        )
+        self._move_end(end, solved)
+
+    def _optimize_all(
+        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: OutlierRejection
+    ) -> Solved:
+        explained = self._explained(problem, config, initialize, rejection)
+        solved = explained.solved
+        self._problem, self._explanation = explained.problem, explained.explanation
+        self._poses.replace(solved.poses)
+        self._weight.replace(solved.minimum.weights)
+        self._factor_is_now = False
+        edges = len(self.edges)
+        self.since = Since(self.since.judged if rejection == "retained" else edges, edges)
+        self.work = self._problem.cholesky.work * solved.minimum.iterations
+        return solved
+
+    def _optimize_last(self, config: GraphConfig, *, explains: bool) -> Solved:
+        """Optimize the last poses, all others held; ``explains`` as "explained" does."""
+        end = _End.of(self, int((1.0 - _LAST) * len(self)))
+        none, poses = Explanation.none(self.freedom), self.poses[end.poses]
+        if not explains:
+            solved = solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
+        else:
+            arrays = end.measured, end.information, end.is_loop
+            explained = Explainer(end.problem_of, *arrays, config, "edges", jumps=True).solve(none, poses, "given")
+            before = int((~self.is_loop).sum() - (~end.is_loop).sum())
+            self._explanation = self._explanation.with_later(explained.explanation, before)
+            solved = explained.solved
+        self._move_end(end, solved)
+        problem = self._prepared()
+        errors = problem.errors(self.poses)
+        estimate = Evaluation(self.poses, errors, problem.chi2(errors), solved.minimum.estimate.cost)
+        return replace(solved, minimum=replace(solved.minimum, estimate=estimate))
+
+    def _move_end(self, end: _End, solved: Solved) -> None:
         moved, weight = self.poses.copy(), self.weight.copy()
-        moved[poses], weight[chosen] = solved.poses, solved.minimum.weights
+        moved[end.poses], weight[end.chosen] = solved.poses, solved.minimum.weights
         self._poses.replace(moved)
         self._weight.replace(weight)
         self._changed()
@@ -409,7 +454,7 @@ class PoseGraph:
             solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
             return Explained(problem, solved, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
-        graduated = "gnc" if rejection == "retained" else rejection
+        graduated: Graduated = "refined" if rejection == "refined" else "edges" if rejection == "edges" else "gnc"
         explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, graduated)
         return explainer.solve(self._explanation, self.poses, initialize)
 
@@ -465,6 +510,42 @@ class PoseGraph:
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """The last poses of a graph, with the edges to them, and the earlier ones that these join them to.
+
+    Attributes
+    ----------
+    chosen : (E,) the edges; poses : (K,) the poses at their ends, is_held (K,) the earlier ones
+    edges, measured, information, is_loop : (E, ...) of the edges, between places among these poses, odometry
+        corrected as it is now
+    """
+
+    chosen: NDArray[np.int64]
+    poses: NDArray[np.int64]
+    is_held: NDArray[np.bool_]
+    is_point: NDArray[np.bool_]
+    edges: NDArray[np.int64]
+    measured: Matrix
+    information: Matrix
+    is_loop: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, graph: PoseGraph, first: int) -> _End:
+        """The poses from this one on."""
+        chosen = np.flatnonzero((graph.edges >= first).any(axis=1))
+        poses, ends = np.unique(graph.edges[chosen], return_inverse=True)
+        measured, information = (each[chosen - chosen[0]] for each in graph.added_since(int(chosen[0])))
+        is_held = (poses < first) | graph.fixed[poses]
+        is_point, is_loop = graph.is_point[poses], graph.is_loop[chosen]
+        return cls(chosen, poses, is_held, is_point, ends.reshape(-1, 2), measured, information, is_loop)
+
+    def problem_of(self, explanation: Explanation) -> BetweenProblem:
+        """The problem under a further explanation."""
+        applied = explanation.applied(self.edges, self.measured, self.information, self.is_loop)
+        return BetweenProblem(self.edges, *applied, self.is_held, self.is_point)
 
 
 def _refused(undetermined: str) -> InputError:

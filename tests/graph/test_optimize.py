@@ -230,10 +230,10 @@ def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_add
     assert np.array_equal(graph.weight, [*whole.weight, 1.0, 1.0])
 
 
-@pytest.mark.parametrize("first", [0, 12, 40, 60])
+@pytest.mark.parametrize("first", [0, 12, 18, 40, 60])
 def test_edges_added_are_corrected_as_among_all_others(first):
     graph, _ = ring(2, count=60, noise=0.03)
-    graph._explanation = Explanation(np.array([0.02, 0.001]), (Slip(10, 4, 0.5),))
+    graph._explanation = Explanation(np.array([0.02, 0.001]), (Slip(10, 4, 0.5),), (20,))
     for added, every in zip(graph.added_since(first), (graph.measurements, graph.information), strict=True):
         assert np.allclose(added, every[first:], rtol=1e-12, atol=1e-12)
 

@@ -226,9 +226,10 @@ def test_a_loss_of_the_users_that_is_none_is_refused(name, fault):
         graph.optimize(GraphConfig(robust=f"{__name__}:{name}"))
 
 
-def round_trips(drifted, turns=3, written="forward"):
-    """A graph of laps whose odometry is measured as ``drifted`` makes it, every lap closed at every tenth pose.
+def round_trips(drifted, turns=3, written="forward", every=10):
+    """A graph of laps whose odometry is measured as ``drifted`` makes it.
 
+    every : every so many poses, a lap is closed to the one before
     written : how its odometry edges are: "forward", "backward" (from each pose to the one before), "last first"
     """
     rng = np.random.default_rng(1)
@@ -242,7 +243,7 @@ def round_trips(drifted, turns=3, written="forward"):
         odometry.append((i + 1, i, lie.inverse(Z)) if written == "backward" else (i, i + 1, Z))
     for i, j, Z in reversed(odometry) if written == "last first" else odometry:
         graph.add_edge(i, j, Z, np.diag(sigma**-2))
-    for i in range(0, len(true) - 60, 10):
+    for i in range(0, len(true) - 60, every):
         Z = lie.inverse(true[i]) @ true[i + 60] @ lie.exp(0.3 * sigma * rng.normal(size=3))
         graph.add_edge(i, i + 60, Z, np.diag(sigma**-2), is_loop=True)
     return graph, np.array(true)
@@ -279,9 +280,27 @@ def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected(writ
     assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.7
 
 
-def test_odometry_that_no_loop_contradicts_is_left_as_it_is():
+@WRITTEN
+def test_loops_that_agree_show_a_jump_of_odometry_among_the_last_poses_instead_of_being_rejected(written):
+    jump = lie.pose_2d(-2.0, 1.0, 0.1)
+    graph, true = round_trips(lambda i, Z: Z @ jump if i == 1105 else Z, turns=20, written=written, every=2)
+    graph.optimize(GraphConfig(), initialize="odometry", rejection="gnc")
+    assert graph.state().is_rejected.any() and np.abs(graph.poses - true)[1110:, :2, 2].max() > 1.0
+    answer = graph.optimize(GraphConfig(), initialize="given", rejection="explained")
+    assert not answer.rejected.any() and graph.slips == () and not graph.drift.any()
+    (edge,) = graph.jumps
+    assert abs(edge - 1105) <= 1
+    assert graph.corrections(10 * np.arange(len(graph)), "scans") == [
+        f"corrected by loop closures: a jump between scans {10 * edge:,} and {10 * edge + 10:,}"
+    ]
+    assert np.abs(np.delete(graph.poses - true, 1105, axis=0))[:, :2, 2].max() < 0.05  # it is to either side
+
+
+@pytest.mark.parametrize("rejection", ["refined", "explained"])
+def test_odometry_that_no_loop_contradicts_is_left_as_it_is(rejection):
     graph, _ = round_trips(lambda i, Z: Z)
-    graph.optimize(GraphConfig())
+    graph.optimize(GraphConfig(), rejection=rejection)
+    assert not graph.corrections(np.arange(len(graph))) and graph.jumps == ()
     assert not graph.drift.any() and graph.slips == ()
 
 

@@ -17,7 +17,7 @@ from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limi
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
 Graduated = Literal["gnc", "edges", "refined"]
-OutlierRejection = Literal[Graduated, "retained"]
+OutlierRejection = Literal[Graduated, "retained", "recent", "explained"]
 
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success

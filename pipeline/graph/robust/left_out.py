@@ -14,6 +14,7 @@ from scanchain.graph.covariance import difference_covariance, edge_covariances, 
 from scanchain.graph.robust.groups import apart
 
 _MOST = 30  # largest number of loop edges that are looked at
+_MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,20 +24,24 @@ class LeftOut:
     Attributes
     ----------
     problem, factored : all edges, and those kept with H factored at the poses
-    edges : (L,) these loop edges; odometry : (O,) the edges of odometry in the order of the poses
+    edges : (L,) these loop edges, each of them for ``stride`` such edges
+    odometry : (O,) the edges of odometry in the order of the poses
     errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
     covariances : (L, k, k) of their residuals, by their own noise and the graph without them
     predicted : (O, k, k) covariances of what the graph predicts of odometry
+    joint : (L, O, k, k) covariances of the left twists of both, Cov(ξ_end − ξ_begin, ξ_j − ξ_i)
     """
 
     problem: BetweenProblem
     factored: BetweenProblem
     edges: NDArray[np.int64]
+    stride: int
     odometry: NDArray[np.int64]
     errors: Matrix
     jacobians: Matrix
     covariances: Matrix
     predicted: Matrix
+    joint: Matrix
 
     @classmethod
     def at(
@@ -46,7 +51,9 @@ class LeftOut:
         is_loop = np.ones(len(kept), np.bool_)
         is_loop[odometry] = False
         edges = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
-        edges = edges[:: max(1, -(-len(edges) // _MOST))]
+        most = min(_MOST, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
+        stride = max(1, -(-len(edges) // max(most, 1)))
+        edges = edges[::stride]
         errors = problem.errors(poses)
         jacobians = problem.jacobians(poses, errors)
         factored = problem.factored(poses, errors, kept)
@@ -57,16 +64,19 @@ class LeftOut:
             joint_of_edge = difference_covariance(factored, *problem.edges[edge])
             covariances[place] += jacobians[edge] @ joint_of_edge @ jacobians[edge].T
         predicted = J @ joint @ np.swapaxes(J, 1, 2)
-        return cls(problem, factored, edges, odometry, errors, jacobians, covariances, predicted)
+        begin, end = problem.edges[odometry].T
+        both = np.empty((len(edges), len(odometry), *predicted.shape[1:]))
+        for place, edge in enumerate(edges):
+            moved = responses(factored, *problem.edges[edge])
+            both[place] = moved[end] - moved[begin]
+        return cls(problem, factored, edges, stride, odometry, errors, jacobians, covariances, predicted, both)
 
     def shifts(self, twists: Matrix) -> Iterator[Matrix]:
         """∂e (O, k, p) of each of these loop edges, by right twists (O, k, p) on the measurements of odometry."""
         problem, odometry = self.problem, self.odometry
         pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ problem.information[odometry]
-        begin, end = problem.edges[odometry].T
-        for edge in self.edges:
-            moved = responses(self.factored, *problem.edges[edge])
-            yield self.jacobians[edge] @ np.swapaxes(moved[end] - moved[begin], 1, 2) @ pull @ twists
+        for edge, joint in zip(self.edges, self.joint, strict=True):
+            yield self.jacobians[edge] @ np.swapaxes(joint, 1, 2) @ pull @ twists
 
     def quadratic(self, twists: Matrix) -> tuple[NDArray[np.float64], Matrix]:
         """Slope b (p,) and curvature A (p, p) of right twists τ (O, k, p) on the odometry.
@@ -74,14 +84,25 @@ class LeftOut:
         With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
         where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
         """
-        problem, odometry, packing = self.problem, self.odometry, self.factored.packing
+        problem, odometry = self.problem, self.odometry
         weighted = problem.information[odometry] @ twists
-        forces = np.swapaxes(self.jacobians[odometry], 1, 2) @ weighted
-        whole = np.zeros((len(problem.variable), *forces.shape[1:]))
-        begin, end = problem.edges[odometry].T
-        np.add.at(whole, end, forces)
-        np.add.at(whole, begin, -forces)
-        g = packing.rows(whole[problem.free])
+        g = self._pull(weighted)
         A = np.einsum("oap,oaq->pq", twists, weighted) - g.T @ self.factored.cholesky.solve(g)
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
         return b, A
+
+    def moved(self, poses: Matrix, edge: int, twist: NDArray[np.float64]) -> Matrix:
+        """These poses after a right twist (k,) on the measurement of one edge of odometry."""
+        weighted = np.zeros((len(self.odometry), len(twist), 1))
+        weighted[edge, :, 0] = self.problem.information[self.odometry[edge]] @ twist
+        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted))[:, 0])
+
+    def _pull(self, weighted: Matrix) -> Matrix:
+        """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (O, k, p)."""
+        problem = self.problem
+        forces = np.swapaxes(self.jacobians[self.odometry], 1, 2) @ weighted
+        whole = np.zeros((len(problem.variable), *forces.shape[1:]))
+        begin, end = problem.edges[self.odometry].T
+        np.add.at(whole, end, forces)
+        np.add.at(whole, begin, -forces)
+        return self.factored.packing.rows(whole[problem.free])
