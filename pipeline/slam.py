@@ -410,8 +410,8 @@ class Slam:
             return "edges" if disagree else "gnc"
         if disagree and count - self.explained_at >= _GROWTH * size:
             return "explained"
-        is_within = (count - self.updated_at) * _WORK_PER_KEYFRAME >= self.graph.work
-        return "retained" if is_within else "recent"
+        enough = max(_GROWTH * size, self.graph.work / _WORK_PER_KEYFRAME)
+        return "retained" if count - self.updated_at >= enough else "recent"
 
     def _optimize(self, rejection: OutlierRejection) -> GraphState:
         if len(self.keyframes) >= _LARGE:

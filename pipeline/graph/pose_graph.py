@@ -38,7 +38,7 @@ from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.graph.solvers.minimizer import Evaluation
 from scanchain.words import counted
 
-_LAST = 0.1  # share of the poses that are the last ones, among which errors of odometry are looked for
+_LAST, _MOST_LAST = 0.1, 2000  # share of the poses that are the last ones, and their largest number
 
 
 class PoseGraph:
@@ -319,7 +319,7 @@ class PoseGraph:
 
     def _optimize_last(self, config: GraphConfig, *, explains: bool) -> Solved:
         """Optimize the last poses, all others held; ``explains`` as "explained" does."""
-        end = _End.of(self, int((1.0 - _LAST) * len(self)))
+        end = _End.of(self, len(self) - min(int(_LAST * len(self)), _MOST_LAST))
         none, poses = Explanation.none(self.freedom), self.poses[end.poses]
         if not explains:
             solved = solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))

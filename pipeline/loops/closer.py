@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.graph.nearest import nearest_position
+from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.map_search import MapSearch
 from scanchain.loops.place_closer import PlaceCloser
@@ -21,7 +21,8 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
 
 _KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
-_LARGE = 2000  # keyframes in space from which on the pass that was matched last goes before the nearest one
+_LARGE = 2000  # keyframes from which on those of one pass go before the nearest one
+_ALIKE_RAD = 0.5  # largest difference in heading from a keyframe of the first pass
 _ALONG = 10  # keyframes before and after the last target, among which the next one is
 _SUBMAP_KEYFRAMES = 5  # before and after the center of a submap, which scans are matched to
 
@@ -176,12 +177,17 @@ class ProximityCloser:
         return near[near < self.of_map] if (near < self.of_map).any() else near, uncertainty_m
 
     def _next(self, T_world: Matrix, old: int, connected: NDArray[np.bool_]) -> tuple[int, float]:
-        """The nearest of the older keyframes, and its distance; in large graphs of the pass that was matched last.
+        """The nearest of the older keyframes, and its distance; in large graphs of one pass over a place.
 
         So revisits of a place that was passed many times are not closed to another pass each, and its submaps are
-        used again. In the plane, where they are quick to build, a slip of odometry in a corridor would go on: the
-        keyframes after it would be closed to one pass before it that looks the same there.
+        used again. In space it is the pass that was matched last. In the plane it is the first: after a slip of
+        odometry in a corridor, keyframes would be closed to each other.
         """
+        if old >= _LARGE and self.submaps.dimension == 2:
+            reach_m = self.config.min_radius_m
+            first, distance_m = on_first_pass(T_world[:old], T_world[-1], connected[:old], reach_m, _ALIKE_RAD)
+            if first >= 0:
+                return first, distance_m
         if old >= _LARGE and self.target >= self.of_map and self.submaps.dimension == 3:
             begin, end = max(self.target - _ALONG, 0), min(self.target + _ALONG + 1, old)
             distances_m = np.where(connected[begin:end], _distances_m(T_world, slice(begin, end)), np.inf)

@@ -6,7 +6,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
-from scanchain.kernels.graph.nearest import nearest_position
+from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
 from scanchain.kernels.graph.shortest_paths import shortest_paths
 from scanchain.kernels.registration import optimizers
 from scanchain.kernels.registration.association import associate
@@ -355,6 +355,18 @@ def test_the_nearest_position_is_that_of_a_search_through_all_that_are_chosen(di
         nearest, distance_m = nearest_position(poses, poses[7], chosen)
         assert distance_m == distances_m.min()
         assert nearest == (np.argmin(distances_m) if count else -1)
+
+
+@pytest.mark.parametrize(
+    ("turned", "chosen", "expected"), [(0.3, 0, 4), (0.6, 0, -1), (0.3, 7, 14), (0.3, 20, -1)]
+)
+def test_the_first_pass_near_a_pose_is_found_where_it_is_nearest(turned, chosen, expected):
+    """Two passes of ten poses, 1 m apart each."""
+    poses = np.array([lie.pose_2d(k % 10, 0.1 * (k // 10), 0.0) for k in range(20)])
+    pose = lie.pose_2d(4.2, 0.0, turned)
+    found, distance_m = on_first_pass(poses, pose, np.arange(20) >= chosen, 2.0, 0.5)
+    away_m = np.linalg.norm(poses[expected, :2, 2] - pose[:2, 2]) if expected >= 0 else np.inf
+    assert (found, distance_m) == (expected, pytest.approx(away_m))
 
 
 def test_an_edge_of_infinite_length_leads_nowhere():

@@ -89,9 +89,11 @@ def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn
 
 @pytest.mark.parametrize(
     ("dimension", "target", "closest"),  # in its pass; in the first one; too far along it; none was matched; in 2D
-    [(3, 40, 45), (3, 5, 15), (3, 0, 75), (3, -1, 75), (2, 40, 75)],
+    [(3, 40, 45), (3, 5, 15), (3, 0, 75), (3, -1, 75), (2, 40, 15), (2, -1, 15)],
 )
-def test_a_revisit_stays_with_the_pass_that_was_matched_last(monkeypatch, dimension, target, closest):
+def test_a_revisit_stays_with_the_pass_that_was_matched_last_and_in_the_plane_with_the_first(
+    monkeypatch, dimension, target, closest
+):
     """Three passes of 30 keyframes, 2 m apart each; the newest keyframe lies in the third."""
     monkeypatch.setattr(closer, "_LARGE", 90)
     near = LoopCloser(configured(dimension), dimension).near
