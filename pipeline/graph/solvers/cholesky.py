@@ -13,6 +13,7 @@ from scanchain.data import Matrix
 from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
 from scanchain.kernels.graph.fronts import Fronts
 
+_MOST_SOLVED = 4_000_000  # scalars of solutions, 32 MB, beyond which their zeros are left out
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
 
@@ -196,10 +197,15 @@ class SparseCholesky:
         within = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         places = self._places[np.repeat(self.pattern.starts[variables], sizes) + within]
         path, local = self._path(places), np.empty(self._fronts.widest)
-        C = np.zeros((B.shape[1], self.pattern.scalars))
-        C[:, places] = B.T
-        for x in C:
+        reached = np.arange(self.pattern.scalars)
+        if B.shape[1] * len(reached) > _MOST_SOLVED:
+            reached = reached[np.isin(self._front_of, path)]
+        C = np.empty((B.shape[1], len(reached)))
+        for row, column in zip(C, B.T, strict=True):
+            x = np.zeros(self.pattern.scalars)
+            x[places] = column
             cholesky.solve_lower(self._fronts, self.factor, path, x, local)
+            row[:] = x[reached]
         return np.asarray(np.einsum("is,js->ij", C, C))
 
     def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
