@@ -109,16 +109,17 @@ def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
         return np.empty(0, np.float32)
     if type(value) is np.ndarray and value.dtype == np.float32 and value.shape == (0,):
         return value
-    array = _numbers(value, name, "seconds, one a point", np.float64)
+    is_ready = _is_ready(value, np.float32)
+    array = _numbers(value, name, "seconds, one a point", np.float32 if is_ready else np.float64)
     if array.shape not in ((count,), (0,)):
         raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or None")
-    farthest_s = float(np.abs(array).max(initial=0.0))
+    farthest_s = largest_magnitude(array)
     if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
             f"{name}: a point lies {farthest_s:.3g} s from the stamp of its scan; wanted seconds after the stamp, "
             f"at most {LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
         )
-    return value if _is_ready(value, np.float32) else array.astype(np.float32)  # type: ignore[return-value]
+    return array if is_ready else array.astype(np.float32)
 
 
 def truth(value: object, name: str) -> bool:

@@ -6,6 +6,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.graph.nearest import nearest_position
 from scanchain.kernels.graph.shortest_paths import shortest_paths
 from scanchain.kernels.registration import optimizers
@@ -360,3 +361,15 @@ def test_the_nearest_position_is_that_of_a_search_through_all_that_are_chosen(di
 def test_an_edge_of_infinite_length_leads_nowhere():
     edges = np.array([[0, 1], [1, 2]])
     assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(0, 3), (3, 3), (1700, 2), (1500,)])
+def test_the_largest_magnitude_is_that_of_all_entries_and_infinite_where_one_is_not_finite(shape, dtype):
+    array = np.random.default_rng(2).normal(size=shape).astype(dtype)
+    assert largest_magnitude(array) == np.abs(array).max(initial=0.0)
+    for place in {0, array.size // 2, array.size - 1} if array.size else ():
+        for bad in (np.nan, np.inf, -np.inf):
+            spoiled = array.copy()
+            spoiled.flat[place] = bad
+            assert largest_magnitude(spoiled) == np.inf
