@@ -95,6 +95,9 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
 
 def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
     """Refuse points that, moved by T, lie beyond what a voxel map can address."""
+    at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + largest_magnitude(T[:-1, -1].copy())
+    if at_most_m < _MOST_VOXELS * voxel_m:  # without moving them
+        return
     farthest_m = largest_moved(points, T)
     if not farthest_m < _MOST_VOXELS * voxel_m:
         raise InputError(

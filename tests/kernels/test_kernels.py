@@ -321,15 +321,27 @@ def test_downsampling_keeps_the_first_point_of_each_voxel_in_range(dimension, dt
     chosen = np.empty(len(points), np.int32)
     count = downsample.first_per_voxel(points, 0.4, 0.5, 3.0, np.arange(2048), chosen)
     assert chosen[:count].tolist() == naive.first_per_voxel(points.astype(float), 0.4, 0.5, 3.0)
+    exact = chosen[:count].copy()
+    table = np.empty(1 << int(count).bit_length(), np.int64)
+    assert downsample.first_per_voxel(points, 0.4, 0.5, 3.0, table, exact) == count
+    assert downsample.first_per_voxel(points, 0.4, 0.5, 3.0, table, exact[1:].copy()) == -1
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_deskewing_moves_each_point_along_the_motion(dimension):
-    points = some_points(dimension)
+@pytest.mark.parametrize(
+    ("twist", "deskew"),
+    [
+        ([1.0, 0.2, 0.3], downsample.deskew_in_plane),
+        ([1.0, 0.2, 0.1, 0.02, -0.05, 0.3], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 0.0, 0.0, 0.0], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 0.6, -0.5, 0.6], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 4.0, -5.0, 3.0], downsample.deskew_in_space),
+    ],
+)
+def test_deskewing_moves_each_point_along_the_motion(twist, deskew):
+    points = some_points(2 if len(twist) == 3 else 3)
     shares = np.linspace(-0.5, 1.0, len(points))
-    twist = np.array([1.0, 0.2, 0.3] if dimension == 2 else [1.0, 0.2, 0.1, 0.02, -0.05, 0.3])
-    expected = naive.deskew(points, shares, twist)
-    downsample.deskew(points, shares, twist)
+    expected = naive.deskew(points, shares, np.array(twist))
+    deskew(points, shares, np.array(twist))
     np.testing.assert_allclose(points, expected, atol=1e-12)
 
 

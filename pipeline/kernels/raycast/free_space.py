@@ -5,7 +5,6 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 
 FAR = 1e9  # m, range of bins that no ray fell into
-RANGE, HEIGHT = 0, 1  # columns of what is known of a point beside its direction, m
 _BLOCK = 256  # points whose directions are computed together
 
 
@@ -17,13 +16,14 @@ def nearest_ranges(points, ranges_m):
     steps of azimuth from −π
     """
     ranges_m[:] = FAR
-    rows, columns, local = _room()
+    rows, columns, ranges, heights = _room()
+    here = np.eye(4)
     for start in range(0, points.shape[0], _BLOCK):
         part = points[start : start + _BLOCK]
-        _locate(part, np.eye(4), ranges_m.shape, rows, columns, local)
+        _locate(part, here, ranges_m.shape, rows, columns, ranges, heights)
         for i in range(part.shape[0]):
-            if local[i, RANGE] > 0.0:
-                ranges_m[rows[i], columns[i]] = min(ranges_m[rows[i], columns[i]], local[i, RANGE])
+            if ranges[i] > 0.0:
+                ranges_m[rows[i], columns[i]] = min(ranges_m[rows[i], columns[i]], ranges[i])
 
 
 @njit(nogil=True)
@@ -34,12 +34,12 @@ def compare_ranges(points, T, ranges_m, margin_m: float, margin_share: float):
     range. It contradicts where all rays of its bin went on behind it. Others are hidden or out of sight.
     """
     agreeing = contradicting = 0
-    rows, columns, local = _room()
+    rows, columns, ranges, heights = _room()
     for start in range(0, points.shape[0], _BLOCK):
         part = points[start : start + _BLOCK]
-        _locate(part, T, ranges_m.shape, rows, columns, local)
+        _locate(part, T, ranges_m.shape, rows, columns, ranges, heights)
         for i in range(part.shape[0]):
-            range_m, seen_m = local[i, RANGE], ranges_m[rows[i], columns[i]]
+            range_m, seen_m = ranges[i], ranges_m[rows[i], columns[i]]
             if range_m <= 0.0 or seen_m >= FAR:
                 continue
             margin = margin_m + margin_share * seen_m
@@ -69,16 +69,16 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
     seen, seen_through : (N,) int32, changed in place
     """
     reach_m, window_m, margin_m, margin_share, level_m, level_share = limits
-    rows, columns, local = _room()
+    rows, columns, ranges, heights = _room()
     for s in range(spans.shape[0]):
         for start in range(spans[s, 0], spans[s, 1], _BLOCK):
             part = points[start : min(start + _BLOCK, spans[s, 1])]
-            _locate(part, T, ranges_m.shape, rows, columns, local)
+            _locate(part, T, ranges_m.shape, rows, columns, ranges, heights)
             for k in range(part.shape[0]):
-                if seen[start + k] >= enough or local[k, RANGE] > reach_m:
+                if seen[start + k] >= enough or ranges[k] > reach_m:
                     continue
                 sight = _sight(
-                    rows[k], columns[k], local[k, RANGE], local[k, HEIGHT],
+                    rows[k], columns[k], ranges[k], heights[k],
                     ranges_m, window_m, margin_m, margin_share, level_m, level_share,
                 )  # fmt: skip
                 if sight > 0:
@@ -87,7 +87,7 @@ def weigh_points(points, spans, T, ranges_m, limits, enough, seen, seen_through)
                     seen_through[start + k] += 1
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _sight(row, column, range_m, z, ranges_m, window_m, margin_m, margin_share, level_m, level_share):
     """1 where a point at that range and height was seen, −1 where it lies in free space, else 0."""
     if range_m <= window_m:
@@ -111,7 +111,7 @@ def _sight(row, column, range_m, z, ranges_m, window_m, margin_m, margin_share, 
     return -1 if _least(ranges_m, row, column, 1, FAR)[0] < FAR else 0
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _least(ranges_m, row, column, half, enough_m):
     """Least range, or any below ``enough_m``, and its row; of the bins ``half`` away at most, below 1.
 
@@ -129,23 +129,24 @@ def _least(ranges_m, row, column, half, enough_m):
     return least_m, row_of_least
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _room():
     """Arrays for ``_locate``."""
-    return np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int32), np.empty((_BLOCK, 2))
+    return np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int32), np.empty(_BLOCK), np.empty(_BLOCK)
 
 
 @njit(nogil=True)
-def _locate(points, T, shape, rows, columns, local):
+def _locate(points, T, shape, rows, columns, ranges, heights):
     """Row and column of the direction of each point (N, 3) moved by T (4, 4), its range and its height.
 
-    Without a branch: the compiler makes vector instructions of it.
+    Without a branch, and coordinates are read a fixed step apart: the compiler makes vector instructions of it.
     """
+    flat = points.reshape(-1)
     rxx, rxy, rxz, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     ryx, ryy, ryz, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     rzx, rzy, rzz, tz = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for i in range(points.shape[0]):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        px, py, pz = flat[3 * i], flat[3 * i + 1], flat[3 * i + 2]
         x = rxx * px + rxy * py + rxz * pz + tx
         y = ryx * px + ryy * py + ryz * pz + ty
         z = rzx * px + rzy * py + rzz * pz + tz
@@ -153,10 +154,10 @@ def _locate(points, T, shape, rows, columns, local):
         row = np.int32((_angle(z, np.sqrt(square)) / np.pi + 0.5) * shape[0])
         column = np.int32((_angle(y, x) / (2.0 * np.pi) + 0.5) * shape[1])
         rows[i], columns[i] = min(row, shape[0] - 1), min(column, shape[1] - 1)
-        local[i, RANGE], local[i, HEIGHT] = np.sqrt(square + z * z), z
+        ranges[i], heights[i] = np.sqrt(square + z * z), z
 
 
-@njit(inline="always")
+@njit(forceinline=True)
 def _angle(y: float, x: float) -> float:
     """``atan2`` to 2e-8 rad, by a polynomial (Abramowitz & Stegun 1964, 4.4.49); a bin is 9e-3 rad wide."""
     ratio = min(abs(x), abs(y)) / max(abs(x), abs(y), 1e-300)
