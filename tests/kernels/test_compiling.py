@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext
+from itertools import count
 from time import perf_counter
 
 import numba
@@ -29,12 +30,13 @@ from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.kernels.registration.weights import weigh
 from scanchain.registration import VoxelMap
-from scanchain.runs import results, warm_up
+from scanchain.runs import processing, results, warm_up
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
+from scanchain.viz.recording.recording import Recording
 
 
 class Told(Unwatched):
@@ -240,6 +242,17 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     assert metrics["run_s"] < figures["run_s"] + 0.5
     assert metrics["times_real_time"] == pytest.approx(metrics["log_span_s"] / metrics["run_s"])
     assert max(metrics["p95_ms"].values()) < 300.0
+
+
+@pytest.mark.parametrize("compiles", [True, False])
+def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_path, monkeypatch, compiles):
+    seconds, shown, steps = count(), [], []
+    monkeypatch.setattr(processing, "compiled_s", lambda: next(seconds) if compiles else 0.0)
+    monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
+    monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
+    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
+    np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
 
 
 @pytest.mark.parametrize(("d", "kernel"), [(2, residuals._in_plane), (3, residuals._in_space)])
