@@ -116,7 +116,7 @@ class Recording:
         return self.path.stat().st_size
 
     def preview(self, scan: Scan) -> None:
-        """Show a viewer, but no file, every n-th point of the first scan as measured, until its step is recorded."""
+        """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
         viewers = [sink for sink in self.sinks if sink is not self.file]
         self._send(lambda: self._previewed(scan), viewers)
 
