@@ -95,6 +95,9 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
 
 def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
     """Refuse points that, moved by T, lie beyond what a voxel map can address."""
+    at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + largest_magnitude(T[:-1, -1].copy())
+    if at_most_m < _MOST_VOXELS * voxel_m:  # without moving them
+        return
     farthest_m = largest_moved(points, T)
     if not farthest_m < _MOST_VOXELS * voxel_m:
         raise InputError(
@@ -109,16 +112,17 @@ def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
         return np.empty(0, np.float32)
     if type(value) is np.ndarray and value.dtype == np.float32 and value.shape == (0,):
         return value
-    array = _numbers(value, name, "seconds, one a point", np.float64)
+    is_ready = _is_ready(value, np.float32)
+    array = _numbers(value, name, "seconds, one a point", np.float32 if is_ready else np.float64)
     if array.shape not in ((count,), (0,)):
         raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or None")
-    farthest_s = float(np.abs(array).max(initial=0.0))
+    farthest_s = largest_magnitude(array)
     if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
             f"{name}: a point lies {farthest_s:.3g} s from the stamp of its scan; wanted seconds after the stamp, "
             f"at most {LONGEST_SWEEP_S:g} (from nanoseconds: 1e-9 * times; from absolute times: less the stamp)"
         )
-    return value if _is_ready(value, np.float32) else array.astype(np.float32)  # type: ignore[return-value]
+    return array if is_ready else array.astype(np.float32)
 
 
 def truth(value: object, name: str) -> bool:

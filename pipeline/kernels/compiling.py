@@ -22,15 +22,19 @@ from numba import config, jit, types  # pyright: ignore[reportPrivateImportUsage
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.environment import Environment
 from numba.core.registry import CPUDispatcher
 from numba.core.target_extension import jit_registry
 from numba.core.typed_passes import (
+    AnnotateTypes,
     InlineOverloads,
     NopythonRewrites,
     NoPythonSupportedFeatureValidation,
 )
+
+from scanchain.kernels.compiler_shortcuts import shortcuts
 
 try:
     import fcntl
@@ -40,7 +44,11 @@ except ImportError:  # Windows: processes that compile the same kernel at once d
 _PATIENCE_S = 120.0  # after which a kernel is compiled here too, whatever the other process is at
 _POLL_S = 0.01
 _OVERLOADS = "generic"  # key of the decorator of Numba's functions for NumPy's, looked up before "cpu"
-_NEEDLESS = (InlineOverloads, NopythonRewrites)  # passes over whole-array expressions, which kernels are without
+_NEEDLESS = (  # passes over closures and whole-array expressions, which kernels are without, and for messages
+    AnnotateTypes,
+    InlineOverloads,
+    NopythonRewrites,
+)
 _ENVIRONMENT = "_ZN08NumbaEnv"  # begin of the name of the variable that Numba sets of each function it has loaded
 
 
@@ -62,17 +70,19 @@ class _Quiet(CPUDispatcher):
     _compiler: Any
 
     def compile(self, sig: Any) -> Any:
-        is_collecting, is_first = gc.isenabled(), _OVERLOADS not in jit_registry
-        gc.disable()
-        if is_first:
+        with global_compiler_lock:
+            if _OVERLOADS in jit_registry:  # within the compilation of another
+                return super().compile(sig)
+            is_collecting = gc.isenabled()
+            gc.disable()
             jit_registry[_OVERLOADS] = _overload
-        try:
-            return super().compile(sig)
-        finally:
-            if is_first:
+            try:
+                with shortcuts():
+                    return super().compile(sig)
+            finally:
                 del jit_registry[_OVERLOADS]
-            if is_collecting:
-                gc.enable()
+                if is_collecting:
+                    gc.enable()
 
 
 class Kernel(_Quiet):

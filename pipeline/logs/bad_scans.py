@@ -10,6 +10,7 @@ from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 from scanchain.words import counted
@@ -46,7 +47,7 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
         return f"is malformed: {returns}"
     if message.log_time_ns >= 1 << 63:
         return f"has the log time {message.log_time_ns} ns, which no clock shows"
-    farthest_s = float(np.abs(returns.times_s).max()) if len(returns.times_s) else 0.0
+    farthest_s = largest_magnitude(returns.times_s)
     if farthest_s > LONGEST_SWEEP_S:
         return f"has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
     if not len(returns.points):

@@ -22,7 +22,7 @@ from scanchain.whole_file import write_whole
 PLACES_FILE = "places.npz"
 VERSION = 1
 _TOGETHER = 10  # number of keyframes whose points are seen together; drift between more would raise the ground
-_MAX_LEVELED = 50  # number of keyframes, evenly spread, whose ground says where the map's vertical is
+_MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground says where the map's vertical is
 
 
 @dataclass(frozen=True, slots=True)

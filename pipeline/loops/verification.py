@@ -164,10 +164,10 @@ def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, 
 
     points : (N, 3) meters, source's frame; margin_m : by which ranges may differ. 1 where nothing was in sight.
     """
-    ranges_m = np.empty(_BINS)
+    ranges_m, points = np.empty(_BINS), np.ascontiguousarray(points)
     agreeing = contradicting = 0
     for T_target_lidar, seen in submap.views(_VIEWS):
-        nearest_ranges(seen, ranges_m)
+        nearest_ranges(np.ascontiguousarray(seen), ranges_m)
         T_lidar_source = lie.between(T_target_lidar, T_target_source)
         yes, no = compare_ranges(points, T_lidar_source, ranges_m, margin_m, _MARGIN_SHARE)
         agreeing, contradicting = agreeing + yes, contradicting + no

@@ -12,7 +12,8 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels.voxels import downsample as kernels
 
-_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling, larger ones are not kept
+_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
+_GROWTH = 4  # of a table that has no room for all voxels
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,8 @@ class Sweep:
         if not self.is_distorted:
             return self.points
         points = self.points.copy()
-        kernels.deskew(points, self.times_s, velocity)
+        deskew = kernels.deskew_in_plane if points.shape[1] == 2 else kernels.deskew_in_space
+        deskew(points, self.times_s, velocity)
         return points
 
 
@@ -84,26 +86,32 @@ def first_per_voxel(
     points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
 ) -> NDArray[np.int32]:
     """Indices (M,) of the first point (N, d) in each voxel, near and far points left out."""
-    table, chosen = _scratch.room(len(points))
-    count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
-    return chosen[:count].copy()
+    while True:
+        table, chosen = _scratch.room(len(points))
+        count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
+        if count >= 0:
+            break
+        _scratch.resize(_GROWTH * len(table))
+    result = chosen[:count].copy()
+    if len(_scratch.table) > _MOST_SLOTS:
+        _scratch.resize(_LEAST_SLOTS)
+    return result
 
 
 class _Scratch(threading.local):
-    """Arrays of each thread, reused: to allocate them for every scan may take longer than to fill them."""
+    """Arrays of each thread, reused, as large as scans with so many voxels need: small ones stay in the cache."""
 
     def __init__(self) -> None:
-        self.table = np.empty(_LEAST_SLOTS, np.int64)
-        self.chosen = np.empty(_LEAST_SLOTS // 2, np.int32)
+        self.resize(_LEAST_SLOTS)
+
+    def resize(self, slots: int) -> None:
+        """Make others of this size."""
+        self.table, self.chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
 
     def room(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Table and indices to downsample so many points."""
-        slots = max(1 << max(2 * count - 1, 0).bit_length(), _LEAST_SLOTS)
-        if slots > _MOST_SLOTS:
-            return np.empty(slots, np.int64), np.empty(count, np.int32)
-        if slots > len(self.table):
-            self.table, self.chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
-        return self.table[:slots], self.chosen
+        """Table and indices to downsample so many points, none larger than they need at most."""
+        slots = min(1 << max(2 * count - 1, 1).bit_length(), len(self.table))
+        return self.table[:slots], self.chosen[: slots // 2]
 
 
 _scratch = _Scratch()

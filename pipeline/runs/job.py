@@ -133,6 +133,10 @@ class Recorder(Protocol):
         """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
         ...
 
+    def preview(self, scan: Scan) -> None:
+        """Show a viewer, but no file, the first scan as measured until its step is recorded."""
+        ...
+
     def log(self, step: Step) -> None:
         """Record one step."""
         ...

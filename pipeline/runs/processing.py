@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.clock import compiled_s
 from scanchain.config import Config
 from scanchain.data import Scan, Step, Trajectory
 from scanchain.errors import InputError
@@ -65,6 +66,7 @@ def process(
     true_poses: TruePoses,
 ) -> Processed:
     """Process every scan, from the first on or from the checkpoint, and write the results."""
+    compiled_before_s = compiled_s()
     slam, scans, checkpoints = _begin(job, log, config, directory.path, left)
     journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     with (
@@ -81,8 +83,9 @@ def process(
         if recording.web_address:
             progress.announce(f"viewer: {recording.web_address}")
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
+        read = _previewed(scans, compiled_before_s, recording) if left is None else scans
         with _Taking(recording, journal, steps) as taking:
-            for step in map(slam.process, _ahead(progress.track(scans, log.scan_count - len(steps)), slam)):
+            for step in map(slam.process, _ahead(progress.track(read, log.scan_count - len(steps)), slam)):
                 taking.take(step)
                 if checkpoints.are_due():
                     taking.enter()
@@ -155,6 +158,14 @@ def _begin(
     set_aside(folder, checkpoint)
     checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
     return checkpoint.slam, scans, checkpoints
+
+
+def _previewed(scans: Iterator[Scan], compiled_before_s: float, recording: Recorder) -> Iterator[Scan]:
+    """The scans; the first one is shown as measured where its step waits for kernels that are compiled."""
+    for number, scan in enumerate(scans):
+        if not number and compiled_s() > compiled_before_s:
+            recording.preview(scan)
+        yield scan
 
 
 def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:

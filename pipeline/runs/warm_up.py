@@ -71,7 +71,7 @@ def _problem(dimension: int) -> tuple[Problem, Pose]:
 
 
 def graph(dimension: int) -> None:
-    """Compile the optimization of a pose graph and the errors of its poses."""
+    """Compile the optimization of a pose graph, errors of its poses, and the covariances that loops need."""
     from scanchain.slam import Slam
 
     slam = Slam(load_settings(dimension).config, lie.identity(dimension))
@@ -79,6 +79,8 @@ def graph(dimension: int) -> None:
         slam.place(_located(keyframe, slam.config))
     slam.graph.position_errors(1)
     slam.finish()
+    slam.graph.relative_covariance(0, 1)
+    slam.graph.covariances()
     slam.points.close()
 
 

@@ -6,31 +6,37 @@ import pickle
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
+from itertools import count
 from time import perf_counter
 
+import numba
 import numpy as np
 import pytest
 from numba import config, njit
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.compiler import Flags
+from numba.core.types.functions import BaseFunction
 
 from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
-from scanchain.kernels import compiling
+from scanchain.kernels import compiler_shortcuts, compiling
 from scanchain.kernels.graph.cholesky import factorize
 from scanchain.kernels.registration import residuals
 from scanchain.kernels.registration.icp import align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
+from scanchain.kernels.registration.weights import weigh
 from scanchain.registration import VoxelMap
-from scanchain.runs import results, warm_up
+from scanchain.runs import processing, results, warm_up
 from scanchain.runs.job import Job, Unwatched
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
+from scanchain.viz.recording.recording import Recording
 
 
 class Told(Unwatched):
@@ -238,6 +244,17 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     assert max(metrics["p95_ms"].values()) < 300.0
 
 
+@pytest.mark.parametrize("compiles", [True, False])
+def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_path, monkeypatch, compiles):
+    seconds, shown, steps = count(), [], []
+    monkeypatch.setattr(processing, "compiled_s", lambda: next(seconds) if compiles else 0.0)
+    monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
+    monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
+    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
+    np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
+
+
 @pytest.mark.parametrize(("d", "kernel"), [(2, residuals._in_plane), (3, residuals._in_space)])
 def test_normal_equations_count_no_references_from_point_to_point(d, kernel, tmp_path, monkeypatch):
     """A row of an array, handed on, was counted up and down for every point: two thirds of the time."""
@@ -271,6 +288,37 @@ def test_functions_of_numpy_are_optimized_in_the_kernels_alone_and_numba_stays_a
     assert zeros(2).tolist() == [[0, 0], [0, 0]] and not any("np_zeros" in name for name in optimized)
     assert njit(lambda n: np.zeros((n, n, n), np.int16))(1).shape == (1, 1, 1)
     assert any("np_zeros" in name for name in optimized)
+
+
+def test_shortcuts_of_the_compiler_lead_to_the_same_code(tmp_path, monkeypatch):
+    voxels = VoxelMap(3, load_settings(3).config.local_map).voxels
+    arguments = voxels, np.empty((0, 3)), np.eye(4), np.empty(0, np.int32), 1.0, np.empty(0)
+
+    def instructions(name):
+        monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / name))
+        compiled = compiling.njit()(weigh.py_func)
+        compiled.compile(tuple(map(numba.typeof, arguments)))
+        return re.sub(r'[%@]("[^"]*"|[\w.$-]+)|^[\w.$-]+:|;.*', "", body(compiled), flags=re.MULTILINE)
+
+    with_shortcuts = instructions("with")
+    monkeypatch.setattr(compiling, "shortcuts", nullcontext)
+    assert instructions("without") == with_shortcuts and with_shortcuts.count("fmul") > 50
+
+
+def test_a_signature_is_resolved_once_and_numba_stays_as_it_is(tmp_path, monkeypatch):
+    resolved, resolve = [], BaseFunction.get_call_type
+
+    def remembered(function, context, arguments, names):
+        resolved.append((function, arguments))
+        return resolve(function, context, arguments, names)
+
+    monkeypatch.setattr(BaseFunction, "get_call_type", remembered)
+    monkeypatch.setattr(compiler_shortcuts, "_resolve", remembered)
+    monkeypatch.setattr(compiler_shortcuts, "_signatures", {})
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    assert compiling.njit()(lambda x, y: x * y + y * x + x * x)(2.0, 3.0) == 16.0
+    assert len(resolved) == len(set(resolved)) >= 2
+    assert BaseFunction.get_call_type is remembered
 
 
 def test_options_of_a_compilation_are_those_of_numba():

@@ -6,6 +6,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
 from scanchain.kernels.graph.shortest_paths import shortest_paths
 from scanchain.kernels.registration import optimizers
@@ -320,15 +321,27 @@ def test_downsampling_keeps_the_first_point_of_each_voxel_in_range(dimension, dt
     chosen = np.empty(len(points), np.int32)
     count = downsample.first_per_voxel(points, 0.4, 0.5, 3.0, np.arange(2048), chosen)
     assert chosen[:count].tolist() == naive.first_per_voxel(points.astype(float), 0.4, 0.5, 3.0)
+    exact = chosen[:count].copy()
+    table = np.empty(1 << int(count).bit_length(), np.int64)
+    assert downsample.first_per_voxel(points, 0.4, 0.5, 3.0, table, exact) == count
+    assert downsample.first_per_voxel(points, 0.4, 0.5, 3.0, table, exact[1:].copy()) == -1
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_deskewing_moves_each_point_along_the_motion(dimension):
-    points = some_points(dimension)
+@pytest.mark.parametrize(
+    ("twist", "deskew"),
+    [
+        ([1.0, 0.2, 0.3], downsample.deskew_in_plane),
+        ([1.0, 0.2, 0.1, 0.02, -0.05, 0.3], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 0.0, 0.0, 0.0], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 0.6, -0.5, 0.6], downsample.deskew_in_space),
+        ([1.0, 0.2, 0.1, 4.0, -5.0, 3.0], downsample.deskew_in_space),
+    ],
+)
+def test_deskewing_moves_each_point_along_the_motion(twist, deskew):
+    points = some_points(2 if len(twist) == 3 else 3)
     shares = np.linspace(-0.5, 1.0, len(points))
-    twist = np.array([1.0, 0.2, 0.3] if dimension == 2 else [1.0, 0.2, 0.1, 0.02, -0.05, 0.3])
-    expected = naive.deskew(points, shares, twist)
-    downsample.deskew(points, shares, twist)
+    expected = naive.deskew(points, shares, np.array(twist))
+    deskew(points, shares, np.array(twist))
     np.testing.assert_allclose(points, expected, atol=1e-12)
 
 
@@ -372,3 +385,15 @@ def test_the_first_pass_near_a_pose_is_found_where_it_is_nearest(turned, chosen,
 def test_an_edge_of_infinite_length_leads_nowhere():
     edges = np.array([[0, 1], [1, 2]])
     assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(0, 3), (3, 3), (1700, 2), (1500,)])
+def test_the_largest_magnitude_is_that_of_all_entries_and_infinite_where_one_is_not_finite(shape, dtype):
+    array = np.random.default_rng(2).normal(size=shape).astype(dtype)
+    assert largest_magnitude(array) == np.abs(array).max(initial=0.0)
+    for place in {0, array.size // 2, array.size - 1} if array.size else ():
+        for bad in (np.nan, np.inf, -np.inf):
+            spoiled = array.copy()
+            spoiled.flat[place] = bad
+            assert largest_magnitude(spoiled) == np.inf

@@ -24,6 +24,7 @@ from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain.viz.recording import entities, shapes, viewer
+from scanchain.viz.recording import recording as module
 from scanchain.viz.recording.blueprint import blueprint
 from scanchain.viz.recording.messages import Message
 from scanchain.viz.recording.recording import Recording
@@ -73,6 +74,28 @@ def test_the_recorded_numbers_are_those_of_the_steps(tmp_path):
         1,
         1,
     ]  # start, correction
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # before the recording is closed
+def test_a_preview_is_shown_by_a_viewer_until_its_step_is_recorded_and_is_in_no_file(tmp_path, monkeypatch):
+    steps, before, after = drive(20, 2), tmp_path / "before.rrd", tmp_path / "after.rrd"
+    monkeypatch.setattr(Recording, "_viewer_address", lambda self: "a viewer")
+    monkeypatch.setattr(module, "viewer_sink", lambda address, stream, layout: file_sink(after, stream, layout))
+    sinks, measured = frozenset({"save", "connect"}), replace(steps[0].scan, points=2.0 * steps[0].scan.points)
+    with Recording(tmp_path / "a.rrd", dimension=2, name="a", sinks=sinks, config=RecordingConfig()) as recording:
+        recording.preview(measured)
+        assert all(sink.settle() for sink in recording.sinks)
+        before.write_bytes(after.read_bytes())
+        for step in steps:
+            recording.log(step)
+    assert recording.warnings == []
+    scan = "Points3D:positions"
+    (previewed,) = column(before, entities.SCAN, scan)
+    np.testing.assert_array_equal(np.array(previewed)[:, :2], measured.points)
+    assert column(after, entities.SCAN, "scan") == [0, *range(20)]
+    assert column(after, entities.SCAN, scan)[1:] == column(tmp_path / "a.rrd", entities.SCAN, scan)
+    assert column(after, entities.SCAN, scan)[0] == previewed
+    assert column(tmp_path / "a.rrd", entities.SCAN, "scan") == list(range(20))
 
 
 def test_stamps_that_step_back_are_recorded_as_they_are(tmp_path):

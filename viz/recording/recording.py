@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rerun.error_utils import catch_and_log_exceptions
 
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
+from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
@@ -114,6 +114,11 @@ class Recording:
         if self.path is None or self.file is None or not self.file.settle():
             return 0
         return self.path.stat().st_size
+
+    def preview(self, scan: Scan) -> None:
+        """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
+        viewers = [sink for sink in self.sinks if sink is not self.file]
+        self._send(lambda: self._previewed(scan), viewers)
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
@@ -217,6 +222,11 @@ class Recording:
             messages.append(Message(entities.LOCAL_MAP, columns, self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
+    def _previewed(self, scan: Scan) -> list[Message]:
+        points = shapes.in_space(shapes.at_most(scan.points, self.config.max_map_points))
+        columns = rr.Points3D.columns(positions=points).partition([len(points)])
+        return [Message(entities.SCAN, columns, Times.at(scan.index, scan.stamp_ns))]
+
     def _settled(self, closures: Sequence[FinalClosure], graph: GraphState) -> list[Message]:
         verdicts = self.graph.settle(closures, graph)
         messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
@@ -253,13 +263,14 @@ class Recording:
         )
         return [Message(entities.GRID, grid)]
 
-    def _send(self, say: Callable[[], list[Message]]) -> None:
-        """Send the messages that ``say`` returns to every sink."""
-        if not self.sinks:
+    def _send(self, say: Callable[[], list[Message]], sinks: Sequence[Sink] | None = None) -> None:
+        """Send the messages that ``say`` returns to these sinks, or to every one."""
+        sinks = self.sinks if sinks is None else sinks
+        if not sinks:
             return
         messages: list[Message] = []
         self._guard(lambda: messages.extend(say()))
-        for sink in self.sinks if messages else ():
+        for sink in sinks if messages else ():
             sink.send(messages)
 
     def _guard(self, act: Callable[[], object]) -> None:

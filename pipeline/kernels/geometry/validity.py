@@ -7,14 +7,20 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.voxel_shapes import move
 
+_BLOCK = 512  # entries that are compared at once with the largest before
+
 
 @njit(nogil=True)
-def largest_magnitude(points) -> float:
-    """Largest |coordinate| of points (N, d); infinite where one is NaN or infinite, 0 without points."""
-    largest = 0.0
-    for i in range(points.shape[0]):
-        for axis in range(points.shape[1]):
-            value = abs(points[i, axis])
+def largest_magnitude(array) -> float:
+    """Largest |entry| of a C-contiguous array; infinite where one is NaN or infinite, 0 without entries."""
+    largest, values = 0.0, array.reshape(-1)
+    for start in range(0, values.size, _BLOCK):
+        part = values[start : start + _BLOCK]
+        larger = 0
+        for i in range(part.size):  # vector instructions, as nothing here depends on the entry before
+            larger += not abs(part[i]) <= largest
+        for i in range(part.size if larger else 0):
+            value = abs(part[i])
             if not value <= largest:
                 if not math.isfinite(value):
                     return np.inf

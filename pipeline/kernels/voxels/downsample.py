@@ -1,11 +1,17 @@
 """Downsampling to one point a voxel, and deskewing."""
 
+import math
+
 import numpy as np
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.twist import perturb
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
 
+_MOST_STEPS = 100.0  # of 1 rad in a sweep; no lidar turns faster
+_TERMS = 9  # of series in the square of an angle up to 1 rad
+_INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(2 * _TERMS + 3))
 _BLOCK = 2048  # points whose keys are computed at once, which the compiler makes vector instructions of
 
 
@@ -13,8 +19,9 @@ _BLOCK = 2048  # points whose keys are computed at once, which the compiler make
 def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: float, table, chosen):
     """Fill ``chosen`` with the indices of the first point in each voxel, near and far points left out.
 
-    points : (N, d) meters from the lidar; chosen : (N,) int32. Returns how many were chosen.
-    table : a power of two of slots, at least 2 N, whatever they hold
+    points : (N, d) meters from the lidar
+    table : int64, a power of two of slots, whatever they hold; chosen : int32, half as many
+    Returns how many were chosen, −1 where there was no room for all; for 2 N slots there is.
     Neighbors on a ring mostly share a voxel, so the last key is tried before the table.
     """
     n, slots = points.shape[0], table.size
@@ -38,6 +45,8 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
                 continue
             slot = find(table, keys[k])
             if slot < 0:
+                if count == chosen.size:
+                    return -1
                 table[~slot] = keys[k]
                 chosen[count] = rows[k]
                 count += 1
@@ -46,15 +55,26 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
 
 @njit(nogil=True)
 def _keys(points, scale: float, low: float, high: float, keys):
-    """Write the key of each point's voxel, EMPTY for squared ranges below low or above high."""
-    planar = points.shape[1] == 2
-    for i in range(points.shape[0]):
-        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        z = 0.0 if planar else np.float64(points[i, 2])
-        square = x * x + y * y + z * z
-        ix, iy, iz = np.int32(np.floor(x * scale)), np.int32(np.floor(y * scale)), np.int32(np.floor(z * scale))
-        key = pack(int(ix), int(iy), int(iz))
-        keys[i] = key if (low <= square) & (square <= high) else EMPTY
+    """Write the key of each point's voxel, EMPTY for squared ranges below low or above high.
+
+    Coordinates a fixed step apart are read as vectors; the compiler does not know how long a row of ``points`` is.
+    """
+    flat = points.reshape(-1)
+    if points.shape[1] == 2:
+        for i in range(points.shape[0]):
+            keys[i] = _key_of(flat[2 * i], flat[2 * i + 1], 0.0, scale, low, high)
+    else:
+        for i in range(points.shape[0]):
+            keys[i] = _key_of(flat[3 * i], flat[3 * i + 1], flat[3 * i + 2], scale, low, high)
+
+
+@njit(inline="always")
+def _key_of(x, y, z, scale: float, low: float, high: float):
+    x, y, z = np.float64(x), np.float64(y), np.float64(z)
+    square = x * x + y * y + z * z
+    ix, iy, iz = np.int32(np.floor(x * scale)), np.int32(np.floor(y * scale)), np.int32(np.floor(z * scale))
+    key = pack(int(ix), int(iy), int(iz))
+    return key if (low <= square) & (square <= high) else EMPTY
 
 
 @njit(nogil=True)
@@ -66,28 +86,57 @@ def gather(points, chosen, out):
 
 
 @njit(nogil=True)
-def deskew(points, shares, twist):
+def deskew_in_plane(points, shares, twist):
     """Move each point, in place, to its position as seen by the lidar at one instant, usually the scan's middle.
 
-    points : (N, d) meters, each in the lidar frame of its own instant
+    points : (N, 2) meters, each in the lidar frame of its own instant
     shares : (N,) time from that instant to the point's own, in units of the time in which the lidar moves by twist
-    twist : (k,) constant velocity; the pose at share τ is T exp(τ ξ), so that p ← exp(τ ξ) p
+    twist : (3,) constant velocity; the pose at share τ is T exp(τ ξ), so that p ← exp(τ ξ) p
     """
-    d = points.shape[1]
-    origin = np.zeros(3)
-    start, moved = np.eye(d + 1), np.eye(d + 1)
-    part = np.empty(twist.shape[0])
+    origin, start, moved = np.zeros(3), np.eye(3), np.eye(3)
+    part = np.empty(3)
     last = np.nan
     for i in range(points.shape[0]):
         if shares[i] != last:
             last = shares[i]
-            for k in range(twist.shape[0]):
+            for k in range(3):
                 part[k] = twist[k] * last
             perturb(part, start, origin, moved)
         x, y = points[i, 0], points[i, 1]
-        z = points[i, 2] if d == 3 else 0.0
-        for axis in range(d):
-            value = moved[axis, 0] * x + moved[axis, 1] * y + moved[axis, d]
-            if d == 3:
-                value += moved[axis, 2] * z
-            points[i, axis] = value
+        for axis in range(2):
+            points[i, axis] = moved[axis, 0] * x + moved[axis, 1] * y + moved[axis, 2]
+
+
+@njit(nogil=True)
+def deskew_in_space(points, shares, twist):
+    """``deskew_in_plane`` of points (N, 3) with a twist (6,): Rodrigues' formula (Barfoot 2017, 7.86) in vectors.
+
+    exp(τ ξ) p = p + τ ρ + φ × (a τ p + b τ² ρ + φ × (b τ² p + c τ³ ρ)) with ξ = (ρ, φ), θ = τ |φ| and the series
+    a = Σ (−θ²)ⁿ/(2n+1)!, b = Σ (−θ²)ⁿ/(2n+2)!, c = Σ (−θ²)ⁿ/(2n+3)!. A turn of more than 1 rad is taken in steps.
+    """
+    flat, x, y, z = points.reshape(-1), twist[3], twist[4], twist[5]
+    square = x * x + y * y + z * z
+    steps = int(np.ceil(min(max(np.sqrt(square) * largest_magnitude(shares), 1.0), _MOST_STEPS)))
+    ru, rv, rw = twist[0], twist[1], twist[2]
+    for _ in range(steps):
+        for i in range(shares.shape[0]):
+            share, u, v, w = shares[i] / steps, flat[3 * i], flat[3 * i + 1], flat[3 * i + 2]
+            share2 = share * share
+            s = -square * share2
+            a, b, c = _series(s, 1) * share, _series(s, 2) * share2, _series(s, 3) * share2 * share
+            du, dv, dw = b * u + c * ru, b * v + c * rv, b * w + c * rw
+            eu = a * u + b * ru + y * dw - z * dv
+            ev = a * v + b * rv + z * du - x * dw
+            ew = a * w + b * rw + x * dv - y * du
+            flat[3 * i] = u + share * ru + y * ew - z * ev
+            flat[3 * i + 1] = v + share * rv + z * eu - x * ew
+            flat[3 * i + 2] = w + share * rw + x * ev - y * eu
+
+
+@njit(forceinline=True)
+def _series(s: float, first: int) -> float:
+    """Σ sⁿ/(2n + first)!, to 1e-17 for |s| ≤ 1."""
+    total = 0.0
+    for n in range(_TERMS - 1, -1, -1):
+        total = total * s + _INVERSE_FACTORIALS[2 * n + first]
+    return total

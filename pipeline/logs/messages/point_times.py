@@ -62,12 +62,12 @@ class PointTimes:
         """
         if not len(values):
             return NO_TIMES
-        is_whole = values.dtype.kind in "iu"
-        raw = values.astype(np.int64) if is_whole else values.astype(np.float64)
-        if not np.isfinite(raw).all():
+        is_whole, kind = values.dtype.kind in "iu", values.dtype.name
+        values = values.astype(np.int64 if is_whole else np.float64)
+        first, last = values.min(), values.max()  # NaN where one of the values is
+        if not np.isfinite([first, last]).all():
             return NO_TIMES
-        first = raw.min()
-        span = float(raw.max() - first)
+        span = float(last - first)
         if span == 0.0:  # as where a float32 holds an absolute time
             return NO_TIMES
         unit = self.unit or _likely_unit(span, is_whole=is_whole)
@@ -76,13 +76,16 @@ class PointTimes:
         stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
         origin = "after the stamp"
         if abs(float(first) - float(stamp)) * unit_s < _NEAR_S and float(first) * unit_s > _ABSOLUTE_S:
-            raw, origin = raw - stamp, "since the epoch"
+            values -= stamp
+            origin = "since the epoch"
         elif abs(float(first)) * unit_s > _NEAR_S:
-            raw, origin = raw - first, "of another clock, counted from the first point"
+            values -= first
+            origin = "of another clock, counted from the first point"
         if self.assumed == _NONE:
-            taken = f"field {name} ({values.dtype.name}) taken as {unit} {origin}"
+            taken = f"field {name} ({kind}) taken as {unit} {origin}"
             self.assumed = f"point times: {taken} (log.point_times)"
-        return (raw * unit_s).astype(np.float32)
+        times_s = np.empty(len(values), np.float32)
+        return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
 
 
 def _likely_unit(span: float, *, is_whole: bool) -> str:
