@@ -22,6 +22,7 @@ from scanchain.graph.robust.left_out import LeftOut
 from scanchain.graph.robust.losses import rejection_limit
 from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
 
+_LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
@@ -142,25 +143,29 @@ class Explainer:
         self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
         self._measured, self._information = measured, information
         self._rejection: Graduated = rejection
+        is_large = len(is_loop) - int(is_loop.sum()) >= _LARGE
+        self._trial: Graduated = "edges" if is_large and rejection == "refined" else rejection
         self._jumps = jumps
         self._nominal = rejection_limit(config.robust_scale, measured.shape[-1] * (measured.shape[-1] - 1) // 2)
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
-        best = self._solved(explanation, poses, initialize)
+        best = first = self._solved(explanation, poses, initialize, self._rejection)
         explains = self._rejection != "gnc" and not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
             better = next(self._better(best), None) if explains and best.solved.minimum.price else None
             if better is None:
                 break
             best = better
+        if best is not first and self._trial != self._rejection:
+            best = self._solved(best.explanation, best.solved.poses, "given", self._rejection)
         return best
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
         price = best.solved.minimum.price
         for explanation, poses in self._candidates(best):
-            trial = self._solved(explanation, poses, "given")
+            trial = self._solved(explanation, poses, "given", self._trial)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
@@ -192,9 +197,11 @@ class Explainer:
         found.sort(key=lambda each: -each[0])
         return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
 
-    def _solved(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
+    def _solved(
+        self, explanation: Explanation, poses: Matrix, initialize: Initialization, rejection: Graduated
+    ) -> Explained:
         problem = self._problem_of(explanation)
-        solved = solve(problem, poses, self._is_loop, self._config, initialize, self._rejection)
+        solved = solve(problem, poses, self._is_loop, self._config, initialize, rejection)
         return Explained(problem, solved, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:
