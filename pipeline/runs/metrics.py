@@ -83,7 +83,7 @@ class Metrics(Struct, frozen=True):
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
     ``calibrated_from`` on; 0 where no error was found.
-    ``odometry_errors`` : systematic drift and slips of odometry that loop closures show, corrected in the graph
+    ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 

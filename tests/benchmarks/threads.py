@@ -38,6 +38,7 @@ from scanchain.simulation.drive import plan
 from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
 from tests.benchmarks.contest import in_fresh_process
+from tests.benchmarks.odometry3d import DATA
 
 OURS = "plicp"
 METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
@@ -122,10 +123,16 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
     figure.savefig(path, dpi=120)
 
 
+def _log(name: str) -> Path:
+    return Path(name) if Path(name).exists() else DATA / name
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs="*", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
-    parser.add_argument("--log", type=Path, nargs="*", default=[])
+    parser.add_argument(
+        "--log", type=_log, nargs="*", default=[], help="a path, or a name in the folder of real logs"
+    )
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--scans", type=int, default=40)
