@@ -1,9 +1,12 @@
-"""Time and memory of SLAM along a long log: ``python -m tests.benchmarks.long_run [--scans N] [--live N]``.
+"""Time and memory of SLAM along a long log.
+
+    python -m tests.benchmarks.long_run [--log LOG] [--scans N] [--live N] [--finish]
 
 A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
 Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
 thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
 so many scans more come in real time, forty a second: the longest that ``Slam.track`` took of one, by the clock.
+With ``--finish`` the last optimization follows, of everything.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ def main() -> None:
     parser.add_argument("--log", type=Path, help="take the scans of this log instead of simulating one")
     parser.add_argument("--pass", type=int, dest="length", help="scans of the log that are played")
     parser.add_argument("--live", type=int, default=0)
+    parser.add_argument("--finish", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = arguments.log or Path(folder) / "office.mcap"
@@ -43,6 +47,8 @@ def main() -> None:
         scans = _scans(log, arguments.scans + arguments.live, arguments.log is None, arguments.length)
         _follow(slam, islice(scans, arguments.scans), arguments.scans)
         _follow_live(slam, scans)
+        if arguments.finish:
+            _finish(slam)
 
 
 def _scans(log: Log, count: int, is_long: bool, length: int | None) -> Iterator[Scan]:
@@ -83,6 +89,12 @@ def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
             f"live: {longest_s:.3f} s at most a scan, {len(slam.keyframes) - before} keyframes, "
             f"{optimizations} optimizations taken over"
         )
+
+
+def _finish(slam: Slam) -> None:
+    started = process_time()
+    slam.finish()
+    print(f"last optimization: {process_time() - started:.1f} s, peak {peak_mib():.1f} MiB")
 
 
 if __name__ == "__main__":
