@@ -62,14 +62,14 @@ def _keys(points, scale: float, low: float, high: float, keys):
     flat = points.reshape(-1)
     if points.shape[1] == 2:
         for i in range(points.shape[0]):
-            keys[i] = _key_of(flat[2 * i], flat[2 * i + 1], 0.0, scale, low, high)
+            keys[i] = _key_in_range(flat[2 * i], flat[2 * i + 1], 0.0, scale, low, high)
     else:
         for i in range(points.shape[0]):
-            keys[i] = _key_of(flat[3 * i], flat[3 * i + 1], flat[3 * i + 2], scale, low, high)
+            keys[i] = _key_in_range(flat[3 * i], flat[3 * i + 1], flat[3 * i + 2], scale, low, high)
 
 
 @njit(inline="always")
-def _key_of(x, y, z, scale: float, low: float, high: float):
+def _key_in_range(x, y, z, scale: float, low: float, high: float):
     x, y, z = np.float64(x), np.float64(y), np.float64(z)
     square = x * x + y * y + z * z
     ix, iy, iz = np.int32(np.floor(x * scale)), np.int32(np.floor(y * scale)), np.int32(np.floor(z * scale))
