@@ -51,7 +51,7 @@ class Explanation:
     def applied(
         self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> tuple[Matrix, Matrix]:
-        """Measurements (E, d+1, d+1) and their information (E, k, k), drift and slips taken out of odometry."""
+        """Measurements (E, d+1, d+1) and their information (E, k, k), drift, slips and jumps taken out."""
         if not self.drift.any() and not self.slips and not self.jumps:
             return measured, information
         odometry = odometry_of(edges, is_loop)

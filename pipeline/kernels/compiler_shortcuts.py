@@ -1,4 +1,4 @@
-"""What Numba's compiler determines again at each call of an operator and after each pass, determined once."""
+"""Results of Numba's compiler, cached, that it computes again at each call of an operator and after each pass."""
 
 from __future__ import annotations
 

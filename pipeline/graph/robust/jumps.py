@@ -33,8 +33,8 @@ def price_of(information: Matrix, price: float, nominal: float) -> NDArray[np.fl
     price, nominal : of a loop edge left out, and what it is where the noise model is right
     """
     prior = _prior(information.shape[-1])
-    surprise = np.linalg.slogdet(np.eye(len(prior)) + np.linalg.solve(prior, information))[1]
-    return FEWEST * price + (price / nominal) * (surprise - 2.0 * np.log(_PROBABILITY))
+    log_ratio = np.linalg.slogdet(np.eye(len(prior)) + np.linalg.solve(prior, information))[1]
+    return FEWEST * price + (price / nominal) * (log_ratio - 2.0 * np.log(_PROBABILITY))
 
 
 def _prior(k: int) -> Matrix:
