@@ -70,10 +70,10 @@ def contradictions(problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool
     joint = 2.0 * (blocks[i] + blocks[j])
     joint[kept] = edge_covariances(sparse, blocks)
     result = _distances(errors, jacobians, problem.information, joint, kept)
-    for edge in np.flatnonzero(~kept & (result < price)):
-        one = np.array([edge])
-        joint = difference_covariance(sparse, *problem.edges[edge])[None]
-        result[edge] = _distances(errors[one], jacobians[one], problem.information[one], joint, kept[one])[0]
+    near = np.flatnonzero(~kept & (result < price))
+    for edge in near:
+        joint[edge] = difference_covariance(sparse, *problem.edges[edge])
+    result[near] = _distances(errors[near], jacobians[near], problem.information[near], joint[near], kept[near])
     return result
 
 

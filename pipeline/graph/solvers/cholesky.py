@@ -13,7 +13,6 @@ from scanchain.data import Matrix
 from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
 from scanchain.kernels.graph.fronts import Fronts
 
-_MOST_SOLVED = 4_000_000  # scalars of solutions, 32 MB, beyond which their zeros are left out
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
 
@@ -134,6 +133,7 @@ class SparseCholesky:
         self._factor: NDArray[np.float64] | None = None
         self._floor = np.empty(pattern.scalars)
         self._every_front = np.arange(len(self._fronts.pivots))
+        self._first_pivot = np.cumsum(self._fronts.pivots) - self._fronts.pivots
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
         first_update = self._fronts.row_start[:-1] + self._fronts.pivots
         has_parent = first_update < self._fronts.row_start[1:]
@@ -193,19 +193,15 @@ class SparseCholesky:
         With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
         the elimination tree alone.
         """
-        sizes = self.pattern.sizes[variables]
-        within = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        places = self._places[np.repeat(self.pattern.starts[variables], sizes) + within]
+        places = self._places[_ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
         path, local = self._path(places), np.empty(self._fronts.widest)
-        reached = np.arange(self.pattern.scalars)
-        if B.shape[1] * len(reached) > _MOST_SOLVED:
-            reached = reached[np.isin(self._front_of, path)]
-        C = np.empty((B.shape[1], len(reached)))
+        reached = _ranges(self._first_pivot[path], self._fronts.pivots[path])
+        x, C = np.zeros(self.pattern.scalars), np.empty((B.shape[1], len(reached)))
         for row, column in zip(C, B.T, strict=True):
-            x = np.zeros(self.pattern.scalars)
             x[places] = column
             cholesky.solve_lower(self._fronts, self.factor, path, x, local)
             row[:] = x[reached]
+            x[reached] = 0.0
         return np.asarray(np.einsum("is,js->ij", C, C))
 
     def _path(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -228,6 +224,11 @@ class SparseCholesky:
         result = np.empty(self.pattern.value_count)
         inverse.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
+
+
+def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The numbers from each start on, so many, one range after the other."""
+    return np.repeat(starts - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
