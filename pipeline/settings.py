@@ -83,7 +83,9 @@ def find_key(name: str, source: str) -> ConfigKey:
     if name in keys:
         return keys[name]
     subject = source if name in source else f"{source}: {name}"
-    raise InputError(f"{subject} is not a configuration key; {_remedy(name, tuple(keys))}")
+    raise InputError(
+        f"{subject} is not a configuration key; {_remedy(name, tuple(keys), is_keyword=source.isidentifier())}"
+    )
 
 
 def load_settings(
@@ -269,7 +271,7 @@ def _check_order(
             raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")
 
 
-def _remedy(name: str, keys: tuple[str, ...]) -> str:
+def _remedy(name: str, keys: tuple[str, ...], *, is_keyword: bool) -> str:
     section, _, leaf = name.rpartition(".")
     same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
     inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
@@ -278,4 +280,5 @@ def _remedy(name: str, keys: tuple[str, ...]) -> str:
     if not near and not inside:
         near = difflib.get_close_matches(name, keys, n=1)
     listing = "all keys: scanchain config show"
-    return f"did you mean {near[0]}? ({listing})" if near else listing
+    spelled = [key.replace(".", "__") if is_keyword else key for key in near]
+    return f"did you mean {spelled[0]}? ({listing})" if near else listing

@@ -13,8 +13,9 @@ from scanchain.commands.options import (
     OverrideCommand,
     ground_truth,
     limit_options,
-    matcher_options,
+    matcher_option,
     method_of,
+    no_loops_option,
     overrides,
     part_of,
     part_options,
@@ -36,7 +37,8 @@ _DAY_S = 86_400.0
 )
 @click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
 @part_options("each log")
-@matcher_options
+@matcher_option
+@no_loops_option
 @click.option(
     "--gt", metavar="TOPIC|none", help="Ground truth in every log; none to ignore it. [default: /ground_truth]"
 )

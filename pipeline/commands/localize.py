@@ -13,7 +13,7 @@ from scanchain.commands.options import (
     LOG,
     OverrideCommand,
     collect_garbage_seldom,
-    matcher_options,
+    matcher_option,
     method_of,
     overrides,
     part_of,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 )
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @part_options()
-@matcher_options
+@matcher_option
 @threads_option
 @click.option("--force", is_flag=True, help="Replace an existing directory once the new one is complete.")
 @click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")

@@ -30,7 +30,11 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 @click.option(
     "--out", metavar="FILE", type=_PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
-@click.option("--optimizer", metavar="NAME", help="Short for --graph.optimizer.")
+@click.option(
+    "--optimizer",
+    metavar="NAME",
+    help="levenberg-marquardt, gauss-newton, dogleg, newton or gradient-descent; short for --graph.optimizer.",
+)
 @click.option(
     "--initialize",
     type=click.Choice(_INITIALIZATIONS),

@@ -152,19 +152,17 @@ threads_option = click.option(
 )
 
 
-def matcher_options(command: Callable[..., None]) -> Callable[..., None]:
-    """``--matcher`` and ``--no-loops``; ``method_of`` reads them."""
-    command = click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")(command)
-    return click.option(
-        "--matcher",
-        metavar="plicp|svd|MODULE:CLASS",
-        help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
-    )(command)
+matcher_option = click.option(
+    "--matcher",
+    metavar="plicp|svd|MODULE:CLASS",
+    help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
+)
+no_loops_option = click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
 
 
 def method_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
-    """The keys that ``matcher_options`` set."""
-    no_loops = "false" if options["no_loops"] else None
+    """The keys that ``matcher_option`` and ``no_loops_option`` set."""
+    no_loops = "false" if options.get("no_loops") else None
     return (
         *alias("matching.matcher", options["matcher"], "--matcher"),
         *alias("loops.enabled", no_loops, "--no-loops"),

@@ -15,9 +15,10 @@ from scanchain.commands.options import (
     OverrideCommand,
     collect_garbage_seldom,
     ground_truth,
-    matcher_options,
+    matcher_option,
     max_gap_option,
     method_of,
+    no_loops_option,
     overrides,
     part_of,
     part_options,
@@ -46,7 +47,8 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@matcher_options
+@matcher_option
+@no_loops_option
 @click.option(
     "--gt",
     metavar="FILE|TOPIC|none",

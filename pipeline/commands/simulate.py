@@ -35,7 +35,7 @@ from scanchain.words import counted
     help="Drive again on another day, number N: furniture or parked cars came, went and moved.",
 )
 @click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
-@click.option("--start", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
+@click.option("--start-at", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
     world: str,
@@ -48,7 +48,7 @@ def simulate(
     dropout: float | None,
     changed: int | None,
     reverse: bool,
-    start: float,
+    start_at: float,
     force: bool,
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
@@ -77,7 +77,7 @@ def simulate(
       scanchain simulate highway fast.mcap --sensor os1-32
       scanchain simulate office later.mcap --changed 1
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
-      scanchain simulate town again.mcap --changed 1 --reverse --start 100
+      scanchain simulate town again.mcap --changed 1 --reverse --start-at 100
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
@@ -96,11 +96,12 @@ def simulate(
             dropout=dropout,
             changed=changed,
             reverse=reverse,
-            start_m=start,
+            start_m=start_at,
             force=force,
             progress=terminal.count,
         )
+    size_mb = destination.stat().st_size / 1e6
     click.echo(
-        f"{destination}: {counted(len(truth), 'scan')}; ground truth in it and in "
+        f"{destination}: {counted(len(truth), 'scan')}, {size_mb:.0f} MB; ground truth in it and in "
         f"{destination.with_suffix('.tum')}"
     )

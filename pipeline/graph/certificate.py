@@ -17,6 +17,7 @@ from scanchain.kernels.graph.dual import scatter_dual
 from scanchain.words import counted
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
+_EXACT = 1e-12  # share of χ² that rounding alone may amount to
 _GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowered, tried one after the other
 _SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
@@ -59,6 +60,8 @@ class Certificate:
         if self.certified and self.is_zero:
             return "globally optimal: χ² is zero"
         if self.certified:
+            if self.relative_gap < _EXACT:
+                return "globally optimal to rounding"
             return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
         return f"not certified: {self.reason}"
 

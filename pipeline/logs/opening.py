@@ -140,14 +140,14 @@ def _claiming(path: Path, head: bytes) -> LogFormat:
         if form.claims(path, head):
             return form
     if path.is_dir():
-        raise InputError(f"{path}: is a folder of no log that is known; give {_known()}")
+        raise InputError(f"{path}: is a folder without a recognized log; give {_known()}")
     raise _unknown(path, head, f"starts with {head[:8]!r}")
 
 
 def _unknown(path: Path, text: bytes, lack: str) -> InputError:
     if _POSE_GRAPH.search(text):
         return InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize")
-    return InputError(f"{path}: is no log that is known ({lack}); give {_known()}")
+    return InputError(f"{path}: is not a recognized log ({lack}); give {_known()}")
 
 
 def _known() -> str:

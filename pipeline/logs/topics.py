@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
-from scanchain.logs.mcap.records import Channel, FileIndex, name_of
+from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
-from scanchain.words import counted
 
 _MOST_LISTED = 8
 _IMU = ("sensor_msgs/Imu",)
@@ -39,7 +38,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
             f"{name}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
-            f"it holds: {_listed(channels.values())}{_damage(indexes)}"
+            f"it holds: {_listed(channels.values())}{damage_of(indexes)}"
         )
     if wanted:
         why = (
@@ -129,12 +128,6 @@ def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
 def is_lidar(channel: Channel) -> bool:
     """True if its messages are scans or clouds of a supported type."""
     return is_scan(channel) or is_cloud(channel)
-
-
-def _damage(indexes: Sequence[FileIndex]) -> str:
-    """Damage that may be the reason for a missing topic."""
-    damage = [line for index in indexes for line in index.damage]
-    return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
 
 
 def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:

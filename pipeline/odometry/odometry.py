@@ -294,7 +294,7 @@ def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: i
         T_base_lidar = lie.identity(3 if dimension is None else checks.dimension(dimension))
     if config is None:
         config = load_settings(len(T_base_lidar) - 1).config
-    checks.instance(config, Config, "config", "load_settings(dimension).config")
+    checks.instance(config, Config, "config", "load_settings(dimension).config, or dimension=2 or 3")
     check_order(config)
     check_dimension(config, len(T_base_lidar) - 1)
     return config, T_base_lidar

@@ -271,8 +271,8 @@ def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> t
     doubtful = [part for part in parts if part.kind != MapState.WITHOUT_MAP]
     outside = int((found.states == MapState.WITHOUT_MAP).sum())
     if not doubtful:
-        share = f", {100.0 * outside / scans:.0f} % of them outside the map" if outside else ""
-        return Reliability.TRUSTWORTHY, f"{where}, and followed over {tried}{share}"
+        share = f", {100.0 * outside / scans:.0f} % of them not matched to the map" if outside else ""
+        return Reliability.TRUSTWORTHY, f"{where}, and followed: {tried}{share}"
     largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
     more = len(doubtful) - len(largest)
     listed = "; ".join(part.text for part in largest) + (f"; and {more:,} more" if more else "")

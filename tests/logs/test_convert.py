@@ -186,7 +186,7 @@ def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capf
         (["in.mcap", "out.mcap"], "is MCAP already"),
         (["a.log", "out.bag"], "does not end in .mcap"),
         (["absent", "out.mcap"], "no such file"),
-        (["empty", "out.mcap"], "is a folder of no log"),
+        (["empty", "out.mcap"], "is a folder without a recognized log"),
         (["a.log", "taken.mcap"], "exists"),
         (["bad.log", "out.mcap"], "no message that could be read"),
     ],

@@ -45,7 +45,7 @@ def complaint(*paths, **config):
 @pytest.mark.parametrize("content", [b"x", b"\x89MCAP", b"\x89MCAP0\r", b"{}", b"\0" * 100])
 def test_a_file_that_is_no_log(tmp_path, content):
     (tmp_path / "a.mcap").write_bytes(content)
-    says(complaint(tmp_path / "a.mcap"), "is no log that is known", repr(content[:8]), "give MCAP")
+    says(complaint(tmp_path / "a.mcap"), "is not a recognized log", repr(content[:8]), "give MCAP")
 
 
 @pytest.mark.parametrize("name", ["README.md", "a.log", "a.log.gz"])
@@ -53,7 +53,7 @@ def test_a_text_that_is_no_log_is_not_called_a_carmen_log(tmp_path, name):
     text = b"# A title\n\nSome words.\n"
     (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
     says(
-        complaint(tmp_path / name), f"{name}: is no log that is known (text without a line of FLASER", "give MCAP"
+        complaint(tmp_path / name), f"{name}: is not a recognized log (text without a line of FLASER", "give MCAP"
     )
 
 

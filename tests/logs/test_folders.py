@@ -355,7 +355,7 @@ def test_raw_bytes_that_are_no_rows_of_numbers_are_refused_with_what_to_do(tmp_p
 
 def test_a_folder_of_nothing_that_is_known_says_what_is(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(InputError, match="is a folder of no log that is known; give MCAP"):
+    with pytest.raises(InputError, match="is a folder without a recognized log; give MCAP"):
         read(tmp_path)
 
 

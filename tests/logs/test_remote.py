@@ -267,7 +267,7 @@ def test_a_line_that_stays_broken_is_an_error_that_names_the_byte_and_what_there
         ("foo://bucket/log.mcap", r"log\.mcap: Protocol not known: foo; give a path, s3:// or https://"),
         ("gs://bucket/log.mcap", r"log\.mcap: .*install gcsfs"),
         ("{url}/empty.mcap", r"empty\.mcap: is empty"),
-        ("{url}/text.mcap", r"is no log that is known"),
+        ("{url}/text.mcap", r"is not a recognized log"),
     ],
 )
 def test_what_is_wrong_with_an_address_is_one_line(site, impatient, capfd, path, complaint):

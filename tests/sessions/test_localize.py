@@ -111,7 +111,15 @@ def test_a_localized_log_never_replaces_its_map(office, call):
 
 
 def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
-    words = ("localize", office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--no-loops")
+    words = (
+        "localize",
+        office / "office.mcap",
+        "--map",
+        office / "map",
+        "--out",
+        tmp_path / "loc",
+        "--loops.enabled=false",
+    )
     code, _, error = call(*words)
     assert code == 2 and "a place in a map is found by loop closures; leave it true" in error
     assert not list(tmp_path.iterdir())

@@ -16,6 +16,7 @@ from scanchain.graph.covariance import difference_covariances
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
 _REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
 _MOST = 50  # largest number of edges of a group that is looked at as one
+_AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
 _ROUNDING = 1e-9  # keeps a group without which its poses would be loose from a division by zero
 
 
@@ -30,23 +31,40 @@ def agreeing_groups(
     loops = np.flatnonzero(chosen & is_loop)
     if len(loops) < FEWEST:
         return []
-    ends = problem.edges[loops]
-    a, b = KDTree(ends).query_pairs(_REACH, p=np.inf, output_type="ndarray").T
-    steps = np.abs(ends[a] - ends[b]).sum(axis=1)
-    (i, j), (k, m) = ends[a].T, ends[b].T
-    before, after = lie.between(poses[k], poses[i]), lie.between(poses[j], poses[m])
-    predicted = before @ problem.measurements[loops[a]] @ after
-    errors = lie.log(lie.between(problem.measurements[loops[b]], predicted))
+    pairs = KDTree(problem.edges[loops]).query_pairs(_REACH, p=np.inf, output_type="ndarray")
     noise = np.linalg.pinv(problem.information[loops], hermitian=True)
     odometry = problem.information[~is_loop]
     step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
-    covariance = noise[a] + noise[b] + steps[:, None, None] * step
-    agree = np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors) < limit
-    links = coo_array((np.ones(agree.sum()), (a[agree], b[agree])), shape=(len(loops), len(loops)))
+    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
+    agree = np.concatenate([_distances(problem, poses, loops, each, noise, step) < limit for each in parts])
+    a, b = pairs[agree].T
+    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(loops), len(loops)))
     label = connected_components(links, directed=False)[1]
     order = np.argsort(label, kind="stable")
     members = np.split(loops[order], 1 + np.flatnonzero(np.diff(label[order])))
     return [each for each in members if FEWEST <= len(each) <= _MOST]
+
+
+def _distances(
+    problem: BetweenProblem,
+    poses: Matrix,
+    loops: NDArray[np.int64],
+    pairs: NDArray[np.int64],
+    noise: Matrix,
+    step: Matrix | float,
+) -> NDArray[np.float64]:
+    """Squared Mahalanobis distance (P,) of one loop edge of each pair (P, 2) from what the other predicts.
+
+    noise : (L, k, k) covariances of the loop edges (L,); step : of an edge of odometry
+    """
+    a, b = pairs.T
+    (i, j), (k, m) = problem.edges[loops[a]].T, problem.edges[loops[b]].T
+    before, after = lie.between(poses[k], poses[i]), lie.between(poses[j], poses[m])
+    predicted = before @ problem.measurements[loops[a]] @ after
+    errors = lie.log(lie.between(problem.measurements[loops[b]], predicted))
+    steps = np.abs(i - k) + np.abs(j - m)
+    covariance = noise[a] + noise[b] + steps[:, None, None] * step
+    return np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors)
 
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:

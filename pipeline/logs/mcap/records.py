@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.source import Source
+from scanchain.words import counted
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
@@ -217,3 +218,9 @@ def name_of(indexes: Sequence[FileIndex]) -> str:
     paths = [str(index.path) for index in indexes]
     shown = f"{paths[0]} and {len(paths) - 1} more files" if len(paths) > 2 else " and ".join(paths)
     return f"{shown}, read as one log" if len(paths) > 1 else shown
+
+
+def damage_of(indexes: Sequence[FileIndex]) -> str:
+    """What is damaged, for an error that it may explain; empty where nothing is."""
+    damage = [line for index in indexes for line in index.damage]
+    return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.blocks import DamagedBlockError, read_block
-from scanchain.logs.mcap.records import Block, FileIndex, Message, name_of
+from scanchain.logs.mcap.records import Block, FileIndex, Message, damage_of, name_of
 from scanchain.words import duration
 
 
@@ -148,7 +148,8 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
         if channel.topic == topic
     )
     if not total:
-        raise InputError(f"{name}: topic {topic} has no messages; scanchain info lists what there is")
+        remedy = damage_of(indexes) or "; scanchain info lists what there is"
+        raise InputError(f"{name}: topic {topic} has no messages{remedy}")
     chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
     if not chosen:
         raise nothing_in_part(f"{name}: no scan of {topic}", whole, config)
