@@ -132,6 +132,27 @@ def test_without_a_loop_closure_the_report_says_why_none_was_tried(tmp_path):
         assert section.text == f"None was tried: {reason} (loops.min_travel_m)."
 
 
+def test_closures_are_counted_by_cause_and_an_older_table_has_a_row_a_verdict_and_says_so(tmp_path):
+    closures = pa.table({
+        "target_scan": [0, 1, 2, 3], "source_scan": [5, 6, 7, 8],
+        "rejected_by": ["", "verification", "verification", "verification"],
+        "cause": ["verified", "small overlap", "few points", "small overlap"],
+        "overlap": [0.9, 0.2, 0.8, 0.4], "residual_m": [0.01, 0.02, 0.03, 0.04],
+    })  # fmt: skip
+    trajectory, file = course(np.random.default_rng(0).normal(size=(9, 3))), tmp_path / "loops.parquet"
+    pq.write_table(closures, file)
+    (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
+    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+        ("2", "30", "30", "small overlap"), ("1", "90", "10", "verified"), ("1", "80", "30", "few points"),
+    ]  # fmt: skip
+    pq.write_table(closures.drop_columns(["cause"]), file)
+    (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
+    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+        ("3", "40", "30"), ("1", "90", "10"),
+    ]  # fmt: skip
+    assert "older than the column cause" in section.grid.notes[0]
+
+
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
     seen = look(one_run / "report.html", tmp_path, width=1200)
     for title in (

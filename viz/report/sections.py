@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -20,9 +19,7 @@ from scanchain.viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, He
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _MEDIANS = "Of long logs, medians of neighboring scans."
-_FIGURES = re.compile(
-    r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
-)  # of one closure; limits stand behind them
+_WITHOUT_CAUSES = "This run is older than the column cause; reasons are in loops.parquet, a sentence a closure."
 
 
 def chip(trajectory: DrawnTrajectory) -> Chip:
@@ -164,16 +161,16 @@ def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
-    """Closures by verdict and reason, the figures of each left out of it, most frequent first."""
+    """Closures by verdict and cause, most frequent first; by verdict alone where a run has no causes."""
+    has_causes = "cause" in closures.column_names
+    causes = closures["cause"].to_pylist() if has_causes else [""] * closures.num_rows
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (by, reason) in enumerate(
-        zip(*(closures[key].to_pylist() for key in ("rejected_by", "reason")), strict=True)
-    ):
-        groups[CLOSURES[by][0], _FIGURES.sub("", reason, count=1)].append(place)
+    for place, (by, cause) in enumerate(zip(closures["rejected_by"].to_pylist(), causes, strict=True)):
+        groups[CLOSURES[by][0], cause].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
-        Head("reason", is_text=True),
+        *((Head("cause", is_text=True),) if has_causes else ()),
     )  # fmt: skip
     rows = tuple(
         Row(
@@ -182,12 +179,12 @@ def _verdict_grid(closures: pa.Table) -> Grid:
                 Cell(f"{len(places):,}"),
                 Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
                 Cell(_millimeters(float(np.median(residual_m[places])))),
-                Cell(reason, is_wide=True),
+                *((Cell(cause, is_wide=True),) if has_causes else ()),
             ),
         )
-        for (verdict, reason), places in sorted(groups.items(), key=lambda group: -len(group[1]))
+        for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
-    return Grid(heads, rows)
+    return Grid(heads, rows, () if has_causes else (_WITHOUT_CAUSES,))
 
 
 def _millimeters(value_m: float) -> str:
