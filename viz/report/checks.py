@@ -11,7 +11,7 @@ from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import read_overlay
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain.viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
-from scanchain.viz.pictures.trajectory_figures import color_of, innovations
+from scanchain.viz.pictures.trajectory_figures import color_of, innovations, window
 from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _CURVES = {
@@ -34,13 +34,16 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
         *(Chip(name, color) for name, (_, color) in curves.items()),
         *((Chip("stretches to check", _SHADE),) if shaded else ()),
     )
+    is_alone, size = not overlay_file.exists(), window(len(steps))
+    largest = f", largest of {size} neighboring scans" if size > 1 else ""
     drawing = Drawing(
         "Innovations",
-        "Normalized innovations over their limits, largest of neighboring scans; above 1 (dotted) is a finding.",
-        innovations(curves, shaded),
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding.",
+        innovations(curves, shaded, is_wide=is_alone),
+        is_wide=is_alone,
     )
     drawings = [drawing]
-    if overlay_file.exists():
+    if not is_alone:
         overlay = read_overlay(overlay_file)
         chips += (Chip("scans before", BEFORE), Chip("scans after", AFTER))
         caption = (
