@@ -213,7 +213,7 @@ def observability_plan(trajectory: DrawnTrajectory) -> Markup:
     worst = np.array([group[np.argmin(values[group])] for group in groups])
     order = worst[np.argsort(-values[worst])]
     axis = Axis(is_logarithmic=True)
-    axis.limit(_LOWEST, _HIGHEST)
+    axis.limit(_LOWEST, _HIGHEST, (_LOWEST, 1.0, _HIGHEST))
     palette = palette_of(_WORST_TO_BEST)
     shown = np.clip(values[order], _LOWEST, _HIGHEST)
     colors = palette[np.rint(255.0 * axis.fractions(shown)).astype(int), :3]

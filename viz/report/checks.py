@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import read_overlay
-from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch, Verdict
 from scanchain.viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
 from scanchain.viz.pictures.trajectory_figures import color_of, innovations, window
 from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
@@ -58,6 +58,11 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
     rows = tuple(_row(each) for each in sorted(longest, key=lambda each: each.first))
     return Section("Checks", "", chips, tuple(drawings), Grid(heads, rows) if rows else None)
+
+
+def verdict_cell(verdict: str) -> Cell:
+    """A verdict in a table, in the color of its severity; empty for none."""
+    return Cell(verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
 
 
 def _row(stretch: Stretch) -> Row:
