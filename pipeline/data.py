@@ -159,6 +159,7 @@ class Match:
     observability : of the worst direction, how many times as much is known of it as it takes to be determined, by
         ``matching.min_information`` and ``matching.min_signal``; below 1 the scan is degenerate
     degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame
+    cause : the reason without its figures, the same for all of its kind
     """
 
     T_target_source: Pose
@@ -175,6 +176,7 @@ class Match:
     degeneracy_eigenvalue: float
     observability: float
     degeneracy_direction: NDArray[np.float64]
+    cause: str = ""
 
     @property
     def inlier_share(self) -> float:
@@ -223,6 +225,21 @@ class Keyframe:
         return self.stored.read()
 
 
+class Problem(NamedTuple):
+    """Why a match did not converge, or why a loop closure is rejected.
+
+    ``cause`` is the same for all of its kind, ``text`` the whole reason with its figures.
+    """
+
+    cause: str
+    text: str
+
+    @classmethod
+    def plain(cls, text: str) -> Problem:
+        """One without figures."""
+        return cls(text, text)
+
+
 class Verdict(StrEnum):
     """Verdict on a proposed loop closure."""
 
@@ -243,7 +260,8 @@ class Closure:
 
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
     ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``chi2_before`` is
-    its χ² in the graph as it was before it became an edge, NaN if it never did.
+    its χ² in the graph as it was before it became an edge, NaN if it never did. ``cause`` is the reason without
+    its figures, the same for all closures of its kind.
     """
 
     target: int
@@ -254,6 +272,7 @@ class Closure:
     reason: str
     proposed_by: Proposal = Proposal.POSITION
     chi2_before: float = float("nan")
+    cause: str = ""
 
 
 REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force

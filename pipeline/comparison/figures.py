@@ -58,7 +58,8 @@ class Column(Struct, frozen=True):
     head, unit : what stands above it
     scale : from the field's unit to the shown one
     digits : after the point, at most
-    better : which values are marked as the best; "one" is whatever is nearest to 1
+    better : which values are marked as the best; none of a figure that is not about accuracy or cost, as the NEES
+        of a bad method may be near 1
     table : the summary, which the short tables are, or one of the two that hold the rest
     definition : its meaning, in a sentence
     """
@@ -68,7 +69,7 @@ class Column(Struct, frozen=True):
     unit: str
     scale: float
     digits: int
-    better: Literal["low", "high", "one", ""]
+    better: Literal["low", "high", ""]
     table: Literal["summary", "accuracy", "time"]
     definition: str
 
@@ -99,7 +100,7 @@ class Column(Struct, frozen=True):
         return min(self.digits, max(0, 2 - math.floor(math.log10(min(sizes))))) if sizes else self.digits
 
     def _badness(self, shown: float) -> float:
-        return {"low": shown, "high": -shown, "one": abs(shown - 1.0), "": 0.0}[self.better]
+        return {"low": shown, "high": -shown, "": 0.0}[self.better]
 
 
 _DEGREES = 57.29577951308232
@@ -159,7 +160,7 @@ COLUMNS = (
     ),
     Column("relations_rad", "relations", "deg", _DEGREES, 3, "low", "summary", "the same, of the angle"),
     Column(
-        "nees", "NEES", "", 1.0, 2, "one", "accuracy", "squared error of a motion over its covariance; 1 is exact"
+        "nees", "NEES", "", 1.0, 2, "", "accuracy", "squared error of a motion over its covariance; 1 is exact"
     ),
     Column(
         "thickness_m",

@@ -11,7 +11,7 @@ import numpy as np
 from scanchain.data import Closure, Match, Proposal, Verdict
 from scanchain.graph.growing_array import GrowingArray
 
-_TEXTS = {"reason": str, "verdict": Verdict, "proposed_by": Proposal}  # kept as numbers
+_TEXTS = {"reason": str, "cause": str, "verdict": Verdict, "proposed_by": Proposal}  # kept as numbers
 
 
 class ClosureTable(Sequence[Closure]):

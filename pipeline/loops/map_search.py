@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import level_frame, upright_frame
@@ -153,7 +153,7 @@ class MapSearch:
             gone_m = keyframes[closure.source].traveled_m - self.matched_m
             problem = self._contradiction(closure, keyframes, graph.poses, gone_m)
             if problem:
-                return (replace(closure, verdict=Verdict.REJECTED, reason=problem),)
+                return (_rejected(closure, problem),)
         return self._confirmed(closure, keyframes)
 
     def _found(
@@ -186,7 +186,7 @@ class MapSearch:
         best = max(accepted, key=lambda each: each.overlap)
         if all(_agree(best, each, keyframes) for each in accepted):
             return best
-        return replace(best, verdict=Verdict.REJECTED, reason="another place of the map is as similar")
+        return _rejected(best, Problem.plain("another place of the map is as similar"))
 
     def _seeds(self, points: Points) -> Generator[None, None, tuple[Matrix, int]]:
         """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined.
@@ -254,13 +254,14 @@ class MapSearch:
 
     def _contradiction(
         self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix, traveled_m: float
-    ) -> str:
-        """Reason why a find contradicts the prediction since the last match, empty if it does not."""
+    ) -> Problem | None:
+        """Why a find contradicts the prediction since the last match, None if it does not."""
         T_found = _implied_pose(closure, closure.source, keyframes)
         moved_m = lie.apart(T_world[closure.source], T_found)[0]
         if moved_m <= max(_DRIFT * traveled_m, self.config.loops.min_radius_m):
-            return ""
-        return f"{moved_m:.1f} m from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
+            return None
+        limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
+        return Problem(f"far {limit}", f"{moved_m:.1f} m {limit}")
 
     def _confirmed(self, closure: Closure, keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
         """The closure and the older ones that agree with it; rejected while there are none."""
@@ -270,7 +271,11 @@ class MapSearch:
             self.finds = []
             return (*agreeing, closure)
         self.finds = [*old, closure]
-        return (replace(closure, verdict=Verdict.REJECTED, reason="found anywhere, and no other find agrees yet"),)
+        return (_rejected(closure, Problem.plain("found anywhere, and no other find agrees yet")),)
+
+
+def _rejected(closure: Closure, problem: Problem) -> Closure:
+    return replace(closure, verdict=Verdict.REJECTED, cause=problem.cause, reason=problem.text)
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose, Proposal, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Pose, Problem, Proposal, Verdict
 from scanchain.errors import InputError, shown
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
@@ -181,28 +181,31 @@ class PlaceCloser:
         target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
         return self.submap_verifier.verify(source, target, T_first)
 
-    def _problem(self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None) -> str:
-        """Reason why an aligned candidate is no closure, empty if it is one.
+    def _problem(
+        self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None
+    ) -> Problem | None:
+        """Why an aligned candidate is no closure, None if it is one.
 
         graph : None between unconnected keyframes, where the distance that odometry has them apart means nothing
         """
         limits, anchor = self.config.loops, query.submap.anchor
         if candidate.rival >= 0:
-            return f"keyframe {candidate.rival} is as similar"
+            return Problem("another keyframe is as similar", f"keyframe {candidate.rival} is as similar")
         if graph is None or verified.problem:
-            return ""
+            return None
         T_world_i, T_world_j = query.T_world[candidate.target], query.T_world[anchor.index]
         moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
         moved_m = float(np.linalg.norm(moved[:-1, -1]))
         traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
         if moved_m <= max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
-            return ""
+            return None
         d = self.dimension
         covariance = graph.relative_covariance(candidate.target, anchor.index)[:d, :d]
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
         if moved_m <= _PLACE_SIGMAS * sigma_m:
-            return ""
-        return (
+            return None
+        return Problem(
+            "far from the prediction",
             f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between and "
-            f"than {_PLACE_SIGMAS:g} of its standard deviations ({sigma_m:.1f} m)"
+            f"than {_PLACE_SIGMAS:g} of its standard deviations ({sigma_m:.1f} m)",
         )

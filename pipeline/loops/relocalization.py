@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Proposal, Verdict
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal, Verdict
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.planar_map_search import LEAST_SHARE, PlanarMapSearch, WholeSearch
@@ -243,8 +243,8 @@ class Relocalizer:
             verified = self.verifier.verify(keyframes, source, anchor, T_first, newest=len(keyframes) - 1)
             off_m, off_rad = lie.apart(T_first, verified.match.T_target_source)
             is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
-            problem = f"{off_m:.1f} m from where the path was found" if is_off else ""
-            closure = verified.closure(anchor, source, Proposal.PLACE, problem=problem)
+            far = Problem("far from where the path was found", f"{off_m:.1f} m from where the path was found")
+            closure = verified.closure(anchor, source, Proposal.PLACE, problem=far if is_off else None)
             if best is None or (_rank(closure) > _rank(best)):
                 best = closure
         return best

@@ -12,7 +12,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Match, Points, Pose, Proposal, Verdict
+from scanchain.data import Closure, Keyframe, Match, Points, Pose, Problem, Proposal, Verdict
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
 from scanchain.loops.submaps import Submap, VoxelSubmaps
@@ -25,6 +25,7 @@ _MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized
 _MIN_AGREEMENT = 0.87  # least agreement about free space, relative to that of each submap with itself
 _COARSE = 2.0  # voxel size, in usual ones, of the first alignment of two submaps
 _VIEWS = 8  # number of views of each submap that are compared with the other
+_VERIFIED = "verified by matching"
 _BINS = (90, 180)  # bins of elevation and azimuth: 2° each
 _MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each other, as a share of the range
 
@@ -37,24 +38,29 @@ class Verification:
     ----------
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
-    problem : why it is no loop closure, empty if it is one
+    problem : why it is no loop closure, None if it is one
     agreement : share of the points in sight of the other's lidar that lie on what it saw, the worse of both
         directions, divided by the share that either submap has with itself; 1 where not compared
     """
 
     match: Match
     overlap: float
-    problem: str
+    problem: Problem | None
     agreement: float = 1.0
 
     def closure(
-        self, target: int, source: int, proposed_by: Proposal = Proposal.POSITION, *, problem: str = ""
+        self,
+        target: int,
+        source: int,
+        proposed_by: Proposal = Proposal.POSITION,
+        *,
+        problem: Problem | None = None,
     ) -> Closure:
         """The closure of two keyframes; a ``problem`` besides those of the alignment rejects it, too."""
         problem = self.problem or problem
         verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
-        reason = problem or "verified by matching"
-        return Closure(target, source, self.match, self.overlap, verdict, reason, proposed_by)
+        cause, reason = problem or (_VERIFIED, _VERIFIED)
+        return Closure(target, source, self.match, self.overlap, verdict, reason, proposed_by, cause=cause)
 
 
 class ScanVerifier:
@@ -94,17 +100,20 @@ class ScanVerifier:
 
     def _problem(
         self, match: Match, overlap: float, moved_m: float, min_overlap: float, min_information: float
-    ) -> str:
+    ) -> Problem | None:
         limits, information = self.config, match.degeneracy_eigenvalue
         if not match.is_fit:
-            return match.reason
+            return Problem(match.cause, match.reason)
         if overlap < min_overlap:
-            return f"overlap {below(overlap)} < loops.min_overlap ({min_overlap:g})"
+            text = f"overlap {below(overlap)} < loops.min_overlap ({min_overlap:g})"
+            return Problem("overlap < loops.min_overlap", text)
         if information < min_information:
-            return f"information {information:.1e} < loops.min_information ({min_information:g})"
+            text = f"information {information:.1e} < loops.min_information ({min_information:g})"
+            return Problem("information < loops.min_information", text)
         if moved_m > limits.max_radius_m:
-            return f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
-        return ""
+            text = f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
+            return Problem("distance from the prediction > loops.max_radius_m", text)
+        return None
 
 
 class SubmapVerifier:
@@ -143,20 +152,23 @@ class SubmapVerifier:
         result.insert(points, lie.identity(3))
         return result
 
-    def _problem(self, match: Match, overlap: float, agreement: float) -> str:
+    def _problem(self, match: Match, overlap: float, agreement: float) -> Problem | None:
         information = match.degeneracy_eigenvalue
         if not match.is_fit:
-            return match.reason
+            return Problem(match.cause, match.reason)
         if overlap < _MIN_PLACE_OVERLAP:
-            return f"overlap {below(overlap)} < the least of a recognized place ({_MIN_PLACE_OVERLAP:g})"
+            return _less("overlap", below(overlap), _MIN_PLACE_OVERLAP)
         if information < _MIN_PLACE_INFORMATION:
-            return f"information {information:.1e} < the least of a recognized place ({_MIN_PLACE_INFORMATION:g})"
+            return _less("information", f"{information:.1e}", _MIN_PLACE_INFORMATION)
         if agreement < self.min_agreement:
-            return (
-                f"free-space agreement {below(agreement)} < the least of a recognized place "
-                f"({self.min_agreement:g})"
-            )
-        return ""
+            return _less("free-space agreement", below(agreement), self.min_agreement)
+        return None
+
+
+def _less(name: str, figure: str, least: float) -> Problem:
+    """A figure below the least of a recognized place."""
+    limit = f"< the least of a recognized place ({least:g})"
+    return Problem(f"{name} {limit}", f"{name} {figure} {limit}")
 
 
 def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, margin_m: float) -> float:

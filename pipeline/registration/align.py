@@ -107,7 +107,7 @@ def _unambiguous(matches: Sequence[Match]) -> Match:
 def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
     """The same match, not converged because a pose so far away fits nearly as well."""
     reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
-    return replace(match, converged=False, reason=reason)
+    return replace(match, converged=False, reason=reason, cause="ambiguous: another pose fits nearly as well")
 
 
 def _range_voxels(points: int, d: int) -> float:

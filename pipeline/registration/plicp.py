@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
-from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior
+from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, Problem
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.icp import Settings
@@ -102,7 +102,7 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
     observability = min(
         _ratio(result.eigenvalue, config.min_information), _ratio(result.signal, config.min_signal)
     )
-    problem = _problem(result, points, target, observability, config)
+    problem = _problem(result, points, target, observability, config) or Problem("", "")
     return Match(
         T_target_source=result.T,
         information=result.information,
@@ -113,69 +113,85 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
         residual_m=result.residual_m,
         fit=result.fit,
         at_minimum=result.ending == icp.CONVERGED,
-        converged=not problem,
-        reason=problem or "converged",
+        converged=not problem.text,
+        reason=problem.text or "converged",
+        cause=problem.cause,
         degeneracy_eigenvalue=result.eigenvalue,
         observability=observability,
         degeneracy_direction=result.direction,
     )
 
 
-def _problem(result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig) -> str:
-    """Reason why a result did not converge, empty if it did."""
+def _problem(
+    result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
+) -> Problem | None:
+    """Why a result did not converge, None if it did."""
     if not math.isfinite(largest_magnitude(result.T)):
-        return "the pose is not finite"
+        return Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
-        return _ENDINGS[result.ending]
+        return Problem.plain(_ENDINGS[result.ending])
     if result.pairs < config.min_inlier_share * points:
-        return (
+        return Problem(
+            "few points have a correspondence (matching.min_inlier_share)",
             f"{result.pairs} of {points} points have a correspondence, below the share "
-            f"matching.min_inlier_share ({config.min_inlier_share:g})"
+            f"matching.min_inlier_share ({config.min_inlier_share:g})",
         )
     if observability < 1.0:
         direction = " ".join(f"{value:.2f}" for value in result.direction)
-        return (
+        return Problem(
+            "motion is undetermined (matching.min_signal or matching.min_information)",
             f"motion along [{direction}] is undetermined: observability {observability:.1e} < 1, by "
-            f"matching.min_signal ({config.min_signal:g}) or matching.min_information ({config.min_information:g})"
+            f"matching.min_signal ({config.min_signal:g}) or matching.min_information "
+            f"({config.min_information:g})",
         )
     if result.ending != icp.CONVERGED:
-        return _ENDINGS[result.ending]
+        return Problem.plain(_ENDINGS[result.ending])
     return _contradiction(result, config) or _chance(result, points, target)
 
 
-def _contradiction(result: Result, config: MatchingConfig) -> str:
-    """Reason why the correspondences contradict the pose, empty if they agree with it."""
+def _contradiction(result: Result, config: MatchingConfig) -> Problem | None:
+    """Why the correspondences contradict the pose, None if they agree with it."""
     if result.fit < LEAST_FIT:
-        return (
+        return Problem(
+            f"the correspondences contradict the pose (fit < {LEAST_FIT:g})",
             f"the correspondences contradict the pose: fit {below(result.fit)} < {LEAST_FIT:g}, residuals along "
-            f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})"
+            f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})",
         )
     if result.residual_m > config.kernel_scale_m:
-        return f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})"
-    return ""
+        return Problem(
+            "residual > matching.kernel_scale_m",
+            f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})",
+        )
+    return None
 
 
-def _chance(result: Result, points: int, target: VoxelMap) -> str:
-    """Reason why the fit may be due to chance, empty if it is redundant enough."""
+def _chance(result: Result, points: int, target: VoxelMap) -> Problem | None:
+    """Why the fit may be due to chance, None if it is redundant enough."""
     freedom, voxel_m = len(result.information), target.voxels.size_m
     if result.pairs < _LEAST_OVERLAP * points:
-        return f"{result.pairs} of {points} points have a correspondence, fewer than {100 * _LEAST_OVERLAP:.0f} %"
+        return Problem(
+            f"fewer than {100 * _LEAST_OVERLAP:.0f} % of the points have a correspondence",
+            f"{result.pairs} of {points} points have a correspondence, fewer than {100 * _LEAST_OVERLAP:.0f} %",
+        )
     if result.on_surfaces < _REDUNDANCY * freedom:
-        return (
+        return Problem(
+            "few correspondences with a surface",
             f"{result.on_surfaces} correspondences with a surface, fewer than {_REDUNDANCY} for each of {freedom} "
-            "degrees of freedom"
+            "degrees of freedom",
         )
     if len(target) < 2 * _REDUNDANCY * freedom:
-        return (
+        return Problem(
+            "the map has few voxels (local_map.voxel_size_m)",
             f"the map has {counted(len(target), 'voxel')}, fewer than {2 * _REDUNDANCY} for each degree of "
-            f"freedom: lower local_map.voxel_size_m ({voxel_m:g})"
+            f"freedom: lower local_map.voxel_size_m ({voxel_m:g})",
         )
     if result.range_m < _SPAN_VOXELS * voxel_m:
-        return (
+        return Problem(
+            "the points spread over few voxels (local_map.voxel_size_m)",
             f"the points spread over {result.range_m:.2g} m, less than {_SPAN_VOXELS:g} voxels: lower "
-            f"local_map.voxel_size_m ({voxel_m:g})"
+            f"local_map.voxel_size_m ({voxel_m:g})",
         )
-    return ""
+    return None
 
 
 def _ratio(known: float, least: float) -> float:

@@ -25,6 +25,7 @@ class FinalClosure:
 
     closure: Closure
     verdict: Verdict
+    cause: str
     reason: str
     weight: float
     chi2_after: float
@@ -45,14 +46,15 @@ def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Fina
     edges = _loop_edges(state)
     final = []
     for closure in closures:
-        verdict, reason, weight, chi2 = closure.verdict, closure.reason, 0.0, float("nan")
+        verdict, cause, reason, weight, chi2 = closure.verdict, closure.cause, closure.reason, 0.0, float("nan")
         if verdict is Verdict.ACCEPTED:
             between = edges[closure.target, closure.source]
             weight, chi2 = between.popleft() if between else (1.0, float("nan"))
             if weight < REJECTED_WEIGHT:
                 verdict = Verdict.REJECTED
-                reason = f"contradicts the rest of the graph, χ² {chi2:.4g}"
-        final.append(FinalClosure(closure, verdict, reason, weight, chi2))
+                cause = "contradicts the rest of the graph"
+                reason = f"{cause}, χ² {chi2:.4g}"
+        final.append(FinalClosure(closure, verdict, cause, reason, weight, chi2))
     return tuple(final)
 
 
@@ -86,6 +88,7 @@ def write_closures(
         "proposed_by": pa.array([str(closure.proposed_by) for closure in closures], pa.string()),
         "verdict": pa.array([str(item.verdict) for item in final], pa.string()),
         "rejected_by": pa.array([item.rejected_by for item in final], pa.string()),
+        "cause": pa.array([item.cause for item in final], pa.string()),
         "reason": pa.array([item.reason for item in final], pa.string()),
         "weight": pa.array([item.weight for item in final], pa.float64()),
         "chi2_before": pa.array([closure.chi2_before for closure in closures], pa.float64(), from_pandas=True),
@@ -111,6 +114,7 @@ def write_closures(
         "proposed_by": "position: close by odometry; place: by place recognition, independent of odometry",
         "rejected_by": "verification: by matching; back end: verified, but it contradicts the rest of the graph; "
         "empty where it is accepted",
+        "cause": "the reason without its figures, the same for all closures of its kind",
         "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
         "weight": "robust weight after the last optimization, 0 for closures that never entered the graph",
     }

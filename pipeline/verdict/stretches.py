@@ -68,7 +68,8 @@ class Stretch(Struct, frozen=True):
         if turn_rad > _SMALL_RAD:
             size += f" and {np.degrees(turn_rad):.0f} deg"
         place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
-        return f"{place} ({self.start_s:.1f} to {self.end_s:.1f} s): {self.kind}{size}"
+        start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
+        return f"{place} ({start if start == end else f'{start} to {end}'} s): {self.kind}{size}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,6 +47,11 @@ class Judged:
         """Verdict and reasons."""
         return f"{self.verdict}: {self.reason}"
 
+    @property
+    def unnamed(self) -> tuple[Stretch, ...]:
+        """Stretches that the reason does not name."""
+        return tuple(each for each in self.stretches if each.text not in self.reason)
+
 
 def judge(evidence: Evidence) -> Judged:
     """The verdict on a trajectory.
@@ -77,7 +82,7 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
     for slip in slips:
         cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
         if cause is not None:
-            yield f"{slip.text}, where scans are {cause.kind}"
+            yield f"{slip.text}, at scans that are not well measured: {cause.kind}"
     for loop in (each for each in stretches if each.kind is Kind.LOOPS):
         slip = next((each for each in slips if _confirms(each, loop)), None)
         if slip is not None:

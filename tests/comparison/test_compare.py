@@ -431,7 +431,7 @@ def test_the_best_of_a_column_is_marked_as_it_is_shown():
         return [cell.is_best for cell in column.cells(rows)]
 
     assert best(ate, rows) == [True, True, False, False]
-    assert best(nees, rows) == [False, True, False, False]
+    assert best(nees, rows) == [False] * 4  # a bad method may have exact covariances
     assert best(ate, rows[2:]) == [False, False]
     assert best(ate, rows[:2]) == [False, False]
 

@@ -28,9 +28,11 @@ def closures(k):
             degeneracy_eigenvalue=rng.normal(),
             observability=np.inf,
             degeneracy_direction=rng.normal(size=k),
+            cause=f"cause {source % 3}",
         )
         verdict = Verdict.REJECTED if source % 4 else Verdict.ACCEPTED
-        yield Closure(source // 2, source, match, rng.random(), verdict, f"overlap {source % 6}", Proposal.PLACE)
+        cause, reason = f"overlap {source % 2}", f"overlap {source % 6}"
+        yield Closure(source // 2, source, match, rng.random(), verdict, reason, Proposal.PLACE, cause=cause)
 
 
 def same(a, b):

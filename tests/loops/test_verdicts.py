@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 
 import msgspec
 import numpy as np
@@ -89,6 +89,17 @@ def test_the_table_says_who_proposed_and_what_the_graph_said(tmp_path, disturbed
         entered = closure.verdict is Verdict.ACCEPTED
         assert (before is not None and before >= 0.0) == entered
         assert (after is not None and after >= 0.0) == entered
+
+
+def test_the_table_groups_closures_by_a_cause_without_figures(forced):
+    table = pq.read_table(forced / "loops.parquet").to_pydict()
+    causes = defaultdict(set)
+    for cause, reason in zip(table["cause"], table["reason"], strict=True):
+        causes[cause].add(reason)
+    assert len(causes["contradicts the rest of the graph"]) >= 5
+    assert causes["verified by matching"] == {"verified by matching"}
+    assert len(causes["overlap < loops.min_overlap"]) > 1
+    assert len(causes) <= 8 < len(set(table["reason"]))
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from scanchain.runs.vouching import evidence_of
 from scanchain.verdict import (
     Closures,
     Evidence,
+    Judged,
     Kind,
     Stretch,
     Verdict,
@@ -129,7 +130,7 @@ def test_wheels_that_stall_and_catch_up_doubt_nothing():
 def test_a_slip_where_scans_are_degenerate_is_not_trustworthy():
     truth, slipped = course(slip=(500, 530))
     judged = judge(evidence(slipped, wheels=wheels_of(truth), is_degenerate=marked(480, 550)))
-    assert judged.verdict is Verdict.NOT_TRUSTWORTHY and "where scans are degenerate" in judged.reason
+    assert judged.verdict is Verdict.NOT_TRUSTWORTHY and "not well measured: degenerate" in judged.reason
 
 
 def test_a_turn_that_the_matching_did_not_see_is_named():
@@ -408,6 +409,17 @@ def test_a_lidar_that_seems_to_stand_after_a_gap_at_speed_is_to_be_checked():
     changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
     (stretch,) = judge(evidence(poses[kept], **changes)).stretches
     assert (stretch.kind, stretch.first) == (Kind.CONTRADICTED, 300)
+
+
+def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
+    assert Stretch(Kind.LOST, 7, 8, 2, 2262.91, 2262.94).text == "scans 7 to 8 (2262.9 s): lost"
+    assert Stretch(Kind.LOST, 7, 9, 3, 2262.9, 2263.1).text == "scans 7 to 9 (2262.9 to 2263.1 s): lost"
+
+
+def test_stretches_that_the_reason_names_are_not_listed_again():
+    stretches = tuple(Stretch(Kind.LOST, 10 * k, 10 * k + 4 + k, 5 + k, float(k), k + 0.5) for k in range(5))
+    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches[2:]) + "; and 2 more", stretches)
+    assert judged.unnamed == stretches[:2]
 
 
 def test_every_kind_of_stretch_has_a_color():

@@ -25,6 +25,7 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.simulation import simulate
+from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures.map_figures import AFTER, BEFORE, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
 from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
@@ -132,6 +133,27 @@ def test_without_a_loop_closure_the_report_says_why_none_was_tried(tmp_path):
         assert section.text == f"None was tried: {reason} (loops.min_travel_m)."
 
 
+def test_closures_are_counted_by_cause_and_an_older_table_has_a_row_a_verdict_and_says_so(tmp_path):
+    closures = pa.table({
+        "target_scan": [0, 1, 2, 3], "source_scan": [5, 6, 7, 8],
+        "rejected_by": ["", "verification", "verification", "verification"],
+        "cause": ["verified", "small overlap", "few points", "small overlap"],
+        "overlap": [0.9, 0.2, 0.8, 0.4], "residual_m": [0.01, 0.02, 0.03, 0.04],
+    })  # fmt: skip
+    trajectory, file = course(np.random.default_rng(0).normal(size=(9, 3))), tmp_path / "loops.parquet"
+    pq.write_table(closures, file)
+    (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
+    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+        ("2", "30", "30", "small overlap"), ("1", "90", "10", "verified"), ("1", "80", "30", "few points"),
+    ]  # fmt: skip
+    pq.write_table(closures.drop_columns(["cause"]), file)
+    (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
+    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+        ("3", "40", "30"), ("1", "90", "10"),
+    ]  # fmt: skip
+    assert "older than the column cause" in section.grid.notes[0]
+
+
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
     seen = look(one_run / "report.html", tmp_path, width=1200)
     for title in (
@@ -152,7 +174,7 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
         "Accuracy", "Trajectory and map", "Checks", "Loop closures", "Trajectories", "Error", "Uncertainty",
-        "Time of a scan", "Time per scan", "How it was made",
+        "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
     assert facts[:3] == ["verdict", "trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
@@ -226,7 +248,7 @@ def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one
     answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     drawn = re.search(r'data-drawn="(\d+)"', answer.stdout)
     assert drawn and int(drawn[1]) == len(read_ply(one_run / "map.ply"))
-    assert answer.stdout.count("<button") == 4
+    assert answer.stdout.count("<button") == 3  # "from above" is left out of a flat map
 
 
 _HANDLED = """
@@ -332,13 +354,25 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
-        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans",
-        "at closures rejected by the back end: 10 scans", "ground truth",
+        "at closures rejected by the back end: 10 scans",
+        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans", "ground truth",
     ]  # fmt: skip
     told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
     assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})
     assert [line["color"] for line in told["lines"]] == [chip.color for chip in section.chips]
     assert all(chip.color in section.drawings[0].svg for chip in section.chips)
+
+
+def test_a_scan_of_several_findings_counts_in_each():
+    states = ["degenerate"] * 4 + ["contradicted"] * 3 + ["ok"] * 3
+    steps = pa.table({"state": states, "keyframe": [0] + [-1] * 9})
+    stretch = Stretch(Kind.ACCELERATION, 3, 4, 2, 0.3, 0.4, 0.5)
+    positions = np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1)
+    points = np.random.default_rng(1).uniform(-5.0, 15.0, (300, 3))
+    section = trajectory_section(course(positions), Tables(steps, None, [stretch]), None, points, 0.2)
+    assert [chip.name for chip in section.chips[1:]] == [
+        "degenerate: 4 scans", "contradicted: 3 scans", "impossible acceleration: 2 scans",
+    ]  # fmt: skip
 
 
 def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):

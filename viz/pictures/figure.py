@@ -27,9 +27,9 @@ Floats = NDArray[np.float64]
 
 INK, LINE = "var(--ink)", "var(--line)"  # the page's own colors
 _INCH = 72.0  # points, the unit of the drawing
-_WIDTH = 4.6  # inches
+_WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure beside another, and of one over the whole page, of equal text
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
-_LOWEST, _HIGHEST = 1.5, 5.2  # least and greatest height of a plan in inches
+_LOWEST, _HIGHEST, _HIGHEST_WHOLE = 1.5, 5.2, 6.5  # least and greatest heights of a plan in inches
 _TICK = 3.5  # length of a tick, and its distance to the number
 _ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # of text, over and under its baseline
 _LABEL = 4.0  # distance of a label to the numbers
@@ -49,12 +49,20 @@ class SvgFigure:
     height_inches : of the whole figure
     logarithmic : the axis whose decades are equally long, "x" or "y"
     spare_inches : left free beside the axes
+    is_wide : over the whole width of the page
     """
 
-    def __init__(self, height_inches: float = 2.7, *, logarithmic: str = "", spare_inches: float = 0.0) -> None:
+    def __init__(
+        self,
+        height_inches: float = 2.7,
+        *,
+        logarithmic: str = "",
+        spare_inches: float = 0.0,
+        is_wide: bool = False,
+    ) -> None:
         self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
         self.has_grid = False
-        self.size = (_WIDTH * _INCH, height_inches * _INCH)
+        self.size = ((_WHOLE if is_wide else _WIDTH) * _INCH, height_inches * _INCH)
         self.corner = (_LEFT * _INCH, _TOP * _INCH)  # of the axes, on the left and above
         self.extent = (
             self.size[0] - (_LEFT + _RIGHT + spare_inches) * _INCH,
@@ -64,11 +72,12 @@ class SvgFigure:
         self._beside: list[Callable[[], str]] = []
 
     @classmethod
-    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0) -> SvgFigure:
+    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> SvgFigure:
         """A figure in the proportions of the box between two corners."""
         width, height = high[0] - low[0], high[1] - low[1]
-        needed = (_WIDTH - _LEFT - _RIGHT - spare_inches) * height / width + _BOTTOM + _TOP
-        figure = cls(float(np.clip(needed, _LOWEST, _HIGHEST)), spare_inches=spare_inches)
+        whole, highest = (_WHOLE, _HIGHEST_WHOLE) if is_wide else (_WIDTH, _HIGHEST)
+        needed = (whole - _LEFT - _RIGHT - spare_inches) * height / width + _BOTTOM + _TOP
+        figure = cls(float(np.clip(needed, _LOWEST, highest)), spare_inches=spare_inches, is_wide=is_wide)
         figure.x.limit(low[0], high[0])
         figure.y.limit(low[1], high[1])
         figure.x.label, figure.y.label = "x [m]", "y [m]"

@@ -62,9 +62,11 @@ def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
     return figure.svg()
 
 
-def path_over_map(points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats) -> Markup:
+def path_over_map(
+    points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats, *, is_wide: bool = False
+) -> Markup:
     """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
-    figure = SvgFigure.of_plan(low, high)
+    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
     draw_points(figure, points, low, high)
     for line in lines:
         x, y = line.positions[:, :2].T
@@ -76,10 +78,15 @@ def path_over_map(points: Points, path: Floats, lines: Sequence[PathLine], low: 
 
 
 def layers_picture(
-    layers: Sequence[tuple[Points, str]], outlines: Sequence[tuple[Floats, str]], low: Floats, high: Floats
+    layers: Sequence[tuple[Points, str]],
+    outlines: Sequence[tuple[Floats, str]],
+    low: Floats,
+    high: Floats,
+    *,
+    is_wide: bool = False,
 ) -> Markup:
     """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
-    figure = SvgFigure.of_plan(low, high)
+    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
     for points, color in layers:
         draw_points(figure, points, low, high, color)
     for outline, color in outlines:
@@ -149,8 +156,8 @@ def _image(
 def loops_picture(
     trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
-    """The trajectory (gray) with its closures in the colors of ``CLOSURES``; ``edges`` (E, 2, 3)."""
-    figure = SvgFigure.of_plan(low, high)
+    """The trajectory (gray) and its closures (E, 2, 3) in the colors of ``CLOSURES``, over the whole page."""
+    figure = SvgFigure.of_plan(low, high, is_wide=True)
     figure.line(trajectory.positions[:, 0], trajectory.positions[:, 1], _POINTS, 0.7)
     for by, (_, color) in CLOSURES.items():
         chosen = edges[rejected_by == by][:, :, :2]

@@ -21,8 +21,8 @@ _COLORS = (
 
 TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never the color of a method
 CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what it is called and its line's color
-    VERIFICATION: ("rejected by verification", "#8a6d5b"),
-    BACK_END: ("rejected by the back end", "#0f9bb5"),
+    VERIFICATION: ("rejected by verification", "#f0958d"),
+    BACK_END: ("rejected by the back end", "#eb463c"),
     "": ("accepted", "#3f9b2f"),
 }
 
@@ -84,13 +84,27 @@ _THIN, _DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
 _TRUTH_WIDTH, _TRUTH_DASHES = 0.9, (3.0, 3.0)
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
 _BAR_INCHES = 0.65  # of a color bar and its numbers
-_WORST_TO_BEST = ("ff00ff", "00ffff")
+_WORST_TO_BEST = (
+    "7a0177",
+    "dd1c77",
+    "f2a03d",
+    "9fb8ad",
+    "41a6c4",
+    "1f6fd0",
+)  # a decade each, degenerate up to orange
 _MAX_DOTS = 3000
 
 
-def plan(trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats) -> Markup:
+def plan(
+    trajectories: Sequence[DrawnTrajectory],
+    truth: Floats | None,
+    low: Floats,
+    high: Floats,
+    *,
+    is_wide: bool = False,
+) -> Markup:
     """Seen from above, within corners."""
-    figure = SvgFigure.of_plan(low, high)
+    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
     for trajectory in _known(trajectories, "positions"):
         x, y = _decimated(trajectory.positions)[:, :2].T
         figure.line(x, y, trajectory.color, dashes=trajectory.dashes)
@@ -128,9 +142,11 @@ def error_over_distance(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     return _labeled(figure, "distance traveled [m]", "position error [m]")
 
 
-def distribution(trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str) -> Markup:
+def distribution(
+    trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str, *, is_wide: bool = False
+) -> Markup:
     """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
-    figure, ends = SvgFigure(logarithmic="x"), []
+    figure, ends = SvgFigure(logarithmic="x", is_wide=is_wide), []
     for trajectory in _known(trajectories, key):
         values = getattr(trajectory, key)
         values = np.maximum(np.sort(unit_scale * values[np.isfinite(values)]), 1e-6)
@@ -163,9 +179,9 @@ def consistency(trajectories: Sequence[DrawnTrajectory], degrees_of_freedom: int
     return _labeled(figure, "squared error over covariance (1 is exact on average)", "motions below [%]")
 
 
-def observability(trajectories: Sequence[DrawnTrajectory]) -> Markup:
+def observability(trajectories: Sequence[DrawnTrajectory], *, is_wide: bool) -> Markup:
     """Observability scan by scan; below 1 (dotted) a scan is degenerate."""
-    figure = SvgFigure(logarithmic="y")
+    figure = SvgFigure(logarithmic="y", is_wide=is_wide)
     for trajectory in _known(trajectories, "observability"):
         x = np.arange(len(trajectory.observability), dtype=np.float64)
         known = np.clip(trajectory.observability, _LOWEST, _HIGHEST)
@@ -174,9 +190,11 @@ def observability(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     return _labeled(figure, "scan", "observability")
 
 
-def innovations(curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]) -> Markup:
+def innovations(
+    curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]], *, is_wide: bool
+) -> Markup:
     """Innovations (N,) over their limits scan by scan, 1 (dotted) is a finding; stretches are shaded."""
-    figure = SvgFigure()
+    figure = SvgFigure(is_wide=is_wide)
     for first, last, color in stretches:
         figure.span(first - 0.5, last + 0.5, color, 0.2)
     for values, color in curves.values():
@@ -195,9 +213,10 @@ def observability_plan(trajectory: DrawnTrajectory) -> Markup:
     worst = np.array([group[np.argmin(values[group])] for group in groups])
     order = worst[np.argsort(-values[worst])]
     axis = Axis(is_logarithmic=True)
-    axis.limit(1.0, _HIGHEST)
+    axis.limit(_LOWEST, _HIGHEST, (_LOWEST, 1.0, _HIGHEST))
     palette = palette_of(_WORST_TO_BEST)
-    colors = palette[np.rint(255.0 * axis.fractions(np.clip(values[order], 1.0, _HIGHEST))).astype(int), :3]
+    shown = np.clip(values[order], _LOWEST, _HIGHEST)
+    colors = palette[np.rint(255.0 * axis.fractions(shown)).astype(int), :3]
     size = float(np.sqrt(np.clip(3000.0 / len(values), 4.0, 30.0)))
     x, y = trajectory.positions[order, :2].T
     figure.dots(x, y, [f"#{bytes(color).hex()}" for color in colors], size)
@@ -238,9 +257,14 @@ def _decimated(values: Floats) -> Floats:
     return values[:: max(1, -(-len(values) // _MAX_POINTS))]
 
 
+def window(count: int) -> int:
+    """Number of neighboring values, of so many, that make a point of a line."""
+    return max(1, -(-count // _WINDOWS))
+
+
 def _windowed(x: Floats, y: Floats, combine: Callable[..., Floats] = np.median) -> tuple[Floats, Floats]:
     """Neighboring values put together so that a line of them can be read."""
-    size = max(1, -(-len(x) // _WINDOWS))
+    size = window(len(x))
     count = len(x) // size * size
     if not count:
         return x, y

@@ -107,7 +107,7 @@ class KeyframeGraph:
 
 def _as_found(closure: Closure) -> FinalClosure:
     """Verdict of the matcher alone, before optimization."""
-    return FinalClosure(closure, closure.verdict, closure.reason, 1.0, float("nan"))
+    return FinalClosure(closure, closure.verdict, closure.cause, closure.reason, 1.0, float("nan"))
 
 
 def _strips(

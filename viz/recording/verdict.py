@@ -37,8 +37,8 @@ def verdict_messages(judged: Judged, trajectory: Trajectory) -> list[Message]:
 
 
 def _text(judged: Judged) -> str:
-    listed = "".join(f"- {each.text}\n" for each in judged.stretches[:_LISTED])
-    more = len(judged.stretches) - _LISTED
+    listed = "".join(f"- {each.text}\n" for each in judged.unnamed[:_LISTED])
+    more = len(judged.unnamed) - _LISTED
     return f"## {judged.verdict}\n\n{judged.reason}\n\n{listed}" + (f"- and {more:,} more\n" if more > 0 else "")
 
 

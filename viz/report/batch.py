@@ -16,10 +16,11 @@ from scanchain.batch.task import Row, State, output_file
 from scanchain.runs.metrics import Metrics
 from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
-from scanchain.verdict import MOST_CONTRADICTED, Verdict
+from scanchain.verdict import MOST_CONTRADICTED
 from scanchain.viz.pictures.figure import SvgFigure
 from scanchain.viz.pictures.trajectory_figures import color_of
 from scanchain.viz.report import page
+from scanchain.viz.report.checks import verdict_cell
 from scanchain.viz.report.page import (
     REPORT_FILE,
     Cell,
@@ -107,7 +108,7 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
-        Cell(str(m.verdict), is_bad=m.verdict is not Verdict.TRUSTWORTHY),
+        verdict_cell(m.verdict),
         Cell(f"{m.scans:,}"),
         Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
         Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),

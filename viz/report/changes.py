@@ -52,7 +52,7 @@ def outline(cluster: Cluster) -> Matrix:
 def _sections(changes: Changes) -> Iterator[Section]:
     points = np.pad(changes.points, ((0, 0), (0, 3 - changes.dimension)))
     chips = tuple(Chip(_NAMES[label], _HEX[label]) for label in _ORDER)
-    plan = _picture(points, changes, *extent(points))
+    plan = _picture(points, changes, *extent(points), is_wide=True)
     drawing = Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
     yield Section("Where", _TEXT, chips=chips, drawings=(drawing,))
     if changes.clusters:
@@ -70,9 +70,10 @@ def _close_ups(points: Matrix, changes: Changes, clusters: Sequence[Cluster]) ->
         yield Drawing(title, counted(cluster.points, "point"), picture)
 
 
-def _picture(points: Matrix, changes: Changes, low: Matrix, high: Matrix) -> Markup:
+def _picture(points: Matrix, changes: Changes, low: Matrix, high: Matrix, *, is_wide: bool = False) -> Markup:
     layers = [(points[changes.labels == label], _HEX[label]) for label in _ORDER]
-    return layers_picture(layers, [(outline(each), INK) for each in changes.clusters], low, high)
+    outlines = [(outline(each), INK) for each in changes.clusters]
+    return layers_picture(layers, outlines, low, high, is_wide=is_wide)
 
 
 def _grid(changes: Changes) -> Grid:

@@ -9,9 +9,9 @@ import pyarrow as pa
 
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import read_overlay
-from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch, Verdict
 from scanchain.viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
-from scanchain.viz.pictures.trajectory_figures import color_of, innovations
+from scanchain.viz.pictures.trajectory_figures import color_of, innovations, window
 from scanchain.viz.report.page import Cell, Chip, Drawing, Grid, Head, Row, Section
 
 _CURVES = {
@@ -34,13 +34,16 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
         *(Chip(name, color) for name, (_, color) in curves.items()),
         *((Chip("stretches to check", _SHADE),) if shaded else ()),
     )
+    is_alone, size = not overlay_file.exists(), window(len(steps))
+    largest = f", largest of {size} neighboring scans" if size > 1 else ""
     drawing = Drawing(
         "Innovations",
-        "Normalized innovations over their limits, largest of neighboring scans; above 1 (dotted) is a finding.",
-        innovations(curves, shaded),
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding.",
+        innovations(curves, shaded, is_wide=is_alone),
+        is_wide=is_alone,
     )
     drawings = [drawing]
-    if overlay_file.exists():
+    if not is_alone:
         overlay = read_overlay(overlay_file)
         chips += (Chip("scans before", BEFORE), Chip("scans after", AFTER))
         caption = (
@@ -55,6 +58,11 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
     rows = tuple(_row(each) for each in sorted(longest, key=lambda each: each.first))
     return Section("Checks", "", chips, tuple(drawings), Grid(heads, rows) if rows else None)
+
+
+def verdict_cell(verdict: str) -> Cell:
+    """A verdict in a table, in the color of its severity; empty for none."""
+    return Cell(verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
 
 
 def _row(stretch: Stretch) -> Row:

@@ -19,6 +19,7 @@ from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.compared_trajectories import read_trajectories
 from scanchain.viz.pictures.map_figures import map_picture, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain.viz.report.checks import verdict_cell
 from scanchain.viz.report.page import (
     REPORT_FILE,
     Cell,
@@ -42,6 +43,7 @@ from scanchain.viz.report.sections import (
     uncertainty_section,
 )
 
+_VERDICT = Head("verdict", "", "of other tools by wheels and constant velocity alone")
 _WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
@@ -92,7 +94,8 @@ def _warnings(table: Table) -> Iterator[str]:
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
     """The summary, and all else in one table more, or in two where that would be too wide."""
-    yield Section("Summary", grid=_grid(table, table.rows, trajectories, columns_of(table.figures, "summary")))
+    summary = columns_of(table.figures, "summary")
+    yield Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
     ended = [row for row in table.rows if row.status is Status.OK]
     accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
     parts = {"More on accuracy": accuracy, "More on time": time}
@@ -104,7 +107,12 @@ def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[
 
 
 def _grid(
-    table: Table, rows: Sequence[TableRow], trajectories: Sequence[DrawnTrajectory], columns: Sequence[Column]
+    table: Table,
+    rows: Sequence[TableRow],
+    trajectories: Sequence[DrawnTrajectory],
+    columns: Sequence[Column],
+    *,
+    has_verdicts: bool = False,
 ) -> Grid:
     """A row a method; the end of a failed one in place of its figures."""
     chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
@@ -112,14 +120,15 @@ def _grid(
     lines = []
     for row in rows:
         cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
-        cells += (Cell(row.verdict, is_bad=row.is_doubted),)
+        if has_verdicts:
+            cells += (verdict_cell(row.verdict),)
         if row.status is not Status.OK:
             cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
         lines.append(Row(row.name, cells, chips.get(row.name)))
     heads = (
         Head("method"),
         *(Head(column.head, column.unit, column.definition) for column in columns),
-        Head("verdict", "", "of other tools by wheels and constant velocity alone"),
+        *((_VERDICT,) if has_verdicts else ()),
     )
     notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
     return Grid(heads, tuple(lines), notes)

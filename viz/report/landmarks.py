@@ -19,7 +19,19 @@ from scanchain.viz.pictures.landmarks import (
     svg_before,
     svg_factor,
 )
-from scanchain.viz.report.page import REPORT_FILE, Cell, Chip, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain.viz.report.page import (
+    REPORT_FILE,
+    Cell,
+    Chip,
+    Collapsible,
+    Drawing,
+    Grid,
+    Head,
+    Page,
+    Row,
+    Section,
+    write_page,
+)
 
 _TIMES = (
     "Times are medians; each method solves from scratch with what it needs to know about the pattern (again: with "
@@ -43,14 +55,21 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         sections = tuple(each for study in studies for each in _sections(study))
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
-        write_page(directory / REPORT_FILE, Page(title, names, (), (), (), sections))
+        definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
+        fold = Collapsible("Definition of the errors", "\n\n".join(definitions))
+        write_page(directory / REPORT_FILE, Page(title, names, (), (), (), sections, (fold,)))
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
 
 def _sections(study: Study) -> Iterator[Section]:
     """The estimate, then the linear solvers."""
-    facts = [(fact.label, fact.value) for fact in study.facts]
+    (_, before), (_, after), _ = accuracy_lines(study)
+    facts = (
+        ("error before, rmse", before),
+        ("error after, rmse", after),
+        *((fact.label, fact.value) for fact in study.facts),
+    )
     is_known = bool(len(study.true_poses) or np.isfinite(study.true_landmarks).any())
     truth = (Chip("truth", "var(--ink)", is_dashed=True),) if is_known else ()
     chips = (Chip("before", BEFORE), Chip("after", AFTER), *truth)
@@ -59,12 +78,11 @@ def _sections(study: Study) -> Iterator[Section]:
         Drawing("Before optimization", f"{marks}.", svg_before(study)),
         Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study)),
     )
-    lines = (*facts, *accuracy_lines(study), ("A", size_of(study)))
-    yield Section(study.name, facts=lines, chips=chips, drawings=drawings)
+    yield Section(study.name, facts=facts, chips=chips, drawings=drawings)
     factors = tuple(
         Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method)) for method in study.methods
     )
-    text = "Drawn is where the factor of every method is not zero."
+    text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
     yield Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
 
 

@@ -18,9 +18,9 @@ from scanchain.words import counted
 
 COLORS = {
     MapState.SEARCHING: "#8c9096",
-    MapState.LOCALIZED: "#2f7de1",
+    MapState.LOCALIZED: "#3f9b2f",
     MapState.WITHOUT_MAP: "#c77800",
-    MapState.LOST: "#e0532f",
+    MapState.LOST: "#d6453d",
 }
 _PLACED_LATER = "#0f9bb5"
 
@@ -96,14 +96,14 @@ def _path(localized: LocalizedLog) -> Drawing:
         lie.lift_points(found.trajectory.poses[known][[0, -1], :-1, -1]) if len(known) else np.full((2, 3), np.nan)
     )
     margin = 0.02 * (high - low)
-    svg = path_over_map(points, ends, lines, low - margin, high + margin)
+    svg = path_over_map(points, ends, lines, low - margin, high + margin, is_wide=True)
     return Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
 
 
 def _states(localized: LocalizedLog) -> Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    figure, runs = SvgFigure(2.0), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
+    figure, runs = SvgFigure(2.0, is_wide=True), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
@@ -116,4 +116,5 @@ def _states(localized: LocalizedLog) -> Drawing:
         "Standard deviation of the position",
         f"Behind it the state, in the colors above; {count} tried.",
         figure.svg(),
+        is_wide=True,
     )

@@ -27,12 +27,16 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell; ``is_wide`` stretches it to the end of its row, ``is_bad`` marks a problem."""
+    """A table's cell; ``is_wide`` stretches it to the end of its row.
+
+    ``is_bad`` marks a problem, ``is_doubted`` what may be one.
+    """
 
     text: str
     is_best: bool = False
     is_wide: bool = False
     is_bad: bool = False
+    is_doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True)

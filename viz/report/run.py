@@ -136,8 +136,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     if metrics.ground_truth is not None:
         yield from error_section(trajectories, metrics.ground_truth.source)
     yield from uncertainty_section(trajectories[:1], is_planar=is_planar)
-    yield stages_section(metrics)
-    yield from time_section(trajectories[:1])
+    yield from time_section(trajectories[:1], _stages(metrics))
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,15 +218,15 @@ def accuracy_section(truth: GroundTruth) -> Section:
     return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimized.definition,)))
 
 
-def stages_section(metrics: Metrics) -> Section:
-    """Time by stage."""
+def _stages(metrics: Metrics) -> Grid:
+    """Time of a scan by stage."""
     heads = (Head("stage"), *(Head(stage, "ms") for stage in STAGES), Head("all but read", "ms"))
     names = (*STAGES, "all_but_read")
     rows = [
         Row(name, tuple(Cell(f"{figures_ms[stage]:.2f}") for stage in names))
         for name, figures_ms in (("median", metrics.median_ms), ("95th percentile", metrics.p95_ms))
     ]
-    return Section("Time of a scan", grid=Grid(heads, tuple(rows)))
+    return Grid(heads, tuple(rows))
 
 
 def _figures(accuracy: Accuracy) -> Iterator[str]:

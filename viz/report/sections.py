@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -19,10 +18,7 @@ from scanchain.viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTraj
 from scanchain.viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
-_MEDIANS = "Of long logs, medians of neighboring scans."
-_FIGURES = re.compile(
-    r"^\d+ of \d+ (?=points)|, χ² \S+$| along \[[^]]*\]| -?\d[\d.e+-]*"
-)  # of one closure; limits stand behind them
+_WITHOUT_CAUSES = "This run is older than the column cause; reasons are in loops.parquet, a sentence a closure."
 
 
 def chip(trajectory: DrawnTrajectory) -> Chip:
@@ -45,7 +41,8 @@ def trajectories_section(
 ) -> Section:
     """Trajectories from above, and their heights; ``framing`` are those that must fit in the axes."""
     corners = figures.frame(framing, truth)
-    drawings = [Drawing("Plan", "Seen from above.", figures.plan(trajectories, truth, *corners))]
+    seen = figures.plan(trajectories, truth, *corners, is_wide=is_planar)
+    drawings = [Drawing("Plan", "Seen from above.", seen, is_wide=is_planar)]
     if not is_planar:
         height = figures.height(trajectories, truth, *corners)
         drawings.append(Drawing("Height", "Over the distance traveled.", height))
@@ -63,7 +60,9 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
         f"Distance of each position from the true one after rigid alignment, against {truth_name}.",
         _legend(known),
         (
-            Drawing("Over the distance", _MEDIANS, figures.error_over_distance(known)),
+            Drawing(
+                "Over the distance", _of_neighbors("Medians", known, "error_m"), figures.error_over_distance(known)
+            ),
             Drawing(
                 "Distribution",
                 "Share of the scans with a smaller error.",
@@ -80,28 +79,31 @@ def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Sectio
         drawing = Drawing(
             "Distribution",
             "Share of the relations with a smaller error.",
-            figures.distribution(known, "relation_error_m", 1.0, "error of a relation [m]"),
+            figures.distribution(known, "relation_error_m", 1.0, "error of a relation [m]", is_wide=True),
+            is_wide=True,
         )
         text = "Distance between the motion of a relation and that of the trajectory."
         yield Section("Error over relations", text, _legend(known), (drawing,))
 
 
-def time_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
-    """Time per scan along the log and its distribution."""
+def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = None) -> Iterator[Section]:
+    """Time per scan by stage, along the log, and its distribution."""
     known = _with(trajectories, "seconds")
     if known:
+        along = figures.time_per_scan(known)
         yield Section(
             "Time per scan",
             "",
             _legend(known),
             (
-                Drawing("Along the log", _MEDIANS, figures.time_per_scan(known)),
+                Drawing("Along the log", _of_neighbors("Medians", known, "seconds"), along),
                 Drawing(
                     "Distribution",
                     "Share of the scans that took less.",
                     figures.distribution(known, "seconds", 1e3, "time of a scan [ms]"),
                 ),
             ),
+            stages,
         )
 
 
@@ -110,20 +112,22 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     reported = _with(trajectories, "observability")
     if not reported:
         return
+    consistency = tuple(_consistency(trajectories, is_planar=is_planar))
+    least = _of_neighbors(" Least values", reported, "observability")
     along = Drawing(
         "Observability",
-        "Information along the least constrained direction over the minimum required, least of neighboring scans. "
-        "Below 1 (dotted) a scan is degenerate.",
-        figures.observability(reported),
+        "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan is "
+        f"degenerate.{least}",
+        figures.observability(reported, is_wide=bool(consistency)),
+        is_wide=bool(consistency),
     )
-    whose = f" of {reported[0].name}" if len(reported) > 1 else ""
+    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
     where = Drawing(
-        "Observability on the trajectory",
-        f"The same, seen from above{whose}.",
+        f"Observability{whose} on the trajectory",
+        "Seen from above, the least observable scans on top.",
         figures.observability_plan(reported[0]),
     )
-    drawings = (*_consistency(trajectories, is_planar=is_planar), along, where)
-    yield Section("Uncertainty", "", _legend(reported), drawings)
+    yield Section("Uncertainty", "", _legend(reported), (along, *consistency, where))
 
 
 def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Drawing]:
@@ -158,22 +162,22 @@ def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel
         title,
         f"{len(ends):,} tried; each is a row of loops.parquet.",
         tuple(Chip(f"{name}: {counts[by]:,}", color) for by, (name, color) in CLOSURES.items()),
-        (Drawing("On the trajectory", "", picture),),
+        (Drawing("On the trajectory", "Seen from above; circle: start.", picture, is_wide=True),),
         _verdict_grid(table),
     )
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
-    """Closures by verdict and reason, the figures of each left out of it, most frequent first."""
+    """Closures by verdict and cause, most frequent first; by verdict alone where a run has no causes."""
+    has_causes = "cause" in closures.column_names
+    causes = closures["cause"].to_pylist() if has_causes else [""] * closures.num_rows
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (by, reason) in enumerate(
-        zip(*(closures[key].to_pylist() for key in ("rejected_by", "reason")), strict=True)
-    ):
-        groups[CLOSURES[by][0], _FIGURES.sub("", reason, count=1)].append(place)
+    for place, (by, cause) in enumerate(zip(closures["rejected_by"].to_pylist(), causes, strict=True)):
+        groups[CLOSURES[by][0], cause].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
-        Head("reason", is_text=True),
+        *((Head("cause", is_text=True),) if has_causes else ()),
     )  # fmt: skip
     rows = tuple(
         Row(
@@ -182,17 +186,24 @@ def _verdict_grid(closures: pa.Table) -> Grid:
                 Cell(f"{len(places):,}"),
                 Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
                 Cell(_millimeters(float(np.median(residual_m[places])))),
-                Cell(reason, is_wide=True),
+                *((Cell(cause, is_wide=True),) if has_causes else ()),
             ),
         )
-        for (verdict, reason), places in sorted(groups.items(), key=lambda group: -len(group[1]))
+        for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
-    return Grid(heads, rows)
+    return Grid(heads, rows, () if has_causes else (_WITHOUT_CAUSES,))
 
 
 def _millimeters(value_m: float) -> str:
     """Millimeters as text, – without a value."""
     return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
+
+
+def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
+    """The caption of lines whose points stand for several scans each; none where each is a scan."""
+    count = max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories)
+    size = figures.window(count)
+    return f"{what} of {size} neighboring scans." if size > 1 else ""
 
 
 def _with(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajectory]:

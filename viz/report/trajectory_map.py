@@ -33,11 +33,11 @@ _OVER_ALL = (
     Kind.COPIES,
 )  # drawn over the states of single scans
 _COLORS = {
+    _DISPUTED: STRETCH_COLORS[Kind.LOOPS],
     State.DEGENERATE: STRETCH_COLORS[Kind.DEGENERATE],
     State.LOST: STRETCH_COLORS[Kind.LOST],
     State.CONTRADICTED: STRETCH_COLORS[Kind.CONTRADICTED],
-    _DISPUTED: "#075e70",
-} | {kind: STRETCH_COLORS[kind] for kind in _OVER_ALL}
+} | {kind: STRETCH_COLORS[kind] for kind in _OVER_ALL}  # a scan may have several; the later are drawn on top
 _MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict
 
@@ -86,12 +86,11 @@ def _lines(path: Floats, tables: Tables, truth: Floats | None) -> Iterator[tuple
     """Lines with their legends, the path first; empty ones are omitted."""
     yield PathLine(path, "#2f7de1", 1.2), Chip("trajectory", "#2f7de1")
     yield from _closure_lines(path, tables.closures)
-    marks = _marks(tables)
-    for state, color in _COLORS.items():
-        count = int((marks == list(_COLORS).index(state)).sum())
-        if count:
-            line = PathLine(_marked_parts(path, marks, list(_COLORS).index(state)), color, 2.6)
-            yield line, Chip(f"{state}: {counted(count, 'scan')}", color)
+    for mark, color in _COLORS.items():
+        is_marked = _is_marked(tables, mark)
+        if is_marked.any():
+            name = f"{mark}: {counted(int(is_marked.sum()), 'scan')}"
+            yield PathLine(_marked_parts(path, is_marked), color, 2.6), Chip(name, color)
     if truth is not None:
         yield PathLine(truth, TRUTH, 0.9, is_dashed=True), Chip("ground truth", TRUTH, is_dashed=True)
 
@@ -111,39 +110,39 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
             yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
-def _marks(tables: Tables) -> NDArray[np.int64]:
-    """(N,) index of every scan's mark in ``_COLORS``, −1 where nothing is wrong."""
-    names, marks = list(_COLORS), _states(tables)
-    for stretch in tables.stretches:
-        if stretch.kind in _OVER_ALL:
-            marks[stretch.first : stretch.last + 1] = names.index(stretch.kind)
-    return marks
+def _is_marked(tables: Tables, mark: State | Kind | str) -> NDArray[np.bool_]:
+    """(N,) scans of a state, of stretches of a kind, or at closures that the back end rejected."""
+    if isinstance(mark, State):
+        return np.array([state == mark for state in tables.steps["state"].to_pylist()])
+    is_marked = np.zeros(len(tables.steps), bool)
+    if mark == _DISPUTED:
+        parts = _disputed(tables)
+    else:
+        parts = [slice(each.first, each.last + 1) for each in tables.stretches if each.kind == mark]
+    for part in parts:
+        is_marked[part] = True
+    return is_marked
 
 
-def _states(tables: Tables) -> NDArray[np.int64]:
-    """(N,) marks by the states of the scans and by closures that the back end rejected."""
-    names = list(_COLORS)
-    states = tables.steps["state"].to_pylist()
-    marks = np.array([names.index(state) if state in _COLORS else -1 for state in states], np.int64)
+def _disputed(tables: Tables) -> list[slice]:
+    """Scans from each keyframe of a closure that the back end rejected to the next keyframe."""
     if tables.closures is None or not tables.closures.num_rows:
-        return marks
-    keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(marks))
+        return []
+    keyframes = np.append(np.flatnonzero(tables.steps["keyframe"].to_numpy() >= 0), len(tables.steps))
     is_rejected = np.array(tables.closures["rejected_by"].to_pylist()) == BACK_END
     ends = np.stack([tables.closures[name].to_numpy() for name in ("target_scan", "source_scan")])
-    for scan in np.unique(ends[:, is_rejected]).tolist():
-        end = int(keyframes[np.searchsorted(keyframes, scan, side="right")])
-        stretch = marks[scan:end]
-        stretch[stretch < 0] = names.index(_DISPUTED)
-    return marks
+    firsts = np.unique(ends[:, is_rejected])
+    lasts = keyframes[np.searchsorted(keyframes, firsts, side="right")]
+    return [slice(first, last) for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True)]
 
 
-def _marked_parts(path: Floats, marks: NDArray[np.int64], mark: int) -> Floats:
-    """The segments of the path that lead to a scan of this mark, NaN elsewhere."""
+def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
+    """The segments of the path that lead to a marked scan, NaN elsewhere."""
     size = max(1, -(-len(path) // _MAX_SEGMENTS))
     groups = [slice(k, k + size) for k in range(0, len(path), size)]
-    is_marked = np.array([bool((marks[group] == mark).any()) for group in groups])
+    has_marked = np.array([bool(is_marked[group].any()) for group in groups])
     positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
-    shown = is_marked | np.append(is_marked[1:], False)
+    shown = has_marked | np.append(has_marked[1:], False)
     positions[~shown] = np.nan
     return positions
 
@@ -153,6 +152,8 @@ _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000
 _HIGHEST = 65_535.0
 _BULK = (3.0, 97.0)  # percentiles of the points: what is in view at first, and the ends of the color scale
+_BULK_2D, _MARGIN = (0.5, 99.5), 0.03  # the same of a flat map, and its share that is added on each side
+_WIDEST = 3.0  # greatest width of a flat map's canvas over its height
 _WIDER = 1.8  # lines, on the canvas
 
 
@@ -165,7 +166,10 @@ def map_scene(
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
-    bulk = np.percentile(shown, _BULK, axis=0) if len(shown) and not is_flat else np.stack([low, high])
+    bulk = np.percentile(shown, _BULK, axis=0) if len(shown) else np.stack([low, high])
+    if is_flat:
+        bulk = _flat_view(shown, lines, low, high)
+    width, height = (bulk[1] - bulk[0])[:2]
     scene = {
         "box": [low.tolist(), high.tolist()],
         "view": bulk.tolist(),
@@ -176,10 +180,20 @@ def map_scene(
         "lines": [_line(line, low, high) for line in lines if len(line.positions)],
     }
     template = Markup(
-        '<canvas class="scene" tabindex="0" role="img" aria-label="Map and trajectory, to rotate and zoom" '
+        '<canvas class="scene"{} tabindex="0" role="img" aria-label="Map and trajectory, to rotate and zoom" '
         'data-scene="{}"></canvas><div class="buttons"></div>'
     )
-    return template.format(json.dumps(scene, separators=(",", ":")))
+    style = Markup(' style="height: auto; aspect-ratio: {:.3f}"').format(min(width / height, _WIDEST))
+    return template.format(style if is_flat else "", json.dumps(scene, separators=(",", ":")))
+
+
+def _flat_view(points: Points, lines: Sequence[PathLine], low: Floats, high: Floats) -> Floats:
+    """Corners (2, 3) of what is in view at first: all lines and most points, with a margin."""
+    bulk = np.percentile(points, _BULK_2D, axis=0) if len(points) else np.empty((0, 3))
+    seen = np.vstack([bulk, *(line.positions for line in lines)])
+    first, last = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+    margin = _MARGIN * (last - first)
+    return np.stack([np.maximum(first - margin, low), np.minimum(last + margin, high)])
 
 
 def _line(line: PathLine, low: Floats, high: Floats) -> dict[str, object]:

@@ -140,6 +140,7 @@ function show(canvas) {
     if (keys[event.key]) { event.preventDefault(); keys[event.key](); }
   });
   const buttons = {"+": () => zoom(0.7), "−": () => zoom(1.4), "from above": () => { view = top(); ask(); }, reset};
+  if (scene.flat) delete buttons["from above"];
   for (const [name, act] of Object.entries(buttons)) {
     const button = document.createElement("button");
     button.type = "button"; button.textContent = name;
