@@ -98,6 +98,7 @@ def _verified(table: pa.Table, dimension: int) -> Closures:
         table["source_scan"].to_numpy()[chosen],
         _poses(table, "", dimension)[chosen],
         rejected_by[chosen] == "",
+        tried=len(table),
     )
 
 

@@ -43,12 +43,14 @@ class WheelCheck(NamedTuple):
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
     turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
+    known_share : share of the scans whose motion the wheels know, at rest too
     """
 
     innovation: Floats
     apart_m: Floats
     apart_rad: Floats
     turn_ratio: float = np.nan
+    known_share: float = 0.0
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
@@ -60,8 +62,9 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     regression over the log; the standard deviations of what is left are learned from the log.
     """
     d, n = poses.shape[-1] - 1, len(poses)
-    check = WheelCheck(np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan))
     known = np.isfinite(wheel_poses[:, 0, 0])
+    nothing = np.full(n, np.nan)
+    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), known_share=float(known.mean()))
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
     matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))

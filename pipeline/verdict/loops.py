@@ -30,12 +30,14 @@ class Closures:
     target, source : (C,) scans
     T_target_source : (C, d+1, d+1) as measured
     is_accepted : (C,) by the back end
+    tried : number of those that were tried, others included
     """
 
     target: NDArray[np.int64]
     source: NDArray[np.int64]
     T_target_source: Matrix
     is_accepted: NDArray[np.bool_]
+    tried: int = 0
 
 
 class Group(NamedTuple):

@@ -22,7 +22,7 @@ _GAP_SCANS = 10  # longest gap within a stretch
 _SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
-_KNOWN = 0.5  # least share of its scans that the wheels are compared at
+KNOWN = 0.5  # least share of scans that the wheels are compared at
 _RESTING_M = 0.05  # distance from copies to the next scan, within which the lidar rested
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
 
@@ -155,7 +155,7 @@ def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
     """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
     positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
     extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
-    if kind is Kind.DEGENERATE or not evidence.is_after_gap[part.start]:
+    if not evidence.is_after_gap[part.start]:
         return extent_m
     speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / np.median(np.diff(evidence.seconds))
     return max(extent_m, float(speed_m_s * (evidence.seconds[part.start] - evidence.seconds[last])))
@@ -164,7 +164,7 @@ def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
 def _passed_m(evidence: Evidence, part: slice) -> float:
     """Extent up to which a part is passed without harm: more where wheels are known and none contradicts."""
     innovation = evidence.wheels.innovation[part]
-    is_held = np.isfinite(innovation).mean() >= _KNOWN and not (innovation > WHEEL_LIMIT).any()
+    is_held = np.isfinite(innovation).mean() >= KNOWN and not (innovation > WHEEL_LIMIT).any()
     return _PASSED_BY_WHEELS_M if is_held else _PASSED_M
 
 
@@ -198,7 +198,7 @@ def _of_overlap(evidence: Evidence) -> Iterator[Stretch]:
 
 
 def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
-    """Stretches over which the driver was stuck, by what follows: a scan elsewhere, or none.
+    """Stretches over which the driver was stuck, by what lies beside: a scan elsewhere, or none.
 
     Simulated scans without noise are copies at rest, and the next one is still there.
     """
@@ -206,8 +206,8 @@ def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
     for part in merged(evidence.is_copy, 0):
         if part.stop - part.start <= MOST_COPIES or evidence.is_held_by_wheels[part].all():
             continue
-        is_last = part.stop == len(evidence)
-        if is_last or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
+        is_at_end = part.start == 1 or part.stop == len(evidence)
+        if is_at_end or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
             yield _stretch(evidence, Kind.COPIES, part.start, part.stop - 1, part.stop - part.start)
 
 

@@ -8,8 +8,10 @@ from enum import StrEnum
 
 import numpy as np
 
+from scanchain import lie
 from scanchain.data import LEAST_FIT
-from scanchain.verdict.stretches import Evidence, Kind, Stretch, find_stretches
+from scanchain.verdict.checks import WINDOW_M
+from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch, find_stretches
 from scanchain.words import counted
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
@@ -18,6 +20,12 @@ _LARGE_M = 1.0  # impossible change of the motion above which the trajectory is 
 _EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
+_MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
+_MEDIAN_LIMIT = (
+    2.0  # largest median innovation of the wheels; where their calibration and σ are right it is about 1
+)
+_REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
+_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # loop closures that must be tried, and share of them that must fit
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
 
@@ -58,13 +66,15 @@ def judge(evidence: Evidence) -> Judged:
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
-    contradict at the same place by about the same distance.
+    contradict at the same place by about the same distance. To be checked is any with a suspicious stretch, and
+    one that is suspicious as a whole: it does not move, wheels disagree all along, many scans are degenerate, or
+    revisited places do not look as mapped.
     """
     stretches = tuple(find_stretches(evidence))
     reasons = list(_grave(evidence, stretches))
     if reasons:
         return Judged(Verdict.NOT_TRUSTWORTHY, "; ".join(reasons), stretches)
-    doubts = [*_opposed(evidence), *([_listed(stretches)] if stretches else [])]
+    doubts = list(_doubts(evidence, stretches))
     if doubts:
         return Judged(Verdict.CHECK, "; ".join(doubts), stretches)
     return Judged(Verdict.TRUSTWORTHY, f"no contradiction in {counted(len(evidence), 'scan')}{_by(evidence)}", ())
@@ -134,6 +144,66 @@ def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
         yield f"{line}; {few}, as a radar's have: choose a lidar with --topic"
     else:
         yield f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
+
+
+def _doubts(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    yield from _opposed(evidence)
+    yield from _at_rest(evidence)
+    yield from _unlike_wheels(evidence)
+    yield from _degenerate(evidence)
+    yield from _unlike_map(evidence)
+    if stretches:
+        yield _listed(stretches)
+
+
+def _at_rest(evidence: Evidence) -> Iterator[str]:
+    """A trajectory that stays where it began, without wheels that say so."""
+    if evidence.wheels.known_share >= KNOWN:
+        return
+    motion = np.abs(lie.log(lie.between(evidence.poses[:1], evidence.poses)))
+    d = evidence.poses.shape[-1] - 1
+    positions, seconds = evidence.poses[:, :-1, -1], float(evidence.seconds[-1])
+    extent_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
+    limit_m = min(_REST_M, _REST_M_S * seconds)
+    if extent_m < limit_m and motion[:, d:].max() < _REST_RAD:
+        yield (
+            f"the trajectory stays within {extent_m:.2f} m for {seconds:.1f} s: the lidar was at rest, or moved "
+            "where everything it sees looks the same or moves along; nothing in the log tells which"
+        )
+
+
+def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
+    """Wheels that disagree all along, which is why their standard deviations were learned to be large."""
+    wheels = evidence.wheels
+    known = np.isfinite(wheels.innovation)
+    if not known.any() or np.median(wheels.innovation[known]) <= _MEDIAN_LIMIT:
+        return
+    apart_m, apart_deg = np.median(wheels.apart_m[known]), np.degrees(np.median(wheels.apart_rad[known]))
+    yield (
+        f"the wheels disagree with the trajectory all along, by {apart_m:.1f} m and {apart_deg:.0f} deg over "
+        f"{WINDOW_M:g} m (medians): their scale or the mounting is wrong, or the lidar follows what moves along"
+    )
+
+
+def _degenerate(evidence: Evidence) -> Iterator[str]:
+    """Directions in which nothing but wheels or prediction says where the lidar is, in many scans."""
+    count = int(evidence.is_degenerate.sum())
+    if count > _MOST_OPEN * len(evidence):
+        source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
+        yield (
+            f"{count:,} of {len(evidence):,} scans are degenerate: along at least one direction poses are {source}"
+        )
+
+
+def _unlike_map(evidence: Evidence) -> Iterator[str]:
+    """Revisits where next to nothing looks as it was mapped."""
+    closures = evidence.closures
+    accepted = int(closures.is_accepted.sum())
+    if closures.tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * closures.tried:
+        yield (
+            f"of {closures.tried:,} loop closures tried {accepted:,} were accepted: where the trajectory returns, "
+            "the place does not look as mapped"
+        )
 
 
 def _listed(stretches: Sequence[Stretch]) -> str:

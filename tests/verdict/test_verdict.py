@@ -212,7 +212,8 @@ def test_a_driver_that_was_stuck_is_a_stretch_unless_the_lidar_rested_or_wheels_
     stuck[501:521] = poses[500]
     (stretch,) = judge(evidence(stuck, is_copy=marked(501, 520))).stretches[:1]
     assert (stretch.kind, stretch.first, stretch.last) == (Kind.COPIES, 501, 520)
-    assert Kind.COPIES in {each.kind for each in judge(evidence(poses, is_copy=marked(N - 20, N - 1))).stretches}
+    for at_an_end in (marked(N - 20, N - 1), marked(1, 20)):
+        assert Kind.COPIES in {each.kind for each in judge(evidence(poses, is_copy=at_an_end)).stretches}
     rested = np.concatenate([poses[:500], np.repeat(poses[500:501], 21, axis=0), poses[501:]])[:N]
     for calm, last, wheels in ((rested, 519, None), (poses, 505, None), (poses, 520, wheels_of(poses))):
         judged = judge(evidence(calm, is_copy=marked(501, last), wheels=wheels))
@@ -271,6 +272,45 @@ def test_a_corridor_that_the_wheels_hold_is_to_be_checked_and_not_wrong():
     judged = judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 1000)))
     assert judged.verdict is Verdict.CHECK and judged.stretches[0].scans == 701
     assert judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 330))).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_trajectory_that_stays_where_it_began_is_to_be_checked_unless_the_wheels_rest_too():
+    rng = np.random.default_rng(0)
+    rested = chained(np.zeros((200, 3)), rng, 0.001)
+    judged = judge(evidence(rested))
+    assert judged.verdict is Verdict.CHECK and "the lidar was at rest, or moved" in judged.reason
+    assert judge(evidence(rested, wheels=chained(np.zeros((200, 3)), rng))).verdict is Verdict.TRUSTWORTHY
+    turning = chained(np.tile([0.0, 0.0, 0.05], (200, 1)), rng, 0.001)
+    assert judge(evidence(turning)).verdict is Verdict.TRUSTWORTHY
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("scale", "verdict"), [(0.9, Verdict.TRUSTWORTHY), (1.4, Verdict.CHECK)])
+def test_wheels_that_disagree_all_along_are_named_though_they_disagree_evenly(dimension, scale, verdict):
+    poses, _ = course(dimension)
+    judged = judge(evidence(poses, wheels=wheels_of(poses, scale=scale)))
+    assert judged.verdict is verdict
+    assert ("wheels disagree with the trajectory all along" in judged.reason) is (verdict is Verdict.CHECK)
+
+
+def test_many_short_stretches_of_degenerate_scans_are_to_be_checked_though_wheels_hold_each():
+    poses, _ = course()
+    often = np.arange(N) % 30 < 9
+    judged = judge(evidence(poses, wheels=wheels_of(poses), is_degenerate=often))
+    assert judged.verdict is Verdict.CHECK and "360 of 1,200 scans are degenerate" in judged.reason
+    seldom = np.arange(N) % 90 < 9
+    assert judge(evidence(poses, wheels=wheels_of(poses), is_degenerate=seldom)).verdict is Verdict.TRUSTWORTHY
+
+
+@pytest.mark.parametrize(("tried", "verdict"), [(9, Verdict.TRUSTWORTHY), (10, Verdict.CHECK)])
+def test_revisited_places_that_do_not_look_as_mapped_are_to_be_checked(tried, verdict):
+    poses, _ = course()
+    pairs = [((10, 610), lie.between(poses[10], poses[610]))]
+    found = evidence(poses, closures=pairs)
+    closures = replace(found.closures, is_accepted=np.array([True]), tried=tried)
+    judged = judge(replace(found, closures=closures))
+    assert judged.verdict is verdict
+    assert judge(replace(found, closures=replace(closures, tried=4))).verdict is Verdict.TRUSTWORTHY
 
 
 def test_segments_that_a_closure_joins_are_not_told():
