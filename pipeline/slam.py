@@ -42,6 +42,7 @@ from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
+_LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
 _ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _UPDATE_GROWTH = 0.02  # the same of a large graph, for an optimization that keeps the verdicts
@@ -455,7 +456,9 @@ def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> M
 
     Residuals share the map's errors and are far from independent, so that H alone is overconfident.
     """
-    floor = lie.by_component(len(information), sigma_m, sigma_rad) ** 2
-    covariance = np.linalg.inv(information + np.diag(1e-6 / floor)) + np.diag(floor)
+    k = len(information)
+    floor = lie.by_component(k, sigma_m, sigma_rad) ** 2
+    least = np.maximum(1e-6 / floor, lie.by_component(k, *_LARGEST_SIGMAS) ** -2.0)
+    covariance = np.linalg.inv(information + np.diag(least)) + np.diag(floor)
     result = np.linalg.inv(covariance)
     return 0.5 * (result + result.T)

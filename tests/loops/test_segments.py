@@ -15,7 +15,7 @@ from scanchain.loops.connectivity import Segments
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
 from scanchain.runs.closures import final_verdicts
-from scanchain.slam import Slam
+from scanchain.slam import Slam, edge_information
 from tests.support.scenes import configured, shared_data, stored
 
 
@@ -96,6 +96,20 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
         and item.closure.target < slam.closer.segments.starts[1] <= item.closure.source
     ]
     assert len(across) > 10
+
+
+def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():
+    graph, step = PoseGraph(2), lie.pose_2d(1.0, 0.0, 0.0)
+    nothing = np.zeros((3, 3))
+    for index in range(200):
+        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
+    for index in range(199):
+        lost = 19 if index in (0, 120) else 0
+        information = edge_information(nothing, 1.0 * lost, 0.2 * lost) if lost else 1e5 * np.eye(3)
+        graph.add_edge(index, index + 1, step, information)
+    for index in range(150, 160):
+        graph.add_edge(index, index + 30, lie.pose_2d(30.0, 0.0, 0.0), 1e5 * np.eye(3), is_loop=True)
+    assert graph.optimize(configured(2).graph, initialize="given").converged
 
 
 def test_a_short_silence_begins_no_new_map():
