@@ -23,6 +23,7 @@ from tests.support.scenes import ROOT
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDTH, BESIDE_WIDTH = 1000, 750  # px, of a picture alone and of each of those beside each other
+NEARLY_WHITE = 248
 NARROW = "--preprocess.max_range_m 4"
 PICTURES = {  # for each picture the commands, and the pictures drawn by them that stand beside each other in it
     "run": (
@@ -71,7 +72,11 @@ def draw(name: str, folder: Path) -> None:
         whole.paste(image, (place * width, 0))
     # Colors of thin lines as well, then moved to the frequent ones.
     palette = whole.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=10)
-    whole.quantize(palette=palette, dither=Image.Dither.NONE).save(FOLDER / f"{name}.png", optimize=True)
+    flat = whole.quantize(palette=palette, dither=Image.Dither.NONE)
+    colors = flat.getpalette() or []
+    entries = [colors[at : at + 3] for at in range(0, len(colors), 3)]
+    flat.putpalette([value for each in entries for value in ([255] * 3 if min(each) >= NEARLY_WHITE else each)])
+    flat.save(FOLDER / f"{name}.png", optimize=True)
     print(f"{name}.png, {os.path.getsize(FOLDER / f'{name}.png') // 1024} kB", flush=True)
 
 
