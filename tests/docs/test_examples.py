@@ -168,3 +168,22 @@ def test_every_file_that_a_page_links_exists(page):
     links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", FENCE.sub("", page.read_text(encoding="utf-8")))
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert not missing
+
+
+def anchors(page):
+    """Anchors of the headings of a page, as GitHub and MyST make them."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_has_a_text_and_leads_to_a_heading(page):
+    links = re.findall(
+        r"\[([^\]]*)\]\(([^)\s#]*)(?:#([^)\s]+))?\)", FENCE.sub("", page.read_text(encoding="utf-8"))
+    )
+    wrong = [(text, path) for text, path, _ in links if not text]
+    for text, path, anchor in links:
+        target = (page.parent / path) if path else page
+        if anchor and "://" not in path and anchor not in anchors(target):
+            wrong.append((text, f"{path}#{anchor}"))
+    assert not wrong
