@@ -134,6 +134,7 @@ def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> 
     scaled = replace(
         match,
         reason=match.reason if match.converged else _in_units_of(match.reason, unit_m),
+        cause=_in_units_of(match.cause, unit_m),
         T_target_source=at_target @ _scaled(match.T_target_source, unit_m),
         information=match.information / np.outer(units, units),
         cost=match.cost * unit_m**2,
@@ -146,7 +147,8 @@ def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> 
 def _in_units_of(reason: str, unit_m: float) -> str:
     """A reason, its lengths in the unit of the clouds that came; without keys, which ``align`` does not take."""
     named = re.sub(r"matching\.kernel_scale_m \((\S+)\)", r"the kernel scale of \1 m", reason)
-    named = re.sub(r"local_map\.voxel_size_m \((\S+)\)", r"voxel_size_m (\1 m)", named).replace("matching.", "")
+    named = re.sub(r"local_map\.voxel_size_m \((\S+)\)", r"voxel_size_m (\1 m)", named)
+    named = named.replace("matching.", "").replace("local_map.", "")
     return re.sub(r"([\d.e+-]*\d) m\b", lambda length: f"{float(length[1]) * unit_m:.3g}", named)
 
 

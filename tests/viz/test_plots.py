@@ -9,6 +9,7 @@ from scanchain import lie
 from scanchain.verdict import Kind, Stretch
 from scanchain.viz.pictures.axis import Axis, width_of
 from scanchain.viz.pictures.figure import SvgFigure, palette_of
+from scanchain.viz.pictures.map_figures import draw_points
 from scanchain.viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
@@ -161,6 +162,19 @@ def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
     off = np.hypot(*(points / figure.extent * 2.2 - 1.1).T) - 1.0
     assert np.abs(off).max() < 1e-4
     np.testing.assert_allclose(points[-1], 129.6 * (1.0 + np.array([1.0, -1.0]) * end / 1.1), atol=0.1)
+
+
+def test_the_pixels_of_a_map_are_square_and_begin_at_its_corner():
+    low, high = np.zeros(3), np.array([13.7, 6.95, 0.0])
+    points = np.random.default_rng(0).uniform(low, high, (1000, 3))
+    figure = SvgFigure.of_plan(low, high)
+    draw_points(figure, points, low, high)
+    x, y, width, height = map(
+        float, re.search(r'<image x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', figure.svg()).groups()
+    )
+    rows, columns = image.imread(BytesIO(b64decode(re.search(r"base64,(.*?)\"", figure.svg())[1]))).shape[:2]
+    assert width / columns == pytest.approx(height / rows, rel=1e-3)
+    assert (x, y + height) == pytest.approx((0.0, figure.extent[1]), abs=0.01)
 
 
 def test_an_image_of_a_figure_has_its_colors_and_its_first_row_at_the_lower_corner():

@@ -169,6 +169,22 @@ def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_pat
     assert len(seen["svgs"]) >= 8
 
 
+@pytest.mark.parametrize("which", ["comparison", "one_run"])
+def test_text_is_as_large_in_figures_over_the_whole_page_as_in_others_and_a_lone_figure_is_one(which, request):
+    page = (request.getfixturevalue(which) / "report.html").read_text(encoding="utf-8")
+    wide, others = (
+        {
+            float(width)
+            for width in re.findall(f'<figure{name}>(?:(?!</figure>).)*?viewBox="0 0 ([0-9.]+)', page, re.S)
+        }
+        for name in (' class="whole"', "")
+    )
+    assert len(wide) == len(others) == 1 and wide.pop() / others.pop() == pytest.approx(1090.0 / 523.0, rel=0.02)
+    for drawings in re.findall(r'<div class="drawings">(.*?)\n</div>', page, re.S):
+        if drawings.count("<figure") == 1:
+            assert '<figure class="whole">' in drawings
+
+
 def test_a_run_tells_its_result_first_and_its_time_last(one_run):
     page = (one_run / "report.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", page)

@@ -129,15 +129,16 @@ def draw_points(
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
         colors = _VIRIDIS if by_height and np.ptp(shown[inside, 2]) else (color.removeprefix("#"),)
-        figure.image(*_image(shown[inside], low, high, colors), low, high)
+        pixels, palette, edge_m = _image(shown[inside], low, high, colors)
+        figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
 
 def _image(
     points: Floats, low: Floats, high: Floats, colors: Sequence[str]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Pixels (H, W) and palette (K, 4): the color of the highest point, opacity by the number of points."""
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float]:
+    """Pixels (H, W), palette (K, 4), edge of a pixel: the color of the highest point, opacity by their number."""
     width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
-    edge_m = (high[0] - low[0]) / width
+    edge_m = float(high[0] - low[0]) / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     pixel = row * columns + column
@@ -150,7 +151,7 @@ def _image(
         np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * share).astype(int))
     palette = np.repeat(shades, _SHADES + 1, axis=0)
     palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_SHADES + 1))), len(shades))
-    return (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8), palette
+    return (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8), palette, edge_m
 
 
 def loops_picture(
