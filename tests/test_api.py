@@ -37,7 +37,7 @@ def test_a_log_is_opened_with_keys_of_its_section(office):
     assert sc.open_log(office, log.config, log__every=2).scan_count == 5
     for changes, words in (
         ({"topic": "/nowhere"}, "has no topic /nowhere"),
-        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean log.topic"),
+        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean log__topic"),
         ({"end_s": "soon"}, "log.end_s is 'soon'"),
     ):
         with pytest.raises(InputError, match=words):
@@ -156,7 +156,7 @@ def test_a_run_from_python_writes_what_the_command_writes(office, tmp_path):
     assert {"trajectory.tum", "report.html", "metrics.json", "results.mcap"} <= written
     assert "recording.rrd" not in written
     assert len(sc.read_tum(done.path / "trajectory.tum")) == 40
-    with pytest.raises(InputError, match=r"did you mean loops\.drift\?"):
+    with pytest.raises(InputError, match=r"did you mean loops__drift\?"):
         sc.run(office, tmp_path / "again", loops__driff=0.1)
 
 

@@ -102,6 +102,6 @@ def simulate(
         )
     size_mb = destination.stat().st_size / 1e6
     click.echo(
-        f"{destination}: {counted(len(truth), 'scan')}, {size_mb:.0f} MB; ground truth in it and in "
+        f"{destination}: {counted(len(truth), 'scan')}, {size_mb:.1f} MB; ground truth in it and in "
         f"{destination.with_suffix('.tum')}"
     )

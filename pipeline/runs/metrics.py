@@ -271,7 +271,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         *_calibration_lines(m),
         *(f"odometry       {error}" for error in m.odometry_errors),
-        f"time           {m.run_s:.1f} s with map and results{m.compiling}, "
+        f"time           {m.run_s:.1f} s{m.compiling} with map and results, "
         f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
         "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),

@@ -212,7 +212,7 @@ def test_a_log_that_fails_is_not_blamed_on_another_of_the_same_contents(tmp_path
         assert reasons[name].startswith(f"{tmp_path / name}: ")
     assert "is a folder" in reasons["folder.mcap"] and "is a folder" not in reasons["empty.mcap"]
     one, other = sorted(("a.mcap", "b.mcap"), key=lambda name: reasons[name].startswith("has the contents"))
-    assert reasons[one].startswith(f"{tmp_path / one}: is no log")
+    assert reasons[one].startswith(f"{tmp_path / one}: is not a recognized log")
     assert reasons[other] == f"has the contents of {tmp_path / one}: {reasons[one]}"
 
 

@@ -238,7 +238,7 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     monkeypatch.setattr(VoxelMap, "insert", compiling)
     cold, metrics = finished("cold")
     assert metrics["compile_s"] == pytest.approx(compiled[0]) and compiled[0] > 0.6
-    assert f" s (and {compiled[0]:.0f} s compiling, once after an installation), " in cold.summary
+    assert f" s (and {compiled[0]:.0f} s compiling, once after an installation) " in cold.summary
     assert metrics["run_s"] < figures["run_s"] + 0.5
     assert metrics["times_real_time"] == pytest.approx(metrics["log_span_s"] / metrics["run_s"])
     assert max(metrics["p95_ms"].values()) < 300.0
