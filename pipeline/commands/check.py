@@ -66,7 +66,7 @@ def check(
 
 
 def _text(judged: Judged) -> str:
-    return "\n".join([judged.sentence, *(f"  {stretch.text}" for stretch in judged.stretches)])
+    return "\n".join([judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)])
 
 
 def _json(judged: Judged) -> str:
