@@ -103,7 +103,7 @@ class Scan:
 
 
 class State(StrEnum):
-    """Reliability of a pose."""
+    """Verdict of a pose."""
 
     OK = "ok"
     CONTRADICTED = "contradicted"
@@ -240,7 +240,7 @@ class Problem(NamedTuple):
         return cls(text, text)
 
 
-class Verdict(StrEnum):
+class ClosureVerdict(StrEnum):
     """Verdict on a proposed loop closure."""
 
     ACCEPTED = "accepted"
@@ -268,7 +268,7 @@ class Closure:
     source: int
     match: Match
     overlap: float
-    verdict: Verdict
+    verdict: ClosureVerdict
     reason: str
     proposed_by: Proposal = Proposal.POSITION
     chi2_before: float = float("nan")

@@ -14,6 +14,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config, LoopsConfig
 from scanchain.data import (
     Closure,
+    ClosureVerdict,
     GraphState,
     Keyframe,
     Matrix,
@@ -24,7 +25,6 @@ from scanchain.data import (
     Step,
     Timing,
     Trajectory,
-    Verdict,
 )
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
@@ -297,7 +297,7 @@ class Slam:
         if is_keyframe:
             closures += self._take(self.closer.close(self.keyframes, self.graph))
         for closure in closures if self.first else ():
-            is_by_map = closure.verdict is Verdict.ACCEPTED and closure.target < self.first
+            is_by_map = closure.verdict is ClosureVerdict.ACCEPTED and closure.target < self.first
             if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
                 self.by_map = closure
                 self.T_world_odom = self._odom_by(closure)
@@ -328,7 +328,7 @@ class Slam:
         if not closures:
             return ()
         taken = tuple(
-            self._add(closure) if closure.verdict is Verdict.ACCEPTED else closure for closure in closures
+            self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
         )
         self.closures.extend(taken)
         return taken

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LoopsConfig
-from scanchain.data import Closure, Keyframe, Matrix, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
 from scanchain.loops.connectivity import Drift, Segments
@@ -154,8 +154,8 @@ class ProximityCloser:
             keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
         )
         closure = verified.closure(target, newest)
-        self.target = target if closure.verdict is Verdict.ACCEPTED else -1
-        if closure.verdict is Verdict.ACCEPTED or self.search is None:
+        self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
+        if closure.verdict is ClosureVerdict.ACCEPTED or self.search is None:
             return (closure,)
         if not self.search.is_due(keyframes):
             return (closure,)

@@ -8,10 +8,10 @@ from typing import Any, overload
 
 import numpy as np
 
-from scanchain.data import Closure, Match, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Match, Proposal
 from scanchain.graph.growing_array import GrowingArray
 
-_TEXTS = {"reason": str, "cause": str, "verdict": Verdict, "proposed_by": Proposal}  # kept as numbers
+_TEXTS = {"reason": str, "cause": str, "verdict": ClosureVerdict, "proposed_by": Proposal}  # kept as numbers
 
 
 class ClosureTable(Sequence[Closure]):

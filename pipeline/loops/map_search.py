@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import level_frame, upright_frame
@@ -79,7 +79,7 @@ class MapSearch:
 
     def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
         """Remember whether the newest keyframe, of these closures, matches the map; then no search goes on."""
-        if any(each.verdict is Verdict.ACCEPTED and each.target < self.of_map for each in closures):
+        if any(each.verdict is ClosureVerdict.ACCEPTED and each.target < self.of_map for each in closures):
             self.matched_m = keyframes[-1].traveled_m
             self.search = None
 
@@ -146,7 +146,7 @@ class MapSearch:
         components: NDArray[np.int64],
     ) -> tuple[Closure, ...]:
         """Closures by the result of a search, accepted where another find agrees."""
-        if closure is None or closure.verdict is Verdict.REJECTED:
+        if closure is None or closure.verdict is ClosureVerdict.REJECTED:
             return () if closure is None else (closure,)
         self.next_m = keyframes[-1].traveled_m + _STEP_M
         if components[-1] == components[0]:
@@ -180,7 +180,7 @@ class MapSearch:
                 T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
                 verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
                 tried.append(verified.closure(target, newest.index, Proposal.PLACE))
-        accepted = [each for each in tried if each.verdict is Verdict.ACCEPTED]
+        accepted = [each for each in tried if each.verdict is ClosureVerdict.ACCEPTED]
         if not accepted:
             return tried[0] if tried else None
         best = max(accepted, key=lambda each: each.overlap)
@@ -275,7 +275,7 @@ class MapSearch:
 
 
 def _rejected(closure: Closure, problem: Problem) -> Closure:
-    return replace(closure, verdict=Verdict.REJECTED, cause=problem.cause, reason=problem.text)
+    return replace(closure, verdict=ClosureVerdict.REJECTED, cause=problem.cause, reason=problem.text)
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:

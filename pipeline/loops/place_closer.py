@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose, Problem, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Problem, Proposal
 from scanchain.errors import InputError, shown
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
@@ -129,7 +129,7 @@ class PlaceCloser:
             problem = self._problem(candidate, verified, query, graph if is_connected else None)
             closure = verified.closure(candidate.target, anchor.index, candidate.proposed_by, problem=problem)
             yield closure
-            if closure.verdict is Verdict.ACCEPTED:
+            if closure.verdict is ClosureVerdict.ACCEPTED:
                 self.last = closure
                 return
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.planar_map_search import LEAST_SHARE, PlanarMapSearch, WholeSearch
@@ -175,7 +175,7 @@ class Relocalizer:
             return ()
         path = np.arange(_path_begin(keyframes, start), len(keyframes))
         closures = self._verified(find, path, old, keyframes, T_world)
-        if any(closure.verdict is Verdict.ACCEPTED for closure in closures):
+        if any(closure.verdict is ClosureVerdict.ACCEPTED for closure in closures):
             self.found = []
         return closures
 
@@ -313,4 +313,4 @@ def _agree(a: Find, b: Find, keyframes: Sequence[Keyframe]) -> bool:
 
 
 def _rank(closure: Closure) -> tuple[bool, float]:
-    return closure.verdict is Verdict.ACCEPTED, closure.overlap
+    return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap

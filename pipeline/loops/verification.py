@@ -12,7 +12,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Match, Points, Pose, Problem, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Match, Points, Pose, Problem, Proposal
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
 from scanchain.loops.submaps import Submap, VoxelSubmaps
@@ -58,7 +58,7 @@ class Verification:
     ) -> Closure:
         """The closure of two keyframes; a ``problem`` besides those of the alignment rejects it, too."""
         problem = self.problem or problem
-        verdict = Verdict.REJECTED if problem else Verdict.ACCEPTED
+        verdict = ClosureVerdict.REJECTED if problem else ClosureVerdict.ACCEPTED
         cause, reason = problem or (_VERIFIED, _VERIFIED)
         return Closure(target, source, self.match, self.overlap, verdict, reason, proposed_by, cause=cause)
 

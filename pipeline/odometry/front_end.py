@@ -69,7 +69,7 @@ class FrontEnd:
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
         self._take(tracked)
-        information = self.information() if is_keyframe else self.at_keyframe
+        information = self.sum_up() if is_keyframe else self.at_keyframe
         if is_keyframe:
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.at_keyframe, 0
@@ -84,8 +84,8 @@ class FrontEnd:
             first_points=self.odometry.first_points,
         )
 
-    def information(self) -> Matrix:
-        """Information (k, k) of the motion of the last scan since the last keyframe."""
+    def sum_up(self) -> Matrix:
+        """Sum up the motions gathered; information (k, k) of that of the last scan since the last keyframe."""
         for motion in self.motions:
             self.since = self._since(motion)
         self.motions = []
@@ -99,7 +99,7 @@ class FrontEnd:
             Motion(tracked.T_odom_lidar, prior.covariance, prior.is_measured, information, is_lost, doubt)
         )
         if len(self.motions) >= _MOST_MOTIONS:
-            self.information()
+            self.sum_up()
 
     def _since(self, motion: Motion) -> Matrix:
         """Information of a motion since the last keyframe: of the match, and of all predictions since.

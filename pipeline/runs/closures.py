@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain.data import REJECTED_WEIGHT, Closure, GraphState, Keyframe, Verdict
+from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, GraphState, Keyframe
 from scanchain.runs.step_table import pose_columns
 
 VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
@@ -24,7 +24,7 @@ class FinalClosure:
     """
 
     closure: Closure
-    verdict: Verdict
+    verdict: ClosureVerdict
     cause: str
     reason: str
     weight: float
@@ -33,9 +33,9 @@ class FinalClosure:
     @property
     def rejected_by(self) -> str:
         """Verification by matching, or the back end where it contradicts the graph; empty if accepted."""
-        if self.verdict is Verdict.ACCEPTED:
+        if self.verdict is ClosureVerdict.ACCEPTED:
             return ""
-        return BACK_END if self.closure.verdict is Verdict.ACCEPTED else VERIFICATION
+        return BACK_END if self.closure.verdict is ClosureVerdict.ACCEPTED else VERIFICATION
 
 
 def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[FinalClosure, ...]:
@@ -47,11 +47,11 @@ def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Fina
     final = []
     for closure in closures:
         verdict, cause, reason, weight, chi2 = closure.verdict, closure.cause, closure.reason, 0.0, float("nan")
-        if verdict is Verdict.ACCEPTED:
+        if verdict is ClosureVerdict.ACCEPTED:
             between = edges[closure.target, closure.source]
             weight, chi2 = between.popleft() if between else (1.0, float("nan"))
             if weight < REJECTED_WEIGHT:
-                verdict = Verdict.REJECTED
+                verdict = ClosureVerdict.REJECTED
                 cause = "contradicts the rest of the graph"
                 reason = f"{cause}, χ² {chi2:.4g}"
         final.append(FinalClosure(closure, verdict, cause, reason, weight, chi2))

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Keyframe, Matrix, Points, Prior, RawPoints, Scan, State, Verdict
+from scanchain.data import ClosureVerdict, Keyframe, Matrix, Points, Prior, RawPoints, Scan, State
 from scanchain.errors import InputError
 from scanchain.maps import SavedMap
 from scanchain.odometry.front_end import Located
@@ -45,11 +45,11 @@ def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
     pairs = result.state.edges[result.state.is_loop & ~result.state.is_rejected]
     loops = int(((pairs < fixed).any(axis=1) & (pairs >= fixed).any(axis=1)).sum())
     if not loops or result.components[0] != result.components[-1]:
-        tried = sum(closure.target < fixed for closure in slam.closures)
-        accepted = sum(closure.verdict is Verdict.ACCEPTED and closure.target < fixed for closure in slam.closures)
+        tried = [closure.verdict for closure in slam.closures if closure.target < fixed]
+        accepted = tried.count(ClosureVerdict.ACCEPTED)
         raise InputError(
-            f"{source.name}: is not found in {target.name} ({counted(tried, 'place')} tried, {accepted} fit); "
-            "give maps of one place, or the transform between them"
+            f"{source.name}: is not found in {target.name} ({counted(len(tried), 'place')} tried, "
+            f"{accepted} fit); give maps of one place, or the transform between them"
         )
     return Alignment(result.trajectory.poses, loops)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Closure, Keyframe, Matrix, Pose, Verdict
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser
@@ -249,7 +249,7 @@ def _recognized(world: Joined, guest: Joined, config: Config) -> Iterator[tuple[
         if len(keyframes) == old + len(guest.keyframes):
             closures += closer.finish(keyframes, graph)
         for closure in closures:
-            if closure.verdict is Verdict.ACCEPTED:
+            if closure.verdict is ClosureVerdict.ACCEPTED:
                 T_world_source = graph.poses[closure.target] @ closure.match.T_target_source
                 yield closure.target, closure.source - old, T_world_source
 
@@ -294,7 +294,7 @@ class _Closing:
             if self.waiting and len(self.keyframes) - self.optimized_at >= due:
                 self._optimize()
         self._take(self.closer.finish(self.keyframes, self.graph))
-        if not any(closure.verdict is Verdict.ACCEPTED for closure in self.closures):
+        if not any(closure.verdict is ClosureVerdict.ACCEPTED for closure in self.closures):
             return None
         joined = optimized(self._joined(), self.config, self.held)
         return joined if _is_joined(joined, old) else None
@@ -315,7 +315,7 @@ class _Closing:
         """Keep closures; those accepted become edges of the graph."""
         self.closures += closures
         for closure in closures:
-            if closure.verdict is Verdict.ACCEPTED:
+            if closure.verdict is ClosureVerdict.ACCEPTED:
                 self.waiting = True
                 information = loop_information(closure, self.config.loops)
                 self.graph.add_edge(
@@ -330,7 +330,7 @@ class _Closing:
     def _joined(self) -> Joined:
         """World and guest with their own edges and all accepted closures, at the poses of now."""
         world, guest, old = self.world, self.guest, len(self.world.keyframes)
-        accepted = [closure for closure in self.closures if closure.verdict is Verdict.ACCEPTED]
+        accepted = [closure for closure in self.closures if closure.verdict is ClosureVerdict.ACCEPTED]
         count = len(accepted)
         closed = Edges(
             np.array([(closure.target, closure.source) for closure in accepted], np.int64),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import Pose, Trajectory, Verdict
+from scanchain.data import ClosureVerdict, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs import Log, open_log
 from scanchain.maps import SavedMap, open_saved_map
@@ -29,7 +29,7 @@ from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import Source
 from scanchain.trajectory import write_tum
-from scanchain.verdict import Verdict as Reliability
+from scanchain.verdict import Verdict
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
@@ -87,7 +87,7 @@ class LocalizeMetrics(Struct, frozen=True):
     closures of keyframes with the map, ``rejected`` those that the graph left out in the end.
     """
 
-    verdict: Reliability
+    verdict: Verdict
     reason: str
     parts: tuple[Part, ...]
     map: str
@@ -207,7 +207,7 @@ def measure(found: Localization, prior: SavedMap, time_s: float, warnings: tuple
     """Figures and verdict of a localized log."""
     first = found.found_at
     seconds = (found.trajectory.stamps_ns - found.trajectory.stamps_ns[0]) * 1e-9
-    with_map = [each for each in found.closures if each.verdict is Verdict.ACCEPTED]
+    with_map = [each for each in found.closures if each.verdict is ClosureVerdict.ACCEPTED]
     graph = found.result.graph
     in_map = graph.is_loop & (graph.edges[:, 0] < len(prior.keyframes))
     rejected = int((graph.is_rejected & in_map).sum())
@@ -259,24 +259,24 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
                 yield Part(kind, begin, end - 1, float(seconds[begin]), float(seconds[end - 1]), length_m)
 
 
-def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> tuple[Reliability, str]:
+def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> tuple[Verdict, str]:
     scans, path_m = len(found.states), float(found.traveled_m[-1])
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
         if path_m < _SHORT_M[found.trajectory.dimension]:
-            return Reliability.NOT_TRUSTWORTHY, f"not found in {prior.name}: {tried} are too short a way to tell"
-        return Reliability.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
+            return Verdict.NOT_TRUSTWORTHY, f"not found in {prior.name}: {tried} are too short a way to tell"
+        return Verdict.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
     doubtful = [part for part in parts if part.kind != MapState.WITHOUT_MAP]
     outside = int((found.states == MapState.WITHOUT_MAP).sum())
     if not doubtful:
         share = f", {100.0 * outside / scans:.0f} % of them not matched to the map" if outside else ""
-        return Reliability.TRUSTWORTHY, f"{where}, and followed: {tried}{share}"
+        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}{share}"
     largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
     more = len(doubtful) - len(largest)
     listed = "; ".join(part.text for part in largest) + (f"; and {more:,} more" if more else "")
-    return Reliability.CHECK, f"{where}; {listed}"
+    return Verdict.CHECK, f"{where}; {listed}"
 
 
 def summary(localized: LocalizedLog, log: Log) -> str:

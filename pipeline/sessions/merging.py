@@ -12,7 +12,7 @@ import numpy as np
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, Verdict
+from scanchain.data import REJECTED_WEIGHT, ClosureVerdict
 from scanchain.errors import InputError, ScanchainError
 from scanchain.graph.optimization import fit
 from scanchain.maps import SavedMap, Session, open_saved_map
@@ -305,7 +305,7 @@ def _measured(
         apart=apart,
         keyframes=len(merged.keyframes),
         closures_tried=len(final),
-        closures_in_force=sum(item.verdict is Verdict.ACCEPTED for item in final),
+        closures_in_force=sum(item.verdict is ClosureVerdict.ACCEPTED for item in final),
         chi2=state.chi2,
         degrees_of_freedom=state.degrees_of_freedom,
         fit=fit(state),

@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from scanchain import lie
 from scanchain.api import open_recorder
-from scanchain.data import Matrix, Scan, Verdict
+from scanchain.data import ClosureVerdict, Matrix, Scan
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
@@ -168,7 +168,7 @@ def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix | Non
         T_last = step.T_odom_lidar
         if np.isfinite(found_m) and poses is not None:
             errors.append(lie.apart(poses[scan.index], step.T_world_lidar))
-        is_found = any(c.verdict is Verdict.ACCEPTED and c.target < slam.first for c in step.closures)
+        is_found = any(c.verdict is ClosureVerdict.ACCEPTED and c.target < slam.first for c in step.closures)
         if is_found and np.isinf(found_m):
             found_m = traveled_m
         if traveled_m > min(found_m + AFTER_M, GIVE_UP_M):

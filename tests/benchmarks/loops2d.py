@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Trajectory, Verdict
+from scanchain.data import ClosureVerdict, Trajectory
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts
@@ -55,7 +55,7 @@ def score(result: SlamResult, truth: Trajectory) -> Score:
     )
     true_poses = truth.poses[[keyframe.scan_index for keyframe in result.keyframes]]
     judged = final_verdicts(result.closures, result.state)
-    closures = [item.closure for item in judged if item.verdict is Verdict.ACCEPTED]
+    closures = [item.closure for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     false = 0
     for closure in closures:
         T_true = lie.inverse(true_poses[closure.target]) @ true_poses[closure.source]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import LogConfig
-from scanchain.data import Keyframe, Matrix, Proposal, Trajectory, Verdict
+from scanchain.data import ClosureVerdict, Keyframe, Matrix, Proposal, Trajectory
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
 from scanchain.runs.closures import FinalClosure, final_verdicts
@@ -75,8 +75,8 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
     result = slam.finish()
     everything = final_verdicts(result.closures, result.state)
     judged = [item for item in everything if item.closure.reason != MADE_UP]
-    named = [item.verdict is Verdict.REJECTED for item in everything if item.closure.reason == MADE_UP]
-    accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
+    named = [item.verdict is ClosureVerdict.REJECTED for item in everything if item.closure.reason == MADE_UP]
+    accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     true_poses = _true_poses(result.keyframes, truth)
     revisit, opposite = revisits(true_poses, _traveled_m(true_poses))
     found = _found(accepted, _traveled_m(true_poses))

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from scanchain.data import Closure, Match, Proposal, Verdict
+from scanchain.data import Closure, ClosureVerdict, Match, Proposal
 from scanchain.loops import ClosureTable
 
 
@@ -30,7 +30,7 @@ def closures(k):
             degeneracy_direction=rng.normal(size=k),
             cause=f"cause {source % 3}",
         )
-        verdict = Verdict.REJECTED if source % 4 else Verdict.ACCEPTED
+        verdict = ClosureVerdict.REJECTED if source % 4 else ClosureVerdict.ACCEPTED
         cause, reason = f"overlap {source % 2}", f"overlap {source % 6}"
         yield Closure(source // 2, source, match, rng.random(), verdict, reason, Proposal.PLACE, cause=cause)
 

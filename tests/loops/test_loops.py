@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import Slam, lie
-from scanchain.data import Verdict
+from scanchain.data import ClosureVerdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
@@ -78,7 +78,7 @@ def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn
     assert before > 2.0
     assert after < before / 5.0
     judged = final_verdicts(drifted.closures, drifted.state)
-    accepted = [item.closure for item in judged if item.verdict is Verdict.ACCEPTED]
+    accepted = [item.closure for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     assert len(accepted) > 50
     true = truth.poses[[keyframe.scan_index for keyframe in drifted.keyframes]]
     for closure in accepted:

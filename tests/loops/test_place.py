@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.data import Keyframe, Proposal, Verdict
+from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.kernels.search.descriptor import count_heights, mark_heights
@@ -253,7 +253,7 @@ def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lo
         for closure in closer.close(
             keyframes[:k], graph_of(keyframes[:k]), np.ones(k, bool), finish=k == len(keyframes)
         )
-        if closure.verdict is Verdict.ACCEPTED
+        if closure.verdict is ClosureVerdict.ACCEPTED
     ]
     assert any(closure.proposed_by is Proposal.PLACE for closure in accepted) and len(accepted) >= 3
     for closure in accepted:
@@ -303,7 +303,7 @@ def begun_live(mapped, seen, folder):
 
 
 def accepted_of(closures):
-    return [closure for closure in closures if closure.verdict is Verdict.ACCEPTED]
+    return [closure for closure in closures if closure.verdict is ClosureVerdict.ACCEPTED]
 
 
 def test_a_log_is_found_in_a_map_by_the_second_keyframe_that_says_the_same(tmp_path):

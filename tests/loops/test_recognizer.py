@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain import plugins
-from scanchain.data import Proposal, Verdict
+from scanchain.data import ClosureVerdict, Proposal
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser
@@ -83,7 +83,7 @@ def by_place(closures):
     return [
         closure
         for closure in closures
-        if closure.verdict is Verdict.ACCEPTED and closure.proposed_by is Proposal.PLACE
+        if closure.verdict is ClosureVerdict.ACCEPTED and closure.proposed_by is Proposal.PLACE
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.data import Keyframe, Verdict
+from scanchain.data import ClosureVerdict, Keyframe
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
@@ -92,7 +92,7 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     across = [
         item.closure.proposed_by
         for item in final_verdicts(holed.closures, holed.state)
-        if item.verdict is Verdict.ACCEPTED
+        if item.verdict is ClosureVerdict.ACCEPTED
         and item.closure.target < slam.closer.segments.starts[1] <= item.closure.source
     ]
     assert len(across) > 10

@@ -11,7 +11,7 @@ import pytest
 
 from scanchain.__main__ import main
 from scanchain.config import GraphConfig, LogConfig
-from scanchain.data import Proposal, Verdict
+from scanchain.data import ClosureVerdict, Proposal
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.logs import open_log
@@ -59,15 +59,15 @@ def ate_m(result, log):
 def test_with_thirty_percent_wrong_loops_the_map_is_as_good_and_all_of_them_are_named(log, undisturbed, disturbed):
     judged = final_verdicts(disturbed.closures, disturbed.state)
     wrong = [item for item in judged if item.closure.reason == MADE_UP]
-    accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
+    accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     assert len(wrong) >= 0.3 * (len(wrong) + len(accepted)) and len(wrong) >= 5
-    assert all(item.verdict is Verdict.REJECTED and "contradicts" in item.reason for item in wrong)
+    assert all(item.verdict is ClosureVerdict.REJECTED and "contradicts" in item.reason for item in wrong)
     assert ate_m(disturbed, log) == pytest.approx(ate_m(undisturbed, log), rel=0.2)
 
 
 def test_a_wrong_closure_keeps_a_large_chi2_and_a_true_one_ends_with_a_small_one(disturbed):
     judged = final_verdicts(disturbed.closures, disturbed.state)
-    accepted = [item for item in judged if item.verdict is Verdict.ACCEPTED]
+    accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     wrong = [item for item in judged if item.closure.reason == MADE_UP]
     assert max(item.chi2_after for item in accepted) < min(item.chi2_after for item in wrong)
     assert sum(item.chi2_after for item in accepted) < sum(item.closure.chi2_before for item in accepted)
@@ -75,7 +75,7 @@ def test_a_wrong_closure_keeps_a_large_chi2_and_a_true_one_ends_with_a_small_one
 
 def test_two_closures_of_the_same_keyframes_each_have_their_own_edge(disturbed):
     judged = final_verdicts(disturbed.closures, disturbed.state)
-    entered = [item for item in judged if item.closure.verdict is Verdict.ACCEPTED]
+    entered = [item for item in judged if item.closure.verdict is ClosureVerdict.ACCEPTED]
     loops = disturbed.state.edge_chi2[disturbed.state.is_loop]
     assert sorted(item.chi2_after for item in entered) == pytest.approx(sorted(loops.tolist()))
 
@@ -86,7 +86,7 @@ def test_the_table_says_who_proposed_and_what_the_graph_said(tmp_path, disturbed
     table = pq.read_table(tmp_path / "loops.parquet").to_pydict()
     assert set(table["proposed_by"]) == {str(Proposal.POSITION)}
     for closure, before, after in zip(disturbed.closures, table["chi2_before"], table["chi2_after"], strict=True):
-        entered = closure.verdict is Verdict.ACCEPTED
+        entered = closure.verdict is ClosureVerdict.ACCEPTED
         assert (before is not None and before >= 0.0) == entered
         assert (after is not None and after >= 0.0) == entered
 

@@ -9,7 +9,7 @@ import pytest
 
 from scanchain import baselines, lie
 from scanchain.config import Config, LogConfig
-from scanchain.data import Prior, Scan, State, Trajectory, Verdict
+from scanchain.data import ClosureVerdict, Prior, Scan, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.logs import open_log
@@ -270,7 +270,7 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
             tracked = Tracked(None, NOTHING, NOTHING, T, match, State.DEGENERATE, "", prior, 0.0, 0.0, 0.0)
             front_end.odometry.process = lambda scan, tracked=tracked: tracked
             front_end.locate(None)
-            told.append(front_end.information())
+            told.append(front_end.sum_up())
         return np.sqrt(np.linalg.inv(np.array(told) + 1e-9 * np.eye(3))[:, 0, 0])
 
     read = np.arange(24) > 0
@@ -290,7 +290,7 @@ def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predic
         tracked = Tracked(None, nothing, nothing, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
         front_end.odometry.process = lambda scan, tracked=tracked: tracked
         front_end.locate(None)
-        told.append(np.linalg.inv(front_end.information()))
+        told.append(np.linalg.inv(front_end.sum_up()))
     sigmas = np.sqrt(np.diagonal(told, axis1=1, axis2=2))
     assert np.all(sigmas[:2] <= 1e-3 * (1.0 + 1e-9))
     assert np.allclose(sigmas[2:], np.hypot(np.abs(off), 0.01), atol=0.02) and sigmas[3, 0] > 0.009
@@ -344,7 +344,7 @@ def test_closing_loops_takes_the_drift_out(office):
     slam = Slam(config, T_base_lidar)
     steps = [slam.process(scan) for scan in scans]
     result = slam.finish()
-    accepted = [closure for closure in result.closures if closure.verdict is Verdict.ACCEPTED]
+    accepted = [closure for closure in result.closures if closure.verdict is ClosureVerdict.ACCEPTED]
     assert accepted
     assert len(result.trajectory) == len(result.odometry) == len(scans) == len(steps)
     assert ate_m(result.trajectory, truth) <= ate_m(result.odometry, truth)

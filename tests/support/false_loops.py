@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scanchain.data import Verdict
+from scanchain.data import ClosureVerdict
 
 MADE_UP = "made up"  # the reason that is given for them
 
@@ -15,7 +15,7 @@ def false_closures(slam, share, seed=0):
     Real ones that happen to be nearly right (within 1 m of what the graph says) are drawn again.
     """
     rng = np.random.default_rng(seed)
-    true = [closure for closure in slam.closures if closure.verdict is Verdict.ACCEPTED]
+    true = [closure for closure in slam.closures if closure.verdict is ClosureVerdict.ACCEPTED]
     wrong = []
     while len(wrong) < share / (1.0 - share) * len(true):
         target, source = np.sort(rng.choice(len(slam.keyframes), 2, replace=False))

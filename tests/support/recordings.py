@@ -7,7 +7,7 @@ from rerun.chunk import RrdReader
 
 from scanchain import lie
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Match, Scan, State, Step, Timing, Verdict
+from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Scan, State, Step, Timing
 from scanchain.runs.closures import final_verdicts
 from scanchain.viz.recording import entities
 from scanchain.viz.recording.recording import Recording
@@ -51,7 +51,7 @@ def drive(count, dimension, points=180, seed=1):
         keyframe = i // 5 if i % 5 == 0 else -1
         closures, graph = (), None
         if keyframe >= 2 and keyframe % 2 == 0:
-            verdict = Verdict.ACCEPTED if keyframe % 4 == 0 else Verdict.REJECTED
+            verdict = ClosureVerdict.ACCEPTED if keyframe % 4 == 0 else ClosureVerdict.REJECTED
             closures = (Closure(0, keyframe, match, 0.8, verdict, "looked alike"),)
         if keyframe >= 4 and keyframe % 4 == 0:
             graph = graph_of([*steps, (keyframe, T_world_lidar)], keyframe)

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from scanchain.data import Closure, GraphState, Step, Verdict
+from scanchain.data import Closure, ClosureVerdict, GraphState, Step
 from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.step_table import StepRow
 from scanchain.viz.recording import entities, shapes
@@ -82,8 +82,8 @@ class KeyframeGraph:
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = shapes.positions(self.graph.poses)
-        accepted = [item for item in self.closures if item.verdict is Verdict.ACCEPTED]
-        rejected = [item for item in self.closures if item.verdict is Verdict.REJECTED]
+        accepted = [item for item in self.closures if item.verdict is ClosureVerdict.ACCEPTED]
+        rejected = [item for item in self.closures if item.verdict is ClosureVerdict.REJECTED]
         colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, rr.Points3D.columns(positions=nodes).partition([len(nodes)]), times),
@@ -97,7 +97,7 @@ class KeyframeGraph:
         before = [item.verdict for item in self.closures]
         self.closures = list(closures)
         counts = Counter(item.verdict for item in closures)
-        self.counts = (counts[Verdict.ACCEPTED], counts[Verdict.REJECTED])
+        self.counts = (counts[ClosureVerdict.ACCEPTED], counts[ClosureVerdict.REJECTED])
         return [
             f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
             for number, item in enumerate(closures)

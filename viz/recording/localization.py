@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from scanchain.data import Verdict
+from scanchain.data import ClosureVerdict
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.viz.pictures.map_figures import map_points
@@ -113,7 +113,7 @@ def _matches(localized: LocalizedLog) -> list[Message]:
     for closure in found.closures:
         T_map_target = keyframes[closure.target].T_odom_lidar
         ends = np.stack([T_map_target, T_map_target @ closure.match.T_target_source])
-        is_accepted = closure.verdict is Verdict.ACCEPTED
+        is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
         color = entities.GREEN if is_accepted else entities.RED
         strips = rr.LineStrips3D.columns(
             strips=[shapes.positions(ends)], colors=[color], radii=[entities.pixels(2.0)]

@@ -74,7 +74,7 @@ _CLASSES = Classes(
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
         Since, ClosureTable, BackgroundOptimization, PointStore, StoredPoints,
-        data.Scan, data.Keyframe, data.Closure, data.Match, data.Verdict, data.Proposal,
+        data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],
     {
