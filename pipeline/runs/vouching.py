@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, State, Trajectory
+from scanchain.data import Matrix, Proposal, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import VERIFICATION
 from scanchain.verdict import Closures, Evidence, Judged, check_overlap, check_velocity, check_wheels, judge
@@ -98,7 +98,7 @@ def _verified(table: pa.Table, dimension: int) -> Closures:
         table["source_scan"].to_numpy()[chosen],
         _poses(table, "", dimension)[chosen],
         rejected_by[chosen] == "",
-        tried=len(table),
+        tried=table["proposed_by"].to_pylist().count(Proposal.POSITION),
     )
 
 

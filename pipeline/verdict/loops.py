@@ -30,7 +30,7 @@ class Closures:
     target, source : (C,) scans
     T_target_source : (C, d+1, d+1) as measured
     is_accepted : (C,) by the back end
-    tried : number of those that were tried, others included
+    tried : number of all, accepted or not, that were tried as the trajectory returned to a place
     """
 
     target: NDArray[np.int64]
