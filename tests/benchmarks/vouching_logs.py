@@ -25,6 +25,7 @@ WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; non
 _AHEAD_S = 9.0  # a kidnapped lidar goes on where it would have been so much later
 _GAPS = ((0.35, 1.5), (0.65, 3.0))  # dropped scans: begin as a share of the drive, seconds
 _CARRIED_S = 2.0  # without scans while it is carried
+_WITHIN_M, _WITHIN_S = 30.0, 10.0  # begin along the corridor and duration of a drive within it
 _MOUNTING = lie.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, np.radians(6.0)]))  # error of the transform in the log
 _SHARE_EVERY_S = 0.5  # between two looks at the true geometry
 _SHARE_RAYS = 4000  # of a scan that such a look takes
@@ -39,8 +40,8 @@ class LogSpec:
 
     Attributes
     ----------
-    incident : "plain", "gap", "kidnapped", "carried" (kidnapped while no scan is recorded), "crowd" or "mounting";
-        of a file "plain" or "backward"
+    incident : "plain", "gap", "kidnapped", "carried" (kidnapped while no scan is recorded), "crowd", "mounting" or
+        "within" (it begins in motion and ends between bare walls); of a file "plain" or "backward"
     file, reference : of a real log, whose ``world`` is its name
     overrides : configuration of every run on it
     reference_m, reference_rad : error of a motion by the reference, infinite where it is no truth
@@ -95,7 +96,8 @@ class LogSpec:
 
     def drive(self) -> Drive:
         """The drive with its incident."""
-        drive = plan(self.world, seed=self.seed, duration_s=self.duration_s + _AHEAD_S, sensor=self.sensor)
+        duration_s, start_m = self.duration_s + _AHEAD_S, _WITHIN_M if self.incident == "within" else 0.0
+        drive = plan(self.world, seed=self.seed, duration_s=duration_s, sensor=self.sensor, start_m=start_m)
         times_s = drive.scans * (drive.sensor.period_ns * 1e-9)
         kept = times_s < self.duration_s
         middle_s = round(0.5 * self.duration_s)
@@ -287,6 +289,7 @@ _INCIDENTS = {
         "identical lms-270", "rounds vlp-16", "forest vlp-16",
     ),
     "mounting": ("office lms-270", "turns utm-30", "town vlp-16", "hall os1-32"),
+    "within": ("corridor vlp-16", "corridor lms-270", "corridor os1-32"),
 }  # fmt: skip
 
 
@@ -304,7 +307,8 @@ def cases() -> list[Case]:
         for k, pair in enumerate(pairs):
             world, sensor = pair.split()
             tenth = 100_000_000 // SENSORS[sensor].period_ns
-            log = LogSpec(world, sensor, incident, duration_s=24.0, dimension=SENSORS[sensor].dimension)
+            duration_s = _WITHIN_S if incident == "within" else 24.0
+            log = LogSpec(world, sensor, incident, duration_s=duration_s, dimension=SENSORS[sensor].dimension)
             found += [Case(log, "wheels", tenth), Case(log, "checked" if k % 2 else "no wheels", tenth)]
     return found + _real()
 
