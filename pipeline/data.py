@@ -103,7 +103,7 @@ class Scan:
 
 
 class State(StrEnum):
-    """Verdict of a pose."""
+    """Reliability of a pose."""
 
     OK = "ok"
     CONTRADICTED = "contradicted"

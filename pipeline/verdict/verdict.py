@@ -21,9 +21,7 @@ _EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confi
 _FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
 _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 _MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
-_MEDIAN_LIMIT = (
-    2.0  # largest median innovation of the wheels; where their calibration and σ are right it is about 1
-)
+_MEDIAN_LIMIT = 2.0  # largest median innovation of the wheels; about 1 where their calibration and σ are right
 _REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
 _FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # loop closures that must be tried, and share of them that must fit
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored

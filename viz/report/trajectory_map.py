@@ -86,8 +86,9 @@ def _lines(path: Floats, tables: Tables, truth: Floats | None) -> Iterator[tuple
     """Lines with their legends, the path first; empty ones are omitted."""
     yield PathLine(path, "#2f7de1", 1.2), Chip("trajectory", "#2f7de1")
     yield from _closure_lines(path, tables.closures)
+    states = np.array(tables.steps["state"].to_pylist())
     for mark, color in _COLORS.items():
-        is_marked = _is_marked(tables, mark)
+        is_marked = states == mark if isinstance(mark, State) else _is_marked(tables, mark)
         if is_marked.any():
             name = f"{mark}: {counted(int(is_marked.sum()), 'scan')}"
             yield PathLine(_marked_parts(path, is_marked), color, 2.6), Chip(name, color)
@@ -110,10 +111,8 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
             yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
-def _is_marked(tables: Tables, mark: State | Kind | str) -> NDArray[np.bool_]:
-    """(N,) scans of a state, of stretches of a kind, or at closures that the back end rejected."""
-    if isinstance(mark, State):
-        return np.array([state == mark for state in tables.steps["state"].to_pylist()])
+def _is_marked(tables: Tables, mark: Kind | str) -> NDArray[np.bool_]:
+    """(N,) scans of stretches of a kind, or at closures that the back end rejected."""
     is_marked = np.zeros(len(tables.steps), bool)
     if mark == _DISPUTED:
         parts = _disputed(tables)
@@ -166,9 +165,10 @@ def map_scene(
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
-    bulk = np.percentile(shown, _BULK, axis=0) if len(shown) else np.stack([low, high])
     if is_flat:
         bulk = _flat_view(shown, lines, low, high)
+    else:
+        bulk = np.percentile(shown, _BULK, axis=0) if len(shown) else np.stack([low, high])
     width, height = (bulk[1] - bulk[0])[:2]
     scene = {
         "box": [low.tolist(), high.tolist()],

@@ -267,9 +267,8 @@ def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
     widths = np.diff(fronts.row_start)
     count = int(fronts.pivots.sum())
     front = np.repeat(np.arange(len(widths)), fronts.pivots)
-    within = np.arange(count) - np.repeat(np.cumsum(fronts.pivots) - fronts.pivots, fronts.pivots)
+    within = _ranges(np.zeros_like(fronts.pivots), fronts.pivots)
     lengths = widths[front] - within
     row_start = np.concatenate([[0], np.cumsum(lengths)])
-    along = np.arange(row_start[-1]) - np.repeat(row_start[:-1], lengths)
-    columns = fronts.rows[np.repeat(fronts.row_start[front] + within, lengths) + along]
+    columns = fronts.rows[_ranges(fronts.row_start[front] + within, lengths)]
     return csr_matrix((factor.copy(), columns, row_start), shape=(count, count))

@@ -221,6 +221,6 @@ def name_of(indexes: Sequence[FileIndex]) -> str:
 
 
 def damage_of(indexes: Sequence[FileIndex]) -> str:
-    """What is damaged, for an error that it may explain; empty where nothing is."""
+    """Damage of a log as the end of an error that it may explain; empty where there is none."""
     damage = [line for index in indexes for line in index.damage]
     return f"; it is damaged in {counted(len(damage), 'place')}, the first: {damage[0]}" if damage else ""
