@@ -7,7 +7,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
@@ -160,6 +160,10 @@ class Match:
         ``matching.min_information`` and ``matching.min_signal``; below 1 the scan is degenerate
     degeneracy_direction : (k,) unit eigenvector of the worst direction, twist order, source's frame
     cause : the reason without its figures, the same for all of its kind
+    variance_factor : of ``covariance`` against the inverse of ``information``, at most 1: in the plane the latter
+        counts ``matching.sensor_noise_m`` where residuals are smaller
+    systematic : (k, k) covariance in the source's own frame by how eight sectors of the scan disagree, which
+        poses aligned to the same map have in common; (0, 0) from a matcher that does not say
     """
 
     T_target_source: Pose
@@ -177,6 +181,13 @@ class Match:
     observability: float
     degeneracy_direction: NDArray[np.float64]
     cause: str = ""
+    variance_factor: float = 1.0
+    systematic: Matrix = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def covariance(self) -> Matrix:
+        """(k, k) of a twist in the source's own frame, by the residuals; infinite where these leave it open."""
+        return np.asarray(self.variance_factor * np.linalg.pinv(self.information, hermitian=True), np.float64)
 
     @property
     def inlier_share(self) -> float:

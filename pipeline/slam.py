@@ -29,6 +29,7 @@ from scanchain.data import (
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.map_errors import MapErrors, PoseErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
@@ -62,6 +63,7 @@ class SlamResult:
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule.
+    ``map_errors`` are those of the keyframes against the map.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -72,8 +74,14 @@ class SlamResult:
     graph: PoseGraph
     state: GraphState
     components: NDArray[np.int64]
+    map_errors: MapErrors
     elevation_offset_rad: float = 0.0
     calibrated_from: int = 0
+
+    @property
+    def keyframe_trajectory(self) -> Trajectory:
+        """Stamps and final poses of the keyframes."""
+        return Trajectory(np.array([keyframe.stamp_ns for keyframe in self.keyframes]), self.T_world_keyframes)
 
     @property
     def T_world_keyframes(self) -> Matrix:
@@ -116,6 +124,7 @@ class Slam:
         self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
         self.T_odom_last = lie.identity(self.dimension)
         self.T_world_odom = lie.identity(self.dimension)
+        self.map_errors = MapErrors(self.graph.freedom)
         self.traveled_m = 0.0
         self.waiting_closures = 0
         self.moves_map = False
@@ -144,6 +153,7 @@ class Slam:
         self.keyframes += prior.keyframes
         self.first = self.optimized_at = len(self.keyframes)
         for keyframe in self.keyframes:
+            self.map_errors.append(PoseErrors(1.0, np.zeros((self.graph.freedom,) * 2), 1.0))
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
         self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)
 
@@ -231,6 +241,7 @@ class Slam:
             graph=self.graph,
             state=state,
             components=self.closer.segments.components(self.graph),
+            map_errors=self.map_errors,
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,
         )
@@ -290,6 +301,7 @@ class Slam:
             )
             self.lost_scans = 0
         self.keyframes.append(keyframe)
+        self.map_errors.append(located.errors)
         return keyframe.index
 
     def _close_loops(self, is_keyframe: bool) -> tuple[Closure, ...]:

@@ -18,6 +18,7 @@ _NS_PER_S = 1_000_000_000
 _TUM_ROW, _KITTI_ROW = 7 * " %.9f" + "\n", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
+_OUT_OF_PLANE = 1e-12  # m² or rad², variance of z, roll and pitch of poses in the plane
 _UNIT = 0.01  # largest deviation from 1 of the length of a quaternion, which may be written with two digits
 _NO_ROTATION = 1e-3  # a quaternion that is shorter stands for an unknown rotation
 _NO_COORDINATE_M, _DAY_S = 1e8, 86_400.0  # x above it, and within a day of the stamp, is a stamp
@@ -74,6 +75,26 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
             file.write(f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}")
+
+
+def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> None:
+    """Write a TUM file with the covariance (N, k, k) of each pose behind it, 29 numbers a line.
+
+    Of a twist in the pose's own frame, T exp(ξ), (translation, rotation): the lower triangle of (6, 6), by rows.
+    In the plane, what lies outside of it is known to a micrometer. Raises OSError where the disk is full.
+    """
+    poses = lie.lift(trajectory.poses)
+    rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
+    lifted = covariances
+    if trajectory.dimension == 2:
+        rows_in, columns_in = np.meshgrid((0, 1, 5), (0, 1, 5), indexing="ij")
+        lifted = np.tile(_OUT_OF_PLANE * np.eye(6), (len(poses), 1, 1))
+        lifted[:, rows_in, columns_in] = covariances
+    lower = np.tril_indices(6)
+    with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
+        for stamp_ns, pose, covariance in zip(trajectory.stamps_ns.tolist(), rows, lifted, strict=True):
+            values = " ".join(f"{value:.6e}" for value in covariance[lower].tolist())
+            file.write(f"{format_stamp(stamp_ns)}{(_TUM_ROW % tuple(pose.tolist())).rstrip()} {values}\n")
 
 
 def read_kitti(path: Path | str) -> Trajectory:

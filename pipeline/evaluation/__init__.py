@@ -10,7 +10,7 @@ from scanchain.evaluation.absolute import (
     on_the_estimate,
 )
 from scanchain.evaluation.consistency import disagreement, motion_nees
-from scanchain.evaluation.expected import ExpectedError, expected_ate
+from scanchain.evaluation.expected import ExpectedError, ExpectedErrors, expected_ate, expected_errors
 from scanchain.evaluation.pairing import Pairs, Statistics, during, pair
 from scanchain.evaluation.reference import TruthFile, check_overlap, read_truth
 from scanchain.evaluation.relations import (
@@ -41,6 +41,7 @@ __all__ = [
     "AbsoluteError",
     "Alignment",
     "ExpectedError",
+    "ExpectedErrors",
     "KittiError",
     "LengthError",
     "Pairs",
@@ -57,6 +58,7 @@ __all__ = [
     "disagreement",
     "during",
     "expected_ate",
+    "expected_errors",
     "far_off",
     "kitti_error",
     "kitti_error_of_any_path",

@@ -83,18 +83,20 @@ def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
     return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
-def position_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
-    """Errors (count, K, d) of all positions, drawn from their joint distribution; those of fixed poses are zero.
+def pose_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
+    """Errors (count, K, k) of all poses, drawn from their joint distribution; those of fixed poses are zero.
 
     Of the linearized problem with H = Uᵀ U: left twists ξ = U⁻¹ z of independent normal z move a position t by
-    ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.)
+    ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.) Returned are that and φ,
+    along the world's axes.
     """
     d, random = poses.shape[-1] - 1, np.random.default_rng(seed)
     lever = turns(poses[problem.free, :d, d])
-    errors = np.zeros((count, len(poses), d))
+    errors = np.zeros((count, len(poses), problem.freedom))
     for k in range(count):
         twists = problem.packing.spread_rows(problem.cholesky.draw(random.normal(size=problem.pattern.scalars)))
-        errors[k, problem.free] = twists[:, :d] + (lever @ twists[:, d:, None])[..., 0]
+        twists[:, :d] += (lever @ twists[:, d:, None])[..., 0]
+        errors[k, problem.free] = twists
     return errors
 
 

@@ -15,7 +15,7 @@ from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
-from scanchain.graph.covariance import own_covariances, position_errors, relative_covariance
+from scanchain.graph.covariance import own_covariances, pose_errors, relative_covariance
 from scanchain.graph.edge_checks import check_connected, check_edges, ranks
 from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
 from scanchain.graph.growing_array import GrowingArray
@@ -358,6 +358,14 @@ class PoseGraph:
         result.since, result.work = self.since, self.work
         return result
 
+    def with_information(self, information: Matrix) -> PoseGraph:
+        """A copy whose edges have these information matrices (E, k, k), its measurements as corrected here."""
+        result = self.copy()
+        result._measurements.replace(self.measurements)
+        result._information.replace(information)
+        result._explanation = Explanation.none(self.freedom)
+        return result
+
     def take_over(self, optimized: PoseGraph) -> None:
         """Take what optimizing a ``copy`` led to; poses added since move along with the last one before them."""
         count, edges = len(optimized), len(optimized.edges)
@@ -419,13 +427,13 @@ class PoseGraph:
             raise self._singular(error, problem) from error
         return own_covariances(problem)
 
-    def position_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """Errors (count, K, d) of all positions, drawn from their joint distribution by the edges in force.
+    def pose_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
+        """Errors (count, K, k) of all poses, drawn from their joint distribution by the edges in force.
 
-        Raises InputError where these leave poses free.
+        Of position and orientation, along the world's axes. Raises InputError where the edges leave poses free.
         """
         count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
-        return position_errors(self._factored(), self.poses, count, seed)
+        return pose_errors(self._factored(), self.poses, count, seed)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")

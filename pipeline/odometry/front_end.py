@@ -10,7 +10,9 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, Matrix, Points, Pose, Scan, State
+from scanchain.graph.map_errors import PoseErrors
 from scanchain.odometry.odometry import Odometry
+from scanchain.odometry.pose_errors import PoseErrorTracker
 from scanchain.odometry.tracked import Tracked
 from scanchain.preprocess import Prepared
 
@@ -34,6 +36,7 @@ class Located(msgspec.Struct, frozen=True):
     ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
     ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
+    ``errors`` are those of its pose against the map, of the first scan unless ``is_keyframe``;
     ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
     """
 
@@ -42,6 +45,7 @@ class Located(msgspec.Struct, frozen=True):
     scale: float
     local_map: Points
     information: Matrix
+    errors: PoseErrors
     first_points: Points
 
 
@@ -56,6 +60,8 @@ class FrontEnd:
         self.at_keyframe = np.zeros((lie.twist_size(T_base_lidar),) * 2)
         self.covariance: Matrix | None = self.at_keyframe  # of the motion since the keyframe, None where unknown
         self.doubt = self.at_keyframe  # of the motion, by scans that their correspondences contradict
+        self.error_tracker = PoseErrorTracker(len(self.at_keyframe))
+        self.errors = PoseErrors(1.0, self.at_keyframe, 0.0)  # of the last keyframe
         self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0
@@ -69,8 +75,11 @@ class FrontEnd:
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
         self._take(tracked)
+        self.error_tracker.take(tracked)
         information = self.sum_up() if is_keyframe else self.at_keyframe
         if is_keyframe:
+            T_keyframe_lidar = lie.between(self.T_odom_keyframe, tracked.T_odom_lidar)
+            self.errors = self.error_tracker.at_keyframe(tracked, T_keyframe_lidar)
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.at_keyframe, 0
             self.doubt = self.at_keyframe
@@ -81,6 +90,7 @@ class FrontEnd:
             scale=local_map.scale,
             local_map=local_map.points() if is_keyframe else self.no_points,
             information=information,
+            errors=self.errors,
             first_points=self.odometry.first_points,
         )
 

@@ -119,6 +119,8 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
         degeneracy_eigenvalue=result.eigenvalue,
         observability=observability,
         degeneracy_direction=result.direction,
+        variance_factor=result.variance_factor,
+        systematic=result.systematic,
     )
 
 

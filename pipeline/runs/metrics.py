@@ -15,9 +15,9 @@ from scanchain.data import State, Trajectory, fit_text
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     ExpectedError,
+    ExpectedErrors,
     Pairs,
     absolute_error_of_any_path,
-    expected_ate,
     kitti_error_of_any_path,
     pair,
 )
@@ -184,6 +184,7 @@ def measure(
     cloud: Cloud,
     final: Sequence[FinalClosure],
     judged: Judged,
+    expected: ExpectedErrors | None,
     *,
     run_s: float,
     compile_s: float,
@@ -232,7 +233,7 @@ def measure(
         verdict=judged.verdict,
         verdict_reason=judged.reason,
         stretches=judged.stretches,
-        expected_ate_m=_expected_ate(result),
+        expected_ate_m=None if expected is None else expected.ate,
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,
@@ -281,16 +282,6 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         lines += _accuracy_lines(m.ground_truth)
     lines += [f"warning        {warning}" for warning in m.warnings]
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
-
-
-def _expected_ate(result: SlamResult) -> ExpectedError | None:
-    starts = [keyframe.scan_index for keyframe in result.keyframes]
-    if len(starts) < 2:
-        return None
-    try:
-        return expected_ate(result.graph, np.diff([*starts, len(result.trajectory)]))
-    except InputError:
-        return None
 
 
 def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:

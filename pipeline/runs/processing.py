@@ -19,7 +19,7 @@ from scanchain.clock import compiled_s
 from scanchain.config import Config
 from scanchain.data import Scan, Step, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import on_the_estimate
+from scanchain.evaluation import ExpectedErrors, on_the_estimate
 from scanchain.logs import Log
 from scanchain.preprocess import Prepared, Resolution, prepare, prepare_ahead
 from scanchain.runs.closures import FinalClosure, final_verdicts
@@ -50,6 +50,7 @@ class Processed:
     cloud: Cloud
     final: tuple[FinalClosure, ...]
     judged: Judged
+    expected: ExpectedErrors | None
     warnings: tuple[str, ...]
     held_s: float
 
@@ -108,7 +109,7 @@ def process(
         slam.points.close()
         held_s = _hold(recording, progress)
         progress.say("writing the rest of the recording")
-    return Processed(result, results.cloud, final, judged, (*notes, *recording.warnings), held_s)
+    return Processed(result, results.cloud, final, judged, results.expected, (*notes, *recording.warnings), held_s)
 
 
 class _Taking:

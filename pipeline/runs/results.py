@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose
+from scanchain.errors import InputError
+from scanchain.evaluation import ExpectedErrors, expected_errors
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import outline_of
@@ -39,7 +41,7 @@ from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
-from scanchain.trajectory import write_kitti, write_tum
+from scanchain.trajectory import write_kitti, write_tum, write_wide_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
 
@@ -66,6 +68,7 @@ class Results:
     final: tuple[FinalClosure, ...]
     drawn: Future[Cloud]
     grid: OccupancyGrid
+    expected: ExpectedErrors | None
 
     @property
     def cloud(self) -> Cloud:
@@ -88,6 +91,12 @@ def _write_graph(path: Path, results: Results) -> None:
         write_g2o(rejected_path(path), graph, edges="rejected")
 
 
+def _write_keyframes(path: Path, results: Results) -> None:
+    """Poses and covariances of the keyframes, where these are known."""
+    if results.expected is not None:
+        write_wide_tum(path, results.result.keyframe_trajectory, results.expected.covariances)
+
+
 def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
@@ -105,6 +114,7 @@ def _write_saved_map(path: Path, results: Results) -> None:
 
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
     Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
+    Output("keyframes.tum", _write_keyframes),
     Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
     Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
     Output(GRAPH_FILE, _write_graph),
@@ -133,7 +143,21 @@ def results_of(
     beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
     drawn = beside.submit(cloud_of, result, config)
     beside.shutdown(wait=False)
-    return Results(log, config, steps, result, final, drawn, grid_of(result, config.maps))
+    return Results(
+        log, config, steps, result, final, drawn, grid_of(result, config.maps), _expected(result, config)
+    )
+
+
+def _expected(result: SlamResult, config: Config) -> ExpectedErrors | None:
+    """Expected errors of the keyframes; None without an edge, or where these leave poses free."""
+    starts = [keyframe.scan_index for keyframe in result.keyframes]
+    if len(starts) < 2:
+        return None
+    scans = np.diff([*starts, len(result.trajectory)])
+    try:
+        return expected_errors(result.graph, result.map_errors, config, scans)
+    except InputError:
+        return None
 
 
 def write_results(folder: Path, results: Results) -> None:

@@ -113,7 +113,7 @@ def _run(
                 few = _few_scans(len(steps))
                 warnings = (*log.damage, *log.copies, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
-                    steps, done.result, done.cloud, done.final, done.judged,
+                    steps, done.result, done.cloud, done.final, done.judged, done.expected,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
                 text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)

@@ -131,7 +131,7 @@ class StepTable:
 
     def covariances(self) -> list[Matrix | None]:
         """Covariance (k, k) of each match, of a lidar-frame twist; None where a direction is unobservable."""
-        values, is_sound = _covariances(self.columns["information"])
+        values, is_sound = _covariances(self.columns)
         return [value if good else None for value, good in zip(values, is_sound.tolist(), strict=True)]
 
     def states(self) -> Counter[State]:
@@ -146,7 +146,7 @@ class StepTable:
         import pyarrow.parquet as pq
 
         steps = self.columns
-        covariances, is_sound = _covariances(steps["information"])
+        covariances, is_sound = _covariances(steps)
         columns: dict[str, object] = {
             **{name: steps[name] for name in ("index", "stamp_ns", "log_time_ns")},
             **pose_columns(trajectory.poses),
@@ -234,6 +234,7 @@ _PART = 1024  # rows that are put into columns together
 _OF_MATCH = (  # as columns; all of a match but its reason
     "points", "inliers", "iterations", "residual_m", "fit", "cost_m2", "converged", "at_minimum",
     "degeneracy_eigenvalue", "observability", "degeneracy_direction", "information", "T_target_source",
+    "variance_factor",
 )  # fmt: skip
 _FIELDS = {"cost_m2": "cost"}  # of a match, where the column has another name
 STAGES = ("read", "preprocess", "match", "map", "loops")
@@ -260,7 +261,9 @@ def _layout(size: int, k: int) -> np.dtype[np.void]:
     codes = dict.fromkeys(("state", "reason", "match_reason"), np.int32)
     flags = dict.fromkeys(("has_wheels", "starts_segment", "is_copy", "converged", "at_minimum"), np.bool_)
     counts = dict.fromkeys(("points", "inliers", "iterations"), np.int64)
-    numbers = dict.fromkeys(("residual_m", "fit", "cost_m2", "degeneracy_eigenvalue", "observability"), np.float64)
+    numbers = dict.fromkeys(
+        ("residual_m", "fit", "cost_m2", "degeneracy_eigenvalue", "observability", "variance_factor"), np.float64
+    )
     arrays = {
         **dict.fromkeys(("T_odom_lidar", "T_world_lidar", "T_target_source", "T_odom_base"), pose),
         "information": (np.float64, (k, k)),
@@ -322,13 +325,14 @@ def _wheel_columns(poses: Matrix) -> dict[str, object]:
     return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
 
 
-def _covariances(informations: Matrix) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Inverses (N, k, k) of (N, k, k), and True where there is one (N,)."""
+def _covariances(steps: NDArray[np.void]) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Covariances (N, k, k) of the matches of steps in columns, and True where there is one (N,)."""
+    informations = steps["information"]
     finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
     sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
     scaled = vectors / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
-    return scaled @ np.swapaxes(scaled, 1, 2), sound
+    return steps["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2)), sound
 
 
 COLUMNS = ("covariance", "state")

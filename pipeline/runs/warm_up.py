@@ -17,6 +17,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Pose, Prior, Scan, State
+from scanchain.graph.map_errors import PoseErrors
 from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
@@ -77,7 +78,7 @@ def graph(dimension: int) -> None:
     slam = Slam(load_settings(dimension).config, lie.identity(dimension))
     for keyframe in _straight_on(dimension):
         slam.place(_located(keyframe, slam.config))
-    slam.graph.position_errors(1)
+    slam.graph.pose_errors(1)
     slam.finish()
     slam.graph.relative_covariance(0, 1)
     slam.graph.covariances()
@@ -122,7 +123,8 @@ def _located(keyframe: Keyframe, config: Config) -> Located:
     match = first_match(keyframe.T_odom_lidar, points, config.matching)
     prior = Prior(keyframe.T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
     tracked = Tracked(scan, points, points, keyframe.T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
-    return Located(tracked, True, 1.0, points, match.information, points)
+    errors = PoseErrors(1.0, np.zeros_like(match.information), 0.0)
+    return Located(tracked, True, 1.0, points, match.information, errors, points)
 
 
 _PARTS: Mapping[str, Callable[[int], None]] = MappingProxyType(

@@ -54,16 +54,16 @@ class Score:
         return f"{self.translation_percent:.3f}{star} {self.ate_m:.3f}m{' LOST' if self.is_lost else ''}"
 
 
-def log_of(world: str, sensor: str, scans: int, cache: Path) -> Path:
+def log_of(world: str, sensor: str, scans: int, cache: Path, seed: int = SEED) -> Path:
     """The simulated log, made if it is not there yet."""
     place, period_s = WORLDS[world], SENSORS[sensor].period_ns * 1e-9
     duration_s = min(place.duration_s, scans * period_s)
     folder = cache / simulator_version()
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{world}_{sensor}_{duration_s:g}s.mcap"
+    path = folder / f"{world}_{sensor}_{duration_s:g}s{'' if seed == SEED else f'_seed{seed}'}.mcap"
     if not path.exists():
         draft = path.with_suffix(".draft.mcap")
-        simulate(world, draft, seed=SEED, duration_s=duration_s, sensor=sensor, force=True)
+        simulate(world, draft, seed=seed, duration_s=duration_s, sensor=sensor, force=True)
         draft.with_suffix(".tum").unlink()  # the log has the truth
         draft.rename(path)
     return path

@@ -1,29 +1,29 @@
-"""Consistency of our covariances, of the flags of degeneracy and of the expected ATE with the truth.
+"""Expected ATE and covariances against the truth.
 
-    python -m tests.benchmarks.trust [--worlds town,...] [--sensors vlp-16,...] [--scans N] [--cache DIR]
+    python -m tests.benchmarks.trust [--worlds town,...] [--sensors vlp-16,...] [--seeds 1,2,3] [--scans N]
 
-Worlds of 3D lidars, sensors and cache are those of tests.benchmarks.odometry3d_set; the planar worlds are driven
-with LMS-270. The odometry has no wheels. A line says
+Worlds of 3D lidars, sensors and cache are those of tests.benchmarks.odometry3d_set; planar worlds are driven with
+LMS-270 and UTM-30, all without wheels. A line says
 
-  NEES/k    squared error of the motion between two scans over its covariance, mean, divided by its dimension:
-            1 is exact, more is overconfident; from scans that are not degenerate
-  along     the same of the translation along the direction with the largest standard deviation (a corridor's)
-  across    the same along the one with the smallest
-  edges     NEES/k of the odometry edges of the pose graph
-  blind     scans whose true geometry says next to nothing along some direction (scanchain.simulation.information)
-  flagged   share of those that are called degenerate; in brackets the median angle between the direction that is
-            named and the blind ones
-  sound     scans whose true geometry says enough along every direction
-  wrongly   share of those that are called degenerate
-  ATE       of the final trajectory, and the expected one with its bounds
+  ATE       of the final trajectory
+  expected  ATE, and bounds that contain the true one in 95 of 100 cases; over the true one; * where they do not
+  NEES/k    squared error of the motion between two scans over its covariance, mean, divided by its dimension: 1 is
+            exact, more is overconfident; from scans that are neither degenerate nor lost
+  k         of smfeval, if it is installed: median of the squared error of keyframes after alignment over their
+            covariances (keyframes.tum), over that of right ones
 
-Then the same of the real logs with relations: NEES of the final relative pose by the marginals of the graph, over
-relations between visits (10 m of path or more). The relations' own noise is added; it follows from those below 1 m
-by comparing relations, wheels and odometry without wheels (three-cornered hat: their errors are independent).
+Then the same of real logs. Of Intel and ACES, whose truth are relations, the errors of relations between visits
+(10 m of path or more) take the place of the ATE: root mean square, and that which their covariances expect. The
+relations' own noise is part of that; it follows from those below 1 m by comparing relations, wheels and odometry
+without wheels (three-cornered hat: their errors are independent).
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,97 +33,119 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, State, Step, Trajectory
 from scanchain.evaluation import (
-    ExpectedError,
+    ExpectedErrors,
     absolute_error_of_any_path,
-    expected_ate,
+    expected_errors,
     motion_nees,
     pair,
     read_relations,
 )
 from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.expected import with_map_errors
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
-from scanchain.simulation import SENSORS, WORLDS, Drive, plan
-from scanchain.simulation.information import information, spectrum
+from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
+from scanchain.trajectory import write_tum, write_wide_tum
 from tests.benchmarks.accuracy import DATA
-from tests.benchmarks.odometry3d_set import PLACES, SEED, log_of, parser_of
+from tests.benchmarks.odometry3d_set import PLACES, log_of, parser_of
 
-BLIND_SHARE, SOUND_SHARE = 1e-6, 1e-3  # of the returns that speak about the worst direction
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
-PLANAR, PLANAR_SENSOR = ("office", "identical"), "lms-270"
+PLANAR, PLANAR_SENSORS = ("office", "identical"), ("lms-270", "utm-30")
 SHORT_M, LONG_M = 1.0, 10.0  # paths of relations that show their own noise, and that show ours
+REAL = {  # file, and keys of [log]
+    "KITTI 0001": ("3d/kitti_0001_first54.mcap", {}),
+    "PandaSet 002": ("3d/pandaset_002_sweeps30to55.mcap", {"topic": "/pandar64/points"}),
+    "mocap room 1": ("2d/mocap_room_1.bag", {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}),
+    "mocap room 2": ("2d/mocap_room_2.bag", {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}),
+}
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
-    """What a line of the table holds; angles in degrees, empty where nothing is blind."""
+class Line:
+    """A line of the table; NaN where there is nothing."""
 
-    nees: Floats
-    along_across: Floats
-    of_edges: Floats
-    angles_deg: Floats
-    flags_of_blind: NDArray[np.bool_]
-    flags_of_sound: NDArray[np.bool_]
-    ate_m: float
-    expected: ExpectedError
+    name: str
+    true_m: float
+    expected_m: float
+    low_m: float
+    high_m: float
+    nees: float
+    gap: float
+
+    @property
+    def ratio(self) -> float:
+        return self.expected_m / self.true_m
+
+    @property
+    def is_covered(self) -> bool:
+        return self.low_m <= self.true_m <= self.high_m
 
     def __str__(self) -> str:
-        blind, sound = self.flags_of_blind, self.flags_of_sound
-        figures = (self.nees, *self.along_across.T, self.of_edges)
-        nees = "".join(f"{each.mean():8.2f}" if len(each) else f"{'-':>8}" for each in figures)
-        flagged = f"{100.0 * blind.mean():7.1f} % ({np.median(self.angles_deg):4.1f} deg)" if blind.any() else "-"
-        wrongly = f"{100.0 * sound.mean():.1f} %" if len(sound) else "-"
-        ate = f"{self.ate_m:.3f} m, {self.expected.text}"
-        return f"{nees}{len(blind):8}{flagged:>22}{len(sound):8}{wrongly:>10}  {ate}"
+        bounds = f"{self.expected_m:.4f} ({self.low_m:.4f} to {self.high_m:.4f})"
+        mark = " " if self.is_covered else "*"
+        figures = f"{self.ratio:8.2f}{mark}{self.nees:9.2f}{self.gap:9.2f}"
+        return f"{self.name:26}{self.true_m:9.4f} {bounds:>29}{figures}"
 
 
-def placed(path: Path, overrides: tuple[Override, ...] = NO_WHEELS) -> tuple[SlamResult, list[Step], Matrix]:
-    """The result of a log, its steps, and T_base_lidar."""
-    log = open_log([path])
-    slam = Slam(load_settings(log.dimension, overrides=overrides).config, log.T_base_lidar)
+def placed(
+    path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object
+) -> tuple[SlamResult, list[Step], Matrix, ExpectedErrors, Trajectory | None]:
+    """The result of a log, its steps, T_base_lidar, what is expected of it, and the truth."""
+    log = open_log([path], **of_log)
+    config = load_settings(log.dimension, overrides=overrides).config
+    slam = Slam(config, log.T_base_lidar)
     steps = [slam.process(scan) for scan in log.scans()]
-    return slam.finish(), steps, log.T_base_lidar
+    result = slam.finish()
+    starts = [keyframe.scan_index for keyframe in result.keyframes]
+    scans = np.diff([*starts, len(steps)])
+    expected = expected_errors(result.graph, result.map_errors, config, scans)
+    return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
-def trust(path: Path, drive: Drive) -> Trust:
-    """Run our SLAM over a simulated log and compare."""
-    result, steps, _ = placed(path)
-    d = result.trajectory.dimension
-    truth = Trajectory(result.trajectory.stamps_ns, drive.truth().poses[: len(steps)])
-    true_poses = truth.poses
-    flags = np.array([step.state is State.DEGENERATE for step in steps])
-    shares, angles = np.full(len(steps), np.nan), np.full(len(steps), np.nan)
-    for k, step in enumerate(steps if d == 3 else ()):
-        H = information(drive.solids, truth.poses[k], drive.sensor, index=int(drive.scans[k]))
-        all_shares, twists = spectrum(H)
-        shares[k] = all_shares[0]
-        if flags[k] and shares[k] < BLIND_SHARE:
-            angles[k] = _angle_deg(step.match.degeneracy_direction, twists[all_shares < BLIND_SHARE], H)
-    judged = np.arange(len(steps)) >= WARM_UP_SCANS
-    blind, sound = judged & (shares < BLIND_SHARE), judged & (shares > SOUND_SHARE)
-    covariances = np.linalg.pinv(np.array([step.match.information for step in steps]), hermitian=True)
-    poses = result.odometry.poses
-    sure = judged[1:] & ~flags[1:] & ~flags[:-1]
-    motion = lie.between(poses[:-1], poses[1:])
-    Ad = lie.adjoint(lie.inverse(motion))
-    covariance = (covariances[1:] + Ad @ covariances[:-1] @ np.swapaxes(Ad, 1, 2))[sure]
-    error = lie.log(lie.between(lie.between(true_poses[:-1], true_poses[1:]), motion))[sure]
-    ate = absolute_error_of_any_path(pair(result.trajectory, truth))
-    return Trust(
-        motion_nees(poses, covariances, true_poses)[sure],
-        along_and_across(error, covariance),
-        _of_edges(result, true_poses),
-        angles[blind & flags],
-        flags[blind],
-        flags[sound],
-        ate.translation_m.rmse,
-        expected_ate(result.graph, _scans_of_keyframes(result)),
-    )
+def line(name: str, path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object) -> Line:
+    """A log with a truth of its own."""
+    result, steps, _, expected, truth = placed(path, overrides, **of_log)
+    assert truth is not None
+    pairs = pair(result.trajectory, truth)
+    ate = expected.ate
+    figures = ate.mean, ate.low, ate.high, _nees(result, steps, truth), _gap(result, expected, truth)
+    return Line(name, absolute_error_of_any_path(pairs).translation_m.rmse, *figures)
+
+
+def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:
+    """Mean NEES of the motions between scans; NaN where not every scan has a true pose."""
+    pairs = pair(result.odometry, truth)
+    estimate, reference = pairs.estimate, pairs.reference
+    if result.odometry.dimension == 2:
+        estimate, reference = lie.flatten(lie.lift(estimate)), lie.flatten(lie.lift(reference))
+    covariances = np.array([step.match.covariance for step in steps])[pairs.places]
+    is_sure = np.array([step.state in (State.OK, State.CONTRADICTED) for step in steps])[pairs.places]
+    covariances[~is_sure | (pairs.places < WARM_UP_SCANS)] = np.nan
+    return float(np.nanmean(motion_nees(estimate, covariances, reference)))
+
+
+def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> float:
+    """The scale gap k of smfeval; NaN where it is not installed."""
+    try:
+        from smfeval.cli.main import main
+    except ImportError:
+        return np.nan
+    with tempfile.TemporaryDirectory() as folder:
+        estimate, reference = Path(folder, "keyframes.tum"), Path(folder, "truth.tum")
+        write_wide_tum(estimate, result.keyframe_trajectory, expected.covariances)
+        write_tum(reference, truth)
+        frames = ("--est-body-frame", "lidar", "--ref-body-frame", "lidar", "--t_max_diff", "0.02")
+        said = io.StringIO()
+        quiet = contextlib.redirect_stderr(io.StringIO())
+        with contextlib.redirect_stdout(said), quiet, contextlib.suppress(SystemExit):
+            main(["nees", str(estimate), str(reference), *frames])
+    words = said.getvalue().split()
+    return float(words[words.index("k") + 2].rstrip(",")) if "k" in words else np.nan
 
 
 def along_and_across(error: Floats, covariance: Matrix) -> Floats:
@@ -139,34 +161,12 @@ def nees(error: Floats, covariance: Matrix) -> Floats:
     return np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) / error.shape[1]
 
 
-def _of_edges(result: SlamResult, true_poses: Matrix) -> Floats:
-    graph, odometry = result.graph, ~result.graph.is_loop
-    at_keyframes = true_poses[[keyframe.scan_index for keyframe in result.keyframes]]
-    i, j = graph.edges[odometry].T
-    error = lie.log(lie.between(lie.between(at_keyframes[i], at_keyframes[j]), graph.measurements[odometry]))
-    return nees(error, np.linalg.inv(graph.information[odometry]))
-
-
-def _scans_of_keyframes(result: SlamResult) -> NDArray[np.int64]:
-    starts = [keyframe.scan_index for keyframe in result.keyframes]
-    return np.diff([*starts, len(result.trajectory)])
-
-
-def _angle_deg(named: Floats, blind: Matrix, H: Matrix) -> float:
-    """Between a twist and the span of blind ones, rotations counted as the lengths they move a return by."""
-    lever_m = np.sqrt(np.trace(H[3:, 3:]) / np.trace(H[:3, :3]))
-    even = np.repeat([1.0, lever_m], 3)
-    basis = np.linalg.qr((blind * even).T)[0]
-    named = named * even
-    return float(np.degrees(np.arccos(min(np.linalg.norm(basis.T @ named) / np.linalg.norm(named), 1.0))))
-
-
-def relations_line(name: str) -> str:
-    """A line of the table of real logs."""
+def relations_line(name: str) -> Line:
+    """A log whose truth are relations."""
     log = DATA / f"2d/{name}.mcap"
     relations = read_relations(log.with_suffix(".relations"))
-    unaided, steps, T_base_lidar = placed(log)
-    result, _, _ = placed(log, ())
+    unaided, steps, T_base_lidar, _, _ = placed(log)
+    result, _, _, expected, _ = placed(log, ())
     places, off_ns = nearest(relations.stamps_ns.ravel(), result.trajectory.stamps_ns)
     known = (off_ns.reshape(-1, 2) < 1_000_000).all(axis=1)
     a, b = places.reshape(-1, 2)[known].T
@@ -177,15 +177,19 @@ def relations_line(name: str) -> str:
     keyframes = np.array([keyframe.scan_index for keyframe in result.keyframes])
     first, last = (np.searchsorted(keyframes, scans, side="right") - 1 for scans in (a, b))
     chosen = np.flatnonzero((length_m > LONG_M) & (first != last))
-    covariance = noise + np.array([result.graph.relative_covariance(int(first[c]), int(last[c])) for c in chosen])
+    graph, own = with_map_errors(result.graph, result.map_errors, load_settings(2).config)
+    covariance = noise + np.array(
+        [
+            graph.relative_covariance(i, j) + own[i] + own[j]
+            for i, j in zip(first[chosen].tolist(), last[chosen].tolist(), strict=True)
+        ]
+    )
     poses = result.trajectory.poses
     error = lie.log(lie.between(true, lie.between(poses[a], poses[b])))[chosen]
-    along, across = along_and_across(error, covariance).mean(axis=0)
-    sigmas = ", ".join(f"{value:.4f}" for value in np.sqrt(np.diag(noise)))
-    return (
-        f"{name:22}{nees(error, covariance).mean():8.2f}{along:8.2f}{across:8.2f}  over {len(chosen)} relations "
-        f"of noise {sigmas} m, m, rad; expected ATE {expected_ate(result.graph, _scans_of_keyframes(result)).text}"
-    )
+    expected_m = float(np.sqrt(covariance[:, [0, 1], [0, 1]].sum(axis=1).mean()))
+    true_m = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
+    low, high = (expected_m * each / expected.ate.mean for each in (expected.ate.low, expected.ate.high))
+    return Line(f"{name}, relations", true_m, expected_m, low, high, float(nees(error, covariance).mean()), np.nan)
 
 
 def _own_noise(
@@ -204,22 +208,40 @@ def _own_noise(
     return np.diag(np.maximum(0.5 * (apart[0] + apart[1] - apart[2]), 1e-8))
 
 
+def summary(kind: str, lines: Sequence[Line]) -> None:
+    """Coverage and median ratio of some lines."""
+    ratios = np.array([each.ratio for each in lines])
+    covered = np.mean([each.is_covered for each in lines])
+    print(
+        f"{kind}: {len(lines)} logs, {100 * covered:.0f} % within the bounds, expected over true "
+        f"{np.median(ratios):.2f} "
+        f"(median; {np.percentile(ratios, 10):.2f} to {np.percentile(ratios, 90):.2f} in eight of ten), NEES/k "
+        f"{np.nanmin([each.nees for each in lines]):.2f} to {np.nanmax([each.nees for each in lines]):.2f}",
+        flush=True,
+    )
+
+
 def main() -> None:
     parser = parser_of(__doc__)
-    parser.set_defaults(worlds=",".join((*PLACES, *PLANAR)))
+    parser.set_defaults(worlds=",".join((*PLACES, *PLANAR)), scans=150)
+    parser.add_argument("--seeds", default="1,2,3")
+    parser.add_argument("--real", action="store_true", help="the real logs alone")
     arguments = parser.parse_args()
-    heads = "".join(f"{head:>8}" for head in ("NEES/k", "along", "across", "edges", "blind"))
-    print(f"{'sequence':22}{heads}{'flagged':>22}{'sound':>8}{'wrongly':>10}  ATE")
-    for world in arguments.worlds.split(","):
+    print(f"{'sequence':26}{'ATE m':>9} {'expected':>29}{'over':>8} {'NEES/k':>9}{'k':>9}")
+    lines = []
+    for world in [] if arguments.real else arguments.worlds.split(","):
         is_planar = SENSORS[WORLDS[world].sensor].dimension == 2
-        for sensor in (PLANAR_SENSOR,) if is_planar else arguments.sensors.split(","):
-            scans = 10**9 if is_planar else arguments.scans
-            path = log_of(world, sensor, scans, arguments.cache)
-            answer = trust(path, plan(world, seed=SEED, sensor=sensor))
-            print(f"{world + ' ' + sensor:22}{answer}", flush=True)
-    for name in ("intel", "aces"):
-        if (DATA / f"2d/{name}.mcap").exists():
-            print(relations_line(name), flush=True)
+        for sensor in PLANAR_SENSORS if is_planar else arguments.sensors.split(","):
+            for seed in map(int, arguments.seeds.split(",")):
+                path = log_of(world, sensor, arguments.scans, arguments.cache, seed)
+                lines.append(line(f"{world} {sensor} {seed}", path))
+                print(lines[-1], flush=True)
+    if lines:
+        summary("simulated", lines)
+    lines = [line(name, DATA / file, (), **of_log) for name, (file, of_log) in REAL.items()]
+    lines += [relations_line(name) for name in ("intel", "aces")]
+    print(*lines, sep="\n")
+    summary("real", lines)
 
 
 if __name__ == "__main__":

@@ -369,12 +369,13 @@ def test_errors_drawn_of_positions_have_the_covariances_of_the_poses(dimension):
     R = graph.poses[:, :-1, :-1]
     own = graph.covariances()[:, :dimension, :dimension]
     expected = R @ own @ np.swapaxes(R, 1, 2)
-    drawn = graph.position_errors(4000)
-    assert not drawn[:, 0].any()
+    errors = graph.pose_errors(4000)
+    drawn = errors[..., :dimension]
+    assert not errors[:, 0].any()
     for pose in range(1, 9):
         size = np.trace(expected[pose])
         assert np.abs(np.cov(drawn[:, pose].T) - expected[pose]).max() < 0.08 * size
-    assert np.array_equal(drawn[:5], graph.position_errors(5))
+    assert np.array_equal(errors[:5], graph.pose_errors(5))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

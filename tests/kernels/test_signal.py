@@ -7,6 +7,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
 from scanchain.kernels.registration import icp, observability
+from scanchain.kernels.registration.residuals import normal_equations, sector_gradients
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.registration.plicp import settings_of
 from tests.support.naive_evidence import signal_along
@@ -97,3 +98,25 @@ def test_along_a_degenerate_direction_the_pose_stays_at_the_prediction():
     seeing = aligned(map_of(ends=200), lie.transform(shifted, walls(99, ends=200))[::2], prior)
     assert abs(blind.T_target_source[0, 3]) < 1e-3
     assert abs(seeing.T_target_source[0, 3] + 0.04) < 0.01
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_gradients_of_the_sectors_are_those_of_their_points(d):
+    voxel_map, points = VoxelMap(d, LocalMapConfig(voxel_size_m=0.5)), walls(99, 30)[::5, :d].copy()
+    for seed in range(3):
+        voxel_map.insert(walls(seed, 200)[:, :d].copy(), lie.identity(d))
+    k, settings = d * (d + 1) // 2, settings_of(LIMITS, voxel_map, wide=False)
+    T = lie.exp(np.array([0.02, -0.01, 0.03] if d == 2 else [0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
+    problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((k, k)), settings)
+    icp.align(problem, T, np.zeros(k), 5.0, settings.first_scale_m)
+    map_side = problem.voxels, problem.points, T, problem.origin
+    found = np.zeros((8, k))
+    sector_gradients(*map_side, problem.correspondence, problem.weight, settings.scale_m, 4.0, found)
+    far = np.linalg.norm(points, axis=1) > 4.0
+    number = (points[:, 0] > 0.0) + 2 * (points[:, 1] > 0.0) + 4 * far
+    for sector in range(8):
+        H, b = np.zeros((k, k)), np.zeros(k)
+        others = np.where(number == sector, problem.correspondence, -1).astype(np.int32)
+        normal_equations(*map_side, others, problem.weight, settings.scale_m, 0.0, H, b)
+        np.testing.assert_allclose(found[sector], b, atol=1e-9)
+    assert np.abs(found).max(axis=1).all()

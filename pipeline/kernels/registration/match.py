@@ -29,8 +29,13 @@ from scanchain.kernels.registration.observability import (
     weak_prior,
     worst,
 )
-from scanchain.kernels.registration.residuals import gradient_spread
+from scanchain.kernels.registration.residuals import gradient_spread, sector_gradients
 
+_SECTORS, _TURN_INFORMATION = 8, 25.0  # of a scan; rad⁻² of a turn that nothing determines
+_POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
+_UNSHARED = (
+    0.5  # share of the variance of planar residuals that is not the map's, by the NEES of simulated motions
+)
 _POOLED = 0.02  # weight of the variance that all residuals have in common against that of each surface
 _SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 
@@ -54,6 +59,8 @@ class Result(NamedTuple):
     on_surfaces: int
     iterations: int
     ending: int
+    variance_factor: float
+    systematic: NDArray[np.float64]
 
 
 @njit(nogil=True)
@@ -150,6 +157,8 @@ def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
         on_surfaces,
         fit.iterations,
         fit.ending if last.pairs else NO_CORRESPONDENCES,
+        1.0 if len(spread) else _variance_factor(problem, fit),
+        _systematic(problem, T, T_first, fit, range_m),
     )
 
 
@@ -175,6 +184,44 @@ def _spread(problem, T, fit):
         for j in range(6):
             spread[i, j] += _POOLED * variance * fit.H[i, j]
     return spread
+
+
+@njit(nogil=True)
+def _variance_factor(problem, fit) -> float:
+    """Variance that residuals do not share with the next scan's, over that which the information counts.
+
+    Pooled with some residuals of the sensor's variance: few fit by chance.
+    """
+    pooled = fit.squares + _POOLED_RESIDUALS * problem.settings.variance
+    variance = _UNSHARED * pooled / (fit.total_weight + _POOLED_RESIDUALS)
+    return min(variance / _variance(problem, fit), 1.0)
+
+
+@njit(nogil=True)
+def _systematic(problem, T, T_first, fit, range_m: float):
+    """Covariance (k, k) in the source's own frame by how the gradients b_s of sectors differ.
+
+    H⁻¹ (Σ b_s b_sᵀ) H⁻¹ G / (G − 1) of G sectors with correspondences, H with the prior (cluster-robust
+    covariance, as ``gradient_spread``). Directions that neither determines are known to a meter and 0.2 rad.
+    """
+    k, H = fit.H.shape[0], fit.H + problem.prior
+    for m in range(k):
+        is_turn = m >= (2 if k == 3 else 3)
+        H[m, m] += _variance(problem, fit) * (_TURN_INFORMATION if is_turn else 1.0)
+    sums = np.zeros((_SECTORS, k))
+    sector_gradients(
+        problem.voxels, problem.points, T, problem.origin, problem.correspondence, problem.weight,
+        problem.settings.scale_m, range_m, sums,
+    )  # fmt: skip
+    spread, groups = np.zeros((k, k)), 0
+    for sector in range(_SECTORS):
+        b = sums[sector]
+        groups += np.any(b != 0.0)
+        for m in range(k):
+            for n in range(k):
+                spread[m, n] += b[m] * b[n]
+    to_source = np.ascontiguousarray(adjoint(inverse(centered(T, T_first))).T)
+    return congruent(to_source, congruent(definite_inverse(H), spread)) * (groups / max(groups - 1.0, 1.0))
 
 
 @njit(nogil=True)

@@ -254,6 +254,40 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
 
 
 @njit(nogil=True)
+def sector_gradients(voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, sums):
+    """Gradients b of ``normal_equations`` by sector, added to sums (8, k).
+
+    Sectors lie ahead or behind, left or right, near or far.
+
+    Calibration, motion within the scan and surfaces that repeat shift the points of a sector together.
+    range_m : from which on points are far
+    """
+    s2, k = scale_m * scale_m, sums.shape[1]
+    for i in range(points.shape[0]):
+        voxel = correspondence[i]
+        if voxel < 0 or weight[i] == 0.0:
+            continue
+        squared = 0.0
+        for axis in range(points.shape[1]):
+            squared += points[i, axis] * points[i, axis]
+        sector = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > range_m * range_m)
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(voxels.cells, voxel)
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        w = weight[i] * ratio * ratio
+        if k == 3:
+            _, gradient = _plus_in_plane((0.0,) * 6, (0.0,) * 3, w, shape, normal, moved, residual, along)
+            for m in range(3):
+                sums[sector, m] += gradient[m]
+        else:
+            _, gradient6 = _plus((0.0,) * 21, (0.0,) * 6, w, shape, normal, moved, residual, along)
+            for m in range(6):
+                sums[sector, m] += gradient6[m]
+
+
+@njit(nogil=True)
 def robust_sums(voxels, points, T, correspondence, weight, scale_m: float):
     """The cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m², as ``normal_equations`` returns them."""
     cost = total_weight = squares = 0.0

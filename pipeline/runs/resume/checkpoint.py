@@ -13,6 +13,7 @@ from scanchain.clock import working_s
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.map_errors import MapErrors, PoseErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.slips import Slip
 from scanchain.graph.robust.update import Since
@@ -31,6 +32,7 @@ from scanchain.odometry.front_end import Motion
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.motion_filter import MotionFilter
+from scanchain.odometry.pose_errors import PoseErrorTracker
 from scanchain.odometry.prediction import Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import Standstill
@@ -73,7 +75,8 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        Since, ClosureTable, BackgroundOptimization, PointStore, StoredPoints,
+        Since, MapErrors, PoseErrors, PoseErrorTracker,
+        ClosureTable, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],

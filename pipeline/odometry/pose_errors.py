@@ -1,0 +1,47 @@
+"""Errors that poses share with the map they are aligned to: what the residuals of a scan alone do not show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.data import LEAST_FIT, Pose, State
+from scanchain.graph.map_errors import PoseErrors
+from scanchain.odometry.tracked import Tracked
+
+_LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
+
+
+class PoseErrorTracker:
+    """Mean systematic error of the scans, and what the map was renewed by since the last keyframe."""
+
+    def __init__(self, freedom: int) -> None:
+        self.systematic = np.zeros((freedom, freedom))
+        self.scans = 0  # that the mean is of
+        self.is_open = False  # since the last keyframe: poses that no correspondences determined
+
+    def take(self, tracked: Tracked) -> None:
+        """Take a scan. Of those whose pose is open or contradicted the sectors say nothing."""
+        match = tracked.match
+        if match.observability < 1.0 or tracked.state is State.LOST:
+            self.is_open = True
+        elif match.fit >= LEAST_FIT and match.systematic.size:
+            self.scans += 1
+            self.systematic = self.systematic + max(_LATEST, 1.0 / self.scans) * (
+                match.systematic - self.systematic
+            )
+
+    def at_keyframe(self, tracked: Tracked, T_keyframe_lidar: Pose) -> PoseErrors:
+        """Errors at a new keyframe, ``T_keyframe_lidar`` seen from the one before.
+
+        A map as wide as the scans is renewed by the distance over their root mean square range, and, where they do
+        not look around, by turning.
+        """
+        distance_m, angle_rad = lie.apart(lie.identity(len(T_keyframe_lidar) - 1), T_keyframe_lidar)
+        points = tracked.matched
+        range_m = float(np.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)))
+        renewal = distance_m / max(range_m, 1e-6) + angle_rad / np.pi
+        renewal = 1.0 if self.is_open else min(renewal, 1.0)
+        self.is_open = False
+        factor = 1.0 if tracked.state is State.LOST else tracked.match.variance_factor
+        return PoseErrors(factor, self.systematic, renewal)
