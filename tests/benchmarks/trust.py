@@ -10,7 +10,7 @@ with LMS-270. The odometry has no wheels. A line says
   along     the same of the translation along the direction with the largest standard deviation (a corridor's)
   across    the same along the one with the smallest
   edges     NEES/k of the odometry edges of the pose graph
-  blind     scans whose true geometry says next to nothing along some direction (scanchain.simulation.information)
+  blind     scans whose true geometry says next to nothing along some direction (tests.support.scan_information)
   flagged   share of those that are called degenerate; in brackets the median angle between the direction that is
             named and the blind ones
   sound     scans whose true geometry says enough along every direction
@@ -45,10 +45,10 @@ from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS, Drive, plan
-from scanchain.simulation.information import information, spectrum
 from scanchain.slam import Slam, SlamResult
 from tests.benchmarks.accuracy import DATA
 from tests.benchmarks.odometry3d_set import PLACES, SEED, log_of, parser_of
+from tests.support.scan_information import information, spectrum
 
 BLIND_SHARE, SOUND_SHARE = 1e-6, 1e-3  # of the returns that speak about the worst direction
 WARM_UP_SCANS = 3
