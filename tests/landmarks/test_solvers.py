@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from scanchain.errors import InputError
 from scanchain.kernels.landmarks import column_order
-from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
+from scanchain.landmarks.solvers.schur import Covariance
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 from tests.support import naive_landmarks
 

@@ -1,4 +1,4 @@
-"""``schur``: the Schur complement of the poses, solved for the landmarks."""
+"""``schur``: the Schur complement of the poses, solved for the landmarks; marginal covariances by its factor."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
+from scanchain.data import Matrix
 from scanchain.kernels.landmarks import arrow
 from scanchain.landmarks.solvers.cholesky import CholeskySolver
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
@@ -49,12 +50,22 @@ class Arrow:
     corner: NDArray[np.float64]
 
 
-def factor_arrow(system: LinearSystem) -> Arrow:
-    """U of a system whose poses are joined in a chain; raises UndeterminedError where there is none."""
-    pattern = system.pattern
-    parts, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
-    _eliminate(parts, system)
-    return parts
+class Covariance:
+    """(AᵀA)⁻¹ between neighboring poses, between poses and landmarks, and between landmarks; never all of it."""
+
+    def __init__(self, system: LinearSystem) -> None:
+        """Raises UndeterminedError where A has not full column rank."""
+        pattern = system.pattern
+        U, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
+        _eliminate(U, system)
+        self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
+        arrow.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+
+    def of(self, columns: NDArray[np.int64]) -> Matrix:
+        """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
+        result = np.empty((*columns.shape, columns.shape[1]))
+        arrow.blocks(self._band, self._border, self._corner, columns, result)
+        return result
 
 
 def _eliminate_poses(system: LinearSystem, width: int) -> Solution:
