@@ -109,9 +109,7 @@ def landmarks(
     from scanchain.landmarks.files.npz import read_landmark_data
     from scanchain.landmarks.files.write import text_of, tree_of
     from scanchain.landmarks.solvers import parse_methods
-    from scanchain.landmarks.study import Options
-    from scanchain.landmarks.study_file import study_file
-    from scanchain.landmarks.study_log import study_log
+    from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
     from scanchain.viz.report.landmarks import write_report
 

@@ -1,21 +1,47 @@
-"""Study of a landmark problem by ``scanchain landmarks``: before and after, every method, accuracy."""
+"""Studies of landmark problems by ``scanchain landmarks``: before and after, every method, accuracy.
+
+A problem is that of a file of the course, or the log of one robot of an MRCLAM folder.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
+from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
-from scanchain.landmarks.accuracy import Accuracy
-from scanchain.landmarks.compare import MethodResult
-from scanchain.landmarks.minimize import Optimizer
-from scanchain.landmarks.problem import Values
-from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
+from scanchain.landmarks import guess as guesses
+from scanchain.landmarks.accuracy import (
+    Accuracy,
+    Truth,
+    against_truth,
+    nanoseconds,
+    of_positions,
+    pose_matrices,
+    truth_at,
+)
+from scanchain.landmarks.bearing_range import BearingRangeProblem, world_referenced
+from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
+from scanchain.landmarks.files.mrclam import RangeLog, read_mrclam
+from scanchain.landmarks.minimize import Optimizer, minimize
+from scanchain.landmarks.problem import LandmarkData, Values
+from scanchain.landmarks.ranges.dead_reckoning import OWN, OWN_UNITS, OdometryNoise
+from scanchain.landmarks.ranges.slam import RangeSolution, solve_range_log
+from scanchain.landmarks.solvers import create_solver, methods_for
+from scanchain.landmarks.solvers.schur import Covariance
+from scanchain.landmarks.system import LinearSystem, landmark_columns, linear_system, pose_columns, state_of
+from scanchain.words import FREEDOM, counted
 
 Guess = Literal["odometry", "disturbed", "origin"]
+
+_SHIFT_M, _TURN_RAD = 1.0, 0.5  # of the disturbed guess
+_DOWNWEIGHTED = 0.25  # share of its expected weight below which an observation is reported as downweighted
+_FITS = (0.5, 2.0)  # χ² per degree of freedom between which a noise model fits
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +69,6 @@ class Fact:
     value: str
 
 
-def left_out_fact(what: str) -> list[Fact]:
-    """The line about a method that was not compared, none where all were."""
-    return [Fact("not compared", what)] if what else []
-
-
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Poses and landmarks, their accuracy, and T_truth_estimate (3, 3) that aligns them to the truth."""
@@ -68,8 +89,7 @@ class Study:
     converged : whether every iteration came to an end by itself
     pose_covariance, landmark_covariance : (K, p, p), (L, 2, 2) after it; m, rad
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
-    landmarks : (L,) names, as numbers
-    rows, columns, entries, build_s : of A, and the time to put it together
+    system, build_s : A x = b as the methods solved it, and the time to put it together
     methods : how every method fared
     trajectory : the poses after it with their stamps; None for a file, which has no stamps
     """
@@ -83,10 +103,189 @@ class Study:
     landmark_covariance: Matrix
     true_poses: Matrix
     true_landmarks: Matrix
-    landmarks: NDArray[np.int64]
-    rows: int
-    columns: int
-    entries: int
+    system: LinearSystem
     build_s: float
     methods: tuple[MethodResult, ...]
     trajectory: Trajectory | None
+
+
+def study_file(data: LandmarkData, options: Options) -> Study:
+    """Solve the problem of a file by every requested method, compare with the truth in the file."""
+    return _linear(data, options) if data.kind == "linear" else _nonlinear(data, options)
+
+
+def _linear(data: LandmarkData, options: Options) -> Study:
+    begin = working_s()
+    system = linear_system(data)
+    build_s = working_s() - begin
+    names, left_out = methods_for(options.methods, system.pattern.shape[1])
+    methods = compare_linear(system, names, options.repeats)
+    chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
+    facts = (
+        Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
+        _chi2(chi2, len(system.b), system.pattern.shape[1]),
+        *_left_out(left_out),
+    )
+    before, after = guesses.of_relative_positions(data), state_of(data, methods[0].x)
+    return _of_file(data, before, after, facts, system, build_s, methods)
+
+
+def _nonlinear(data: LandmarkData, options: Options) -> Study:
+    problem = BearingRangeProblem(world_referenced(data))
+    guess = _guess(problem, options.guess)
+    names, left_out = methods_for(options.methods, problem.pattern.shape[1])
+    minimum = minimize(problem, guess, create_solver(names[0]), optimizer=options.optimizer)
+    begin = working_s()
+    system = problem.system(problem.linearize(minimum.state), minimum.weights)
+    build_s = working_s() - begin
+    if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
+        methods = compare_linear(system, names, options.repeats)
+    else:
+        methods = compare_nonlinear(problem, guess, options.optimizer, names, options.repeats)
+    ended = "converged" if minimum.converged else "DID NOT CONVERGE"
+    facts = (
+        Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
+        Fact("guess", options.guess),
+        Fact(
+            "iteration",
+            f"{options.optimizer} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
+        ),
+        _chi2(minimum.cost, len(system.b), system.pattern.shape[1]),
+        *_left_out(left_out),
+    )
+    study = _of_file(data, guess, minimum.state, facts, system, build_s, methods)
+    return replace(study, converged=minimum.converged)
+
+
+def _chi2(chi2: float, rows: int, unknowns: int) -> Fact:
+    """χ² over its degrees of freedom, and its meaning."""
+    freedom = max(rows - unknowns, 1)
+    verdict = (
+        "the noise model fits"
+        if 0.5 <= chi2 / freedom <= 2.0
+        else "the noise model does not fit, or a poor minimum"
+    )
+    return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
+
+
+def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
+    state = guesses.from_odometry(problem.measurements)
+    if guess == "disturbed":
+        return guesses.disturbed(state, _SHIFT_M, _TURN_RAD)
+    if guess == "origin":
+        return replace(state, landmarks=np.zeros_like(state.landmarks))
+    return state
+
+
+def _of_file(
+    data: LandmarkData,
+    before: Values,
+    after: Values,
+    facts: tuple[Fact, ...],
+    system: LinearSystem,
+    build_s: float,
+    methods: tuple[MethodResult, ...],
+) -> Study:
+    layout, covariance = system.pattern.layout, Covariance(system)
+    return Study(
+        name=data.name,
+        facts=facts,
+        before=Estimate(before, of_positions(before, data), lie.identity(2)),
+        after=Estimate(after, of_positions(after, data), lie.identity(2)),
+        converged=True,
+        pose_covariance=covariance.of(pose_columns(layout, np.arange(layout.poses))),
+        landmark_covariance=covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks)))),
+        true_poses=data.true_poses,
+        true_landmarks=data.true_landmarks,
+        system=system,
+        build_s=build_s,
+        methods=methods,
+        trajectory=None,
+    )
+
+
+def study_log(folder: Path, options: Options) -> Study:
+    """Read the log, estimate trajectory, landmarks and noise, compare with motion capture.
+
+    The requested linear solvers run on the first step from where the estimate began, with the noise that
+    it found; ``ESTIMATOR`` makes the estimate.
+    """
+    log = read_mrclam(folder, options.robot)
+    solution = solve_range_log(log, options.noise)
+    begin = working_s()
+    at = solution.problem.linearize(solution.guess)
+    system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
+    build_s = working_s() - begin
+    names, left_out = methods_for(options.methods, system.pattern.shape[1])
+    truth = truth_at(log, solution.nodes_s, system.pattern.layout.landmarks)
+    return Study(
+        name=log.name,
+        facts=(*_facts(log, solution, is_stated=options.noise is not None), *_left_out(left_out)),
+        before=_estimate(solution.reckoned, solution.nodes_s, truth),
+        after=_estimate(solution.minimum.state, solution.nodes_s, truth),
+        converged=solution.minimum.converged,
+        pose_covariance=solution.pose_covariance,
+        landmark_covariance=solution.landmark_covariance,
+        true_poses=truth.poses[:, :2],
+        true_landmarks=truth.landmarks,
+        system=system,
+        build_s=build_s,
+        methods=compare_linear(system, names, options.repeats),
+        trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.minimum.state.poses)),
+    )
+
+
+def _estimate(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
+    if np.count_nonzero(truth.known) < 2:
+        nothing = Accuracy(np.nan, np.nan, "no motion capture at these times")
+        return Estimate(state, nothing, lie.identity(2))
+    accuracy, T_truth_estimate = against_truth(state, nodes_s, truth)
+    return Estimate(state, accuracy, T_truth_estimate)
+
+
+def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[Fact, ...]:
+    noise = solution.consistency
+    ended = "converged" if solution.minimum.converged else "DID NOT CONVERGE"
+    count = len(log.seen_s)
+    worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
+    nodes = counted(len(solution.nodes_s), "pose")
+    seen = f"{count:,} of {len(solution.minimum.state.landmarks)} landmarks from {nodes}; they {worth}"
+    left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
+    forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m = solution.sigmas
+    wheels = (
+        f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
+        f" after a meter, {turn_rad:.3g} rad after a radian"
+    )
+    own = zip(OWN, solution.minimum.state.calibration, OWN_UNITS, strict=True)
+    found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
+    after = f"{ended} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
+    downweighted = int(np.count_nonzero(solution.minimum.weights < _DOWNWEIGHTED * solution.loss.share))
+    return (
+        Fact("observations", seen),
+        Fact("left out", left),
+        Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {after}"),
+        Fact("robot", "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own)),
+        Fact(
+            "odometry noise",
+            f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
+        ),
+        Fact(
+            "sensor noise", f"estimated: {found}; {_verdict(float(np.mean(noise.sensor / noise.sensor_freedom)))}"
+        ),
+        Fact(
+            "downweighted",
+            f"{counted(downweighted, 'observation')} with less than {_DOWNWEIGHTED:g} of the weight of others",
+        ),
+    )
+
+
+def _verdict(chi2: float) -> str:
+    """χ² per degree of freedom as text."""
+    low, high = _FITS
+    verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
+    return f"χ² per degree of freedom {chi2:.2f}: {verdict}"
+
+
+def _left_out(what: str) -> list[Fact]:
+    """The line about a method that was not compared, none where all were."""
+    return [Fact("not compared", what)] if what else []

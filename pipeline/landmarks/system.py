@@ -1,4 +1,7 @@
-"""Linear systems A x = b of landmark problems: layout of the unknowns, pattern of A, its assembly."""
+"""Linear systems A x = b of landmark problems: layout of the unknowns, pattern of A, its assembly.
+
+That of a linear problem, steps between poses and landmarks' positions relative to them, is made here.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from scanchain.data import Matrix
+from scanchain.landmarks.problem import LandmarkData, Values
 
+_FIRST_POSE = 100.0  # weight of the first pose over that of a step in a linear problem
 _COMPONENTS = ("x", "y", "heading")
 
 
@@ -137,3 +142,29 @@ def difference_rows(W: Matrix, first: NDArray[np.int64], second: NDArray[np.int6
         values = np.broadcast_to(np.concatenate([-W, W], axis=1), columns.shape)
     width = columns.shape[-1]
     return Rows(np.ascontiguousarray(columns).reshape(-1, width), values.reshape(-1, width))
+
+
+def linear_system(data: LandmarkData) -> LinearSystem:
+    """A x = b with A = Σ^(−1/2) H, b = Σ^(−1/2) z: a prior on the first pose, odometry, observations.
+
+    The prior puts the first pose at the origin. It can be met exactly, so that its weight, a hundredth of a step's
+    noise, matters to the covariance alone.
+    """
+    layout = Layout(len(data.odometry) + 1, 2, np.arange(len(data.true_landmarks)))
+    W_odometry, W_observation = whitening(data.odometry_covariance), whitening(data.observation_covariance)
+    poses = pose_columns(layout, np.arange(layout.poses))
+    seen_from, seen = data.observed.T
+    groups = [
+        Rows(poses[0][:, None], _FIRST_POSE * W_odometry.diagonal()[:, None]),
+        difference_rows(W_odometry, poses[:-1], poses[1:]),
+        difference_rows(W_observation, poses[seen_from], landmark_columns(layout, seen)),
+    ]
+    b = [np.zeros(2), (data.odometry @ W_odometry.T).ravel(), (data.measured @ W_observation.T).ravel()]
+    values = np.concatenate([group.values.ravel() for group in groups])
+    return LinearSystem(pattern_of([group.columns for group in groups], layout), values, np.concatenate(b))
+
+
+def state_of(data: LandmarkData, x: np.ndarray) -> Values:
+    """The unknowns as positions."""
+    split = 2 * (len(data.odometry) + 1)
+    return Values(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))

@@ -2,20 +2,8 @@
 
 from scanchain.simulation.another_day import Change
 from scanchain.simulation.drive import Drive, plan
-from scanchain.simulation.information import information, spectrum, undetermined
 from scanchain.simulation.log import record, simulate
 from scanchain.simulation.sensors import SENSORS
 from scanchain.simulation.worlds.registry import WORLDS
 
-__all__ = [
-    "SENSORS",
-    "WORLDS",
-    "Change",
-    "Drive",
-    "information",
-    "plan",
-    "record",
-    "simulate",
-    "spectrum",
-    "undetermined",
-]
+__all__ = ["SENSORS", "WORLDS", "Change", "Drive", "plan", "record", "simulate"]

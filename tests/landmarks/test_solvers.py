@@ -5,9 +5,8 @@ from hypothesis import strategies as st
 
 from scanchain.errors import InputError
 from scanchain.kernels.landmarks import column_order
-from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
-from scanchain.landmarks.solvers.schur import LandmarkElimination
+from scanchain.landmarks.solvers.schur import Covariance
 from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 from tests.support import naive_landmarks
 
@@ -119,13 +118,14 @@ def test_a_solver_that_keeps_its_analysis_forgets_the_numbers_of_the_last_system
         assert np.allclose(solver.solve(other).x, np.linalg.lstsq(B, other.b, rcond=None)[0])
 
 
-def test_landmarks_can_be_eliminated_as_well_as_poses():
-    A, system = problem(10, 30, 6)
-    solution = LandmarkElimination().solve(system)
-    assert np.allclose(solution.x, np.linalg.lstsq(A, system.b, rcond=None)[0])
-    assert np.array_equal(create_solver("schur").solve(system).x, solution.x)  # the larger group goes
-    U, order = solution.factor().matrix.toarray(), solution.factor().order
-    assert np.allclose(U.T @ U, (A.T @ A)[np.ix_(order, order)])
+def test_schur_eliminates_the_poses_where_they_are_more_and_is_cholesky_elsewhere():
+    for poses, landmarks, is_arrow in ((30, 10, True), (10, 30, False)):
+        A, system = problem(poses, landmarks, 6)
+        solution = create_solver("schur").solve(system)
+        assert np.allclose(solution.x, np.linalg.lstsq(A, system.b, rcond=None)[0])
+        factor, order = solution.factor().matrix.toarray(), solution.factor().order
+        assert np.allclose(factor.T @ factor, (A.T @ A)[np.ix_(order, order)])
+        assert np.array_equal(order, np.arange(A.shape[1])) == is_arrow  # poses first, then landmarks
 
 
 def test_colamd_orders_every_column_once_and_saves_fill_in():

@@ -11,13 +11,13 @@ from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import catalog, lie
 from scanchain.errors import InputError
-from scanchain.simulation import SENSORS, WORLDS, information, plan, simulate, spectrum, undetermined
-from scanchain.simulation.information import surface_normals
+from scanchain.simulation import SENSORS, WORLDS, plan, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
 from tests.support import naive_raycast
+from tests.support.scan_information import information, spectrum, surface_normals, undetermined
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 STRESSING = [name for name in WORLDS if name not in ("office", "town")]

@@ -69,11 +69,10 @@ def text_of(study: Study) -> str:
 
 def size_of(study: Study) -> str:
     """Size of A as text."""
-    return (
-        f"{counted(study.rows, 'row')}, {counted(study.columns, 'column')}, "
-        f"{counted(study.entries, 'entry', 'entries')},"
-        f" put together in {1e3 * study.build_s:.1f} ms"
-    )
+    rows, columns = study.system.pattern.shape
+    entries = counted(len(study.system.values), "entry", "entries")
+    build = f"put together in {1e3 * study.build_s:.1f} ms"
+    return f"{counted(rows, 'row')}, {counted(columns, 'column')}, {entries}, {build}"
 
 
 def accuracy_lines(study: Study) -> list[tuple[str, str]]:
@@ -87,13 +86,14 @@ def accuracy_lines(study: Study) -> list[tuple[str, str]]:
 
 def tree_of(study: Study) -> dict[str, object]:
     """The figures for JSON."""
+    rows, columns = study.system.pattern.shape
     return {
         "name": study.name,
         "facts": {fact.label: fact.value for fact in study.facts},
         "converged": study.converged,
         "before": _figures(study.before.accuracy),
         "after": _figures(study.after.accuracy),
-        "A": {"rows": study.rows, "columns": study.columns, "entries": study.entries, "build_s": study.build_s},
+        "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
         "methods": [
             {
                 "method": method.method,
@@ -123,10 +123,9 @@ def write_estimate(directory: Path, study: Study) -> None:
         state.poses,
         study.pose_covariance,
     )
-    _write_csv(
-        directory / f"{stem}_landmarks.csv", "landmark", study.landmarks, ["x_m", "y_m"], state.landmarks,
-        study.landmark_covariance,
-    )  # fmt: skip
+    numbers = study.system.pattern.layout.landmarks
+    file = directory / f"{stem}_landmarks.csv"
+    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.landmark_covariance)
     if study.trajectory is not None:
         write_tum(directory / f"{stem}.tum", study.trajectory)
 

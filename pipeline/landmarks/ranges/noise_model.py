@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.landmarks.bearing_range import BearingRangeProblem
-from scanchain.landmarks.covariance import Covariance
 from scanchain.landmarks.minimize import Minimum
+from scanchain.landmarks.solvers.schur import Covariance
 
 _FREEDOM = 4.0
 _SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)

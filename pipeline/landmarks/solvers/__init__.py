@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 from scanchain.errors import InputError
 from scanchain.landmarks.solvers.cholesky import CholeskySolver
-from scanchain.landmarks.solvers.qr import QrSolver
+from scanchain.landmarks.solvers.qr import QrSolver, SuiteSparseQrSolver
 from scanchain.landmarks.solvers.schur import SchurSolver
 from scanchain.landmarks.solvers.scipy_direct import PINV_BELOW, DefaultSolver, LuSolver, PinvSolver, check_pinv
 from scanchain.landmarks.solvers.solution import Factor, LinearSolver, Solution, UndeterminedError
-from scanchain.landmarks.solvers.suitesparse import SuiteSparseQrSolver
 
 __all__ = [
     "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver",

@@ -1,4 +1,8 @@
-"""``qr`` and ``qr_colamd``: sparse orthogonal factorization A = Q R, R x = Qᵀb, without ever forming AᵀA."""
+"""Sparse orthogonal factorization A = Q R, R x = Qᵀb, without ever forming AᵀA.
+
+``qr`` and ``qr_colamd`` are the project's own, ``spqr`` and ``spqr_colamd`` SuiteSparseQR (Davis 2011), where the
+package sparseqr is installed.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
+from scipy.sparse.linalg import spsolve_triangular
 
+from scanchain.errors import MissingExtraError
 from scanchain.graph.solvers.cholesky import front_rows
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.graph.fronts import Fronts, lay_out_fronts
@@ -17,6 +23,7 @@ from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, 
 from scanchain.landmarks.system import LinearSystem, Pattern
 
 Ordering = Literal["natural", "colamd"]
+_SPQR_ORDERINGS = {"natural": 0, "colamd": 2}  # SPQR_ORDERING_FIXED, SPQR_ORDERING_COLAMD
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,3 +113,33 @@ def _neighbor_lists(
     beyond = csr_matrix((np.ones(len(others), np.int8), others, start), shape=(n, n))
     both = csr_matrix(beyond + beyond.T)
     return both.indptr.astype(np.int64), both.indices.astype(np.int64)
+
+
+class SuiteSparseQrSolver:
+    """Householder QR with the fronts of SuiteSparse; GPL, so never part of the default installation."""
+
+    def __init__(self, ordering: Ordering) -> None:
+        try:
+            import sparseqr  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise MissingExtraError("sparseqr", "suitesparse") from error
+        self._rz = sparseqr.rz
+        self._ordering: Ordering = ordering
+
+    def solve(self, system: LinearSystem) -> Solution:
+        """Solve in the least-squares sense; the factor is R."""
+        watch = Stopwatch()
+        A, n = coo_matrix(system.A), system.pattern.shape[1]
+        lengths = np.bincount(system.pattern.columns, system.values**2, n)
+        build_s = watch.lap()
+        z, R, permutation, rank = self._rz(A, system.b[:, None], ordering=_SPQR_ORDERINGS[self._ordering])
+        factor_s = watch.lap()
+        order = np.asarray(permutation, np.int64) if self._ordering == "colamd" else np.arange(n)
+        R = csc_matrix(R)
+        if rank < n or not np.all(np.abs(R.diagonal()) > LOST_DIGITS * np.sqrt(lengths[order])):
+            raise undetermined(system)
+        watch.lap()
+        x = np.empty(n)
+        x[order] = spsolve_triangular(R.tocsr(), np.asarray(z).reshape(-1)[:n], lower=False)
+        solve_s = watch.lap()
+        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", R, order))

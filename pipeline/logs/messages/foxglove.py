@@ -1,13 +1,14 @@
 """Foxglove's own messages, LaserScan, PointCloud, PoseInFrame and FrameTransforms, in JSON or Protobuf.
 
-Schemas: https://docs.foxglove.dev/docs/sdk/schemas
+Schemas: https://docs.foxglove.dev/docs/sdk/schemas. The records are those of JSON; what Protobuf parses has the
+same attributes.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -23,144 +24,6 @@ from scanchain.logs.messages.poses import StampedPose, pose_matrix
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
 T = TypeVar("T")
-
-
-class _Stamp(Protocol):
-    seconds: int
-    nanos: int
-
-
-class _Vector(Protocol):
-    x: float
-    y: float
-    z: float
-
-
-class _Quaternion(_Vector, Protocol):
-    w: float
-
-
-class _Pose(Protocol):
-    position: _Vector
-    orientation: _Quaternion
-
-
-class _Posed(Protocol):
-    timestamp: _Stamp
-    frame_id: str
-    pose: _Pose
-
-
-class _LaserScan(_Posed, Protocol):
-    """A foxglove.LaserScan."""
-
-    start_angle: float
-    end_angle: float
-    ranges: Sequence[float]
-
-
-class _Field(Protocol):
-    name: str
-    offset: int
-    type: int
-
-
-class _PointCloud(_Posed, Protocol):
-    """A foxglove.PointCloud."""
-
-    point_stride: int
-    fields: Sequence[_Field]
-    data: bytes
-
-
-class _Transform(Protocol):
-    """A foxglove.FrameTransform."""
-
-    timestamp: _Stamp
-    parent_frame_id: str
-    child_frame_id: str
-    translation: _Vector
-    rotation: _Quaternion
-
-
-class _Transforms(Protocol):
-    """A foxglove.FrameTransforms."""
-
-    transforms: Sequence[_Transform]
-
-
-def laser_scan(message: _LaserScan) -> LaserScanMessage:
-    """The scan, without range limits and times, which Foxglove lacks."""
-    with np.errstate(over="ignore"):
-        ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
-    step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
-    return LaserScanMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        first_rad=message.start_angle,
-        last_rad=message.end_angle,
-        step_rad=step_rad,
-        beam_s=0.0,
-        scan_s=0.0,
-        range_min_m=0.0,
-        range_max_m=0.0,
-        ranges_m=ranges_m,
-        T_frame_scan=_unless_identity(message.pose),
-    )
-
-
-def point_cloud(message: _PointCloud) -> PointCloudMessage:
-    """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
-    if not message.point_stride:
-        raise MalformedMessageError("point_stride is zero")
-    count = len(message.data) // message.point_stride
-    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields]
-    return PointCloudMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        height=1,
-        width=count,
-        fields=fields,
-        is_bigendian=False,
-        point_step=message.point_stride,
-        row_step=count * message.point_stride,
-        data=memoryview(message.data),
-        described=repr((message.point_stride, fields)).encode(),
-        T_frame_cloud=_unless_identity(message.pose),
-    )
-
-
-def pose_in_frame(message: _Posed, dimension: int) -> StampedPose:
-    """A foxglove.PoseInFrame, flattened for dimension 2."""
-    pose = _pose(message.pose.position, message.pose.orientation, dimension)
-    return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
-
-
-def frame_transform(message: _Transform) -> list[StampedPose]:
-    """A foxglove.FrameTransform."""
-    pose = _pose(message.translation, message.rotation, 3)
-    return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
-
-
-def frame_transforms(message: _Transforms) -> list[StampedPose]:
-    """All transforms of a foxglove.FrameTransforms."""
-    return [transform for each in message.transforms for transform in frame_transform(each)]
-
-
-def _stamp_ns(stamp: _Stamp) -> int:
-    return stamp.seconds * 1_000_000_000 + stamp.nanos
-
-
-def _unless_identity(pose: _Pose) -> Pose | None:
-    T = _pose(pose.position, pose.orientation, 3)
-    return None if np.array_equal(T, np.eye(4)) else T
-
-
-def _pose(position: _Vector, orientation: _Quaternion, dimension: int) -> Pose:
-    """A pose; a quaternion that was left out, zero, turns nothing."""
-    quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
-    quaternion = quaternion if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
-    return pose_matrix((position.x, position.y, position.z, *quaternion), dimension)
 
 
 class JsonStamp(Struct, frozen=True):
@@ -246,6 +109,80 @@ class JsonFrameTransforms(Struct, frozen=True):
     """A foxglove.FrameTransforms."""
 
     transforms: list[JsonFrameTransform]
+
+
+def laser_scan(message: JsonLaserScan) -> LaserScanMessage:
+    """The scan, without range limits and times, which Foxglove lacks."""
+    with np.errstate(over="ignore"):
+        ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
+    step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
+    return LaserScanMessage(
+        stamp_ns=_stamp_ns(message.timestamp),
+        frame=message.frame_id,
+        first_rad=message.start_angle,
+        last_rad=message.end_angle,
+        step_rad=step_rad,
+        beam_s=0.0,
+        scan_s=0.0,
+        range_min_m=0.0,
+        range_max_m=0.0,
+        ranges_m=ranges_m,
+        T_frame_scan=_unless_identity(message.pose),
+    )
+
+
+def point_cloud(message: JsonPointCloud) -> PointCloudMessage:
+    """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
+    if not message.point_stride:
+        raise MalformedMessageError("point_stride is zero")
+    count = len(message.data) // message.point_stride
+    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields]
+    return PointCloudMessage(
+        stamp_ns=_stamp_ns(message.timestamp),
+        frame=message.frame_id,
+        height=1,
+        width=count,
+        fields=fields,
+        is_bigendian=False,
+        point_step=message.point_stride,
+        row_step=count * message.point_stride,
+        data=memoryview(message.data),
+        described=repr((message.point_stride, fields)).encode(),
+        T_frame_cloud=_unless_identity(message.pose),
+    )
+
+
+def pose_in_frame(message: JsonPoseInFrame, dimension: int) -> StampedPose:
+    """A foxglove.PoseInFrame, flattened for dimension 2."""
+    pose = _pose(message.pose.position, message.pose.orientation, dimension)
+    return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
+
+
+def frame_transform(message: JsonFrameTransform) -> list[StampedPose]:
+    """A foxglove.FrameTransform."""
+    pose = _pose(message.translation, message.rotation, 3)
+    return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
+
+
+def frame_transforms(message: JsonFrameTransforms) -> list[StampedPose]:
+    """All transforms of a foxglove.FrameTransforms."""
+    return [transform for each in message.transforms for transform in frame_transform(each)]
+
+
+def _stamp_ns(stamp: JsonStamp) -> int:
+    return stamp.seconds * 1_000_000_000 + stamp.nanos
+
+
+def _unless_identity(pose: JsonPose) -> Pose | None:
+    T = _pose(pose.position, pose.orientation, 3)
+    return None if np.array_equal(T, np.eye(4)) else T
+
+
+def _pose(position: JsonVector, orientation: JsonQuaternion, dimension: int) -> Pose:
+    """A pose; a quaternion that was left out, zero, turns nothing."""
+    quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
+    quaternion = quaternion if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
+    return pose_matrix((position.x, position.y, position.z, *quaternion), dimension)
 
 
 def parse_json(data: memoryview, kind: type[T]) -> T:

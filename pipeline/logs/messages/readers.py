@@ -77,55 +77,38 @@ def transforms_reader(channel: Channel) -> Callable[[memoryview], list[StampedPo
 
 def _kind(channel: Channel) -> Kind:
     """The registry's key; an encoding whose schema is in another language is none of ours."""
-    is_ours = channel.schema_encoding in _ENCODINGS.get(channel.encoding, _Encoding(())).schema_languages
+    is_ours = channel.schema_encoding in _SCHEMA_LANGUAGES.get(channel.encoding, ())
     return Kind(channel.encoding if is_ours else "", kind(channel))
 
 
-class _Encoding(NamedTuple):
-    """A message encoding: languages of its schemas, reader of ROS's types, parser of Foxglove's."""
-
-    schema_languages: tuple[str, ...]
-    reader: type[CdrReader] | None = None
-    parser: Callable[[Channel, type], Read] | None = None
-
-
-_ENCODINGS = {
-    "cdr": _Encoding(("ros2msg", "ros2idl"), reader=CdrReader),
-    "ros1": _Encoding(("ros1msg",), reader=Ros1Reader),
-    "json": _Encoding(("jsonschema", ""), parser=lambda _, kind: partial(foxglove.parse_json, kind=kind)),
-    "protobuf": _Encoding(("protobuf",), parser=lambda channel, _: foxglove.protobuf_parser(channel)),
+_SCHEMA_LANGUAGES = {
+    "cdr": ("ros2msg", "ros2idl"),
+    "ros1": ("ros1msg",),
+    "json": ("jsonschema", ""),
+    "protobuf": ("protobuf",),
 }
 
 
 def _ros(type_names: tuple[str, ...], read: Read) -> dict[Kind, _Bind]:
     """A type that ROS 1 and ROS 2 lay out alike, each in its own serialization."""
-    return {
-        Kind(encoding, name): partial(_form_bound, read, each.reader)
-        for name in type_names
-        for encoding, each in _ENCODINGS.items()
-        if each.reader is not None
-    }
 
+    def binding(form: type[CdrReader]) -> _Bind:
+        return lambda _: partial(read, form=form)
 
-def _form_bound(read: Read, form: type[CdrReader], _: Channel) -> Read:
-    return partial(read, form=form)
+    forms = {"cdr": CdrReader, "ros1": Ros1Reader}
+    return {Kind(encoding, name): binding(form) for name in type_names for encoding, form in forms.items()}
 
 
 def _foxglove(type_name: str, json_type: type, take: Read) -> dict[Kind, _Bind]:
     """A type of Foxglove's, in JSON and in Protobuf."""
+
+    def taking(parse: Read) -> Read:
+        return lambda data, **options: take(parse(data), **options)
+
     return {
-        Kind(encoding, type_name): partial(_parser_bound, each.parser, json_type, take)
-        for encoding, each in _ENCODINGS.items()
-        if each.parser is not None
+        Kind("json", type_name): lambda _: taking(partial(foxglove.parse_json, kind=json_type)),
+        Kind("protobuf", type_name): lambda channel: taking(foxglove.protobuf_parser(channel)),
     }
-
-
-def _parser_bound(parser: Callable[[Channel, type], Read], json_type: type, take: Read, channel: Channel) -> Read:
-    return _both(parser(channel, json_type), take)
-
-
-def _both(parse: Read, take: Read) -> Read:
-    return lambda data, **options: take(parse(data), **options)
 
 
 _SCANS: dict[Kind, _Bind] = {
